@@ -1,0 +1,41 @@
+# Two commands on a bare machine with python3 >= 3.11, python3-venv and make: `make solve` and `make test`.
+PYTHON ?= python3
+BIN := .venv/bin
+# One BLAS thread per process: the matrices are small and the work is spread over processes.
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
+
+.PHONY: solve test lint bench setup setup-test clean
+
+solve: setup
+	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
+
+test: setup-test lint
+	$(BIN)/python -m pytest
+
+lint: setup-test
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: setup-test
+	$(BIN)/python benchmarks/synthesis.py
+
+setup: .venv/.ready
+setup-test: .venv/.ready-test
+
+# The compiled kernels are built once here, so that the first solve does not wait for them.
+.venv/.ready: requirements.lock pyproject.toml
+	test -d .venv || $(PYTHON) -m venv .venv
+	$(PIP) -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	$(BIN)/python -m ccd_casadi.kernels
+	touch $@
+
+.venv/.ready-test: .venv/.ready requirements-test.lock
+	$(PIP) -r requirements-test.lock
+	touch $@
+
+clean:
+	rm -rf .venv *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
