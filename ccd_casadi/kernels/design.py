@@ -1,0 +1,180 @@
+"""One design from end to end, compiled: γ_opt, controller, certificate, closed-loop figures.
+
+The figures of a design are one row of numbers, in scaled units; `Figure` names the columns.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+
+from ccd_casadi.kernels.certificate import level_test, stack_norm, weighted_loop
+from ccd_casadi.kernels.frequency import prepare
+from ccd_casadi.kernels.gamma import (
+    gamma_lower_bound,
+    level_hamiltonian,
+    lqr_hamiltonian,
+    optimal_gamma,
+)
+from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.lapack import eigenvalues, stable_subspace
+from ccd_casadi.kernels.sensitivity import bandwidth, loop_matrices, peak, sensitivity_gain
+
+
+class Code(IntEnum):
+    """How a design ended; 0 is the only one that may be used."""
+
+    CERTIFIED = 0
+    GAMMA_NOT_CONVERGED = 1
+    RICCATI_FAILED = 2
+    NOT_FINITE = 3
+    UNSTABLE_LOOP = 4
+    NORM_EXCEEDED = 5
+    LEVEL_TEST_FAILED = 6
+    NO_BANDWIDTH = 7
+    EIGENVALUES_FAILED = 8
+    PEAK_NOT_CONFIRMED = 9
+
+
+class Figure(IntEnum):
+    """Columns of a row of figures; frequencies over ω₀, poles over ω₀."""
+
+    CODE = 0
+    GAMMA_OPT = 1
+    GAMMA_LOWER_BOUND = 2
+    GAMMA = 3
+    LIMITED_BY_BOUND = 4
+    SCHUR_FORMS = 5
+    BANDWIDTH = 6
+    PEAK = 7
+    PEAK_FREQUENCY = 8
+    LOW = 9
+    MAX_REAL_POLE = 10
+    NORM = 11
+    NORM_FREQUENCY = 12
+    COUNT = 13
+
+
+_COUNT = int(Figure.COUNT)
+GAMMA_TOLERANCE = 1e-11
+
+
+@njit(cache=True)
+def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
+    """A_K = A + B2 F - B1 C2, B_K = B1, C_K = F, F = -(B2ᵀX + D12ᵀC1)/d2², X at γ; and ok."""
+    p, m = C2.shape[0], B2.shape[1]
+    t = gamma**2 - d1**2
+    _, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
+    N = Ag.shape[0]
+    if not ok:
+        return np.zeros((N, N)), B1, np.zeros((m, N)), False
+    X = np.linalg.solve(np.ascontiguousarray(U1.T), np.ascontiguousarray(U2.T))
+    X = 0.5 * (X + X.T)
+    F = -(B2.T @ X + d2 * C1[p : p + m, :]) / d2**2
+    return Ag + B2 @ F - B1 @ C2, B1, F, True
+
+
+@njit(cache=True)
+def certificate_grid(wr, wi):
+    """Frequencies for the norm: 12 a decade beyond the poles, and every pole with its flanks."""
+    low, high = np.inf, 0.0
+    n = wr.size
+    for i in range(n):
+        size = np.hypot(wr[i], wi[i])
+        low, high = min(low, size), max(high, size)
+    low, high = np.log10(0.01 * low), np.log10(10.0 * high)
+    count = int(np.ceil(12.0 * (high - low))) + 1
+    grid = np.empty(count + 3 * n)
+    for i in range(count):
+        grid[i] = 10.0 ** (low + (high - low) * i / (count - 1))
+    k = count
+    for i in range(n):
+        if wi[i] > 0.0:
+            half = min(abs(wr[i]), 0.5 * wi[i])
+            grid[k], grid[k + 1], grid[k + 2] = wi[i] - half, wi[i], wi[i] + half
+            k += 3
+    return np.sort(grid[:k])
+
+
+@njit(cache=True)
+def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
+    """Certify a controller against `gamma` and fill in its closed-loop figures."""
+    row[Figure.GAMMA] = gamma
+    if not (np.all(np.isfinite(Ak)) and np.all(np.isfinite(Bk)) and np.all(np.isfinite(Ck))):
+        row[Figure.CODE] = Code.NOT_FINITE.value
+        return
+    As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
+    wr, wi, info = eigenvalues(As)
+    row[Figure.MAX_REAL_POLE] = wr.max()
+    if info != 0:
+        row[Figure.CODE] = Code.EIGENVALUES_FAILED.value
+        return
+    if not wr.max() < 0.0:
+        row[Figure.CODE] = Code.UNSTABLE_LOOP.value
+        return
+    G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
+    norm, at = stack_norm(G, K, Dk, w, certificate_grid(wr, wi))
+    row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
+    if not norm <= gamma:
+        row[Figure.CODE] = Code.NORM_EXCEEDED.value
+        return
+    if not level_test(G, K, Dk, w, weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w), gamma):
+        row[Figure.CODE] = Code.LEVEL_TEST_FAILED.value
+        return
+    row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
+    value, at, confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
+    row[Figure.PEAK], row[Figure.PEAK_FREQUENCY] = value, at
+    if not confirmed:
+        row[Figure.CODE] = Code.PEAK_NOT_CONFIRMED.value
+        return
+    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, As, Bs, Cs)
+    if info != 0:
+        row[Figure.CODE] = Code.EIGENVALUES_FAILED.value
+    elif not np.isfinite(row[Figure.BANDWIDTH]):
+        row[Figure.CODE] = Code.NO_BANDWIDTH.value
+    else:
+        row[Figure.CODE] = Code.CERTIFIED.value
+
+
+@njit(cache=True)
+def design(A, B, C, w, grid, sigma, backoff, omega_low, guess):
+    """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K."""
+    row = np.full(_COUNT, np.nan)
+    Ag, B1, B2, C1, C2, d1, d2 = generalized_plant(A, B, C, w)
+    p, m = C.shape[0], B.shape[1]
+    H0 = lqr_hamiltonian(Ag, B2, C1, d2, p, m)
+    bound, _ = gamma_lower_bound(A, B, C, w, grid, sigma)
+    gamma_opt, limited, forms, converged = optimal_gamma(
+        H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE
+    )
+    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, bound
+    row[Figure.LIMITED_BY_BOUND], row[Figure.SCHUR_FORMS] = limited, forms
+    gamma = backoff * gamma_opt
+    Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma)
+    if not converged:
+        row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
+    elif not ok:
+        row[Figure.CODE] = Code.RICCATI_FAILED.value
+    else:
+        assess(A, B, C, Ak, Bk, Ck, np.zeros((m, p)), w, gamma, omega_low, row)
+    return row, Ak, Bk, Ck
+
+
+@njit(cache=True)
+def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low):
+    """Rows (n_S, n_T, figures) over the frequencies of W1 and W3, each warm-started.
+
+    Boustrophedon order: the neighbour before is the guess for γ.
+    """
+    rows = np.empty((omega_S.size, omega_T.size, _COUNT))
+    guess = 0.0
+    weights = w.copy()
+    for j in range(omega_T.size):
+        weights[7] = omega_T[j]
+        for step in range(omega_S.size):
+            i = step if j % 2 == 0 else omega_S.size - 1 - step
+            weights[2] = omega_S[i]
+            row, _, _, _ = design(A, B, C, weights, grid, sigma, backoff, omega_low, guess)
+            rows[i, j, :] = row
+            guess = row[Figure.GAMMA_OPT] if row[Figure.CODE] == Code.CERTIFIED.value else 0.0
+    return rows

@@ -1,0 +1,74 @@
+"""State space of the weights and of the mixed-sensitivity generalized plant, in scaled units.
+
+States are ordered [plant; W1; W2; W3], the input is [w = r; u], the output is
+[z1 = W1 e; z2 = W2 u; z3 = W3 y; e = r - y]. Weights are diagonal, w·I, as in the
+paper's equations (4) to (6); a weight vector is (M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T),
+frequencies over the plant's ω₀, M_K absorbed in the unit of force.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def first_order_weights(w):
+    """(a, b, c, d) of W1, W2 and W3 as ẋ = -a x + b v, z = c x + d v, rows of a 3 x 4 array.
+
+    |b| = |c| so that neither the gain nor its inverse piles up on one side.
+    """
+    M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
+    out = np.empty((3, 4))
+    # W1 = 1/M_S + ω_S (1 - A_S/M_S)/(s + ω_S A_S)
+    out[0, 0], out[0, 1], out[0, 3] = ω_S * A_S, ω_S * (1.0 - A_S / M_S), 1.0 / M_S
+    # W2 = c_K + c_K ω_K (1 - c_K)/(s + c_K ω_K)
+    out[1, 0], out[1, 1], out[1, 3] = c_K * ω_K, c_K * ω_K * (1.0 - c_K), c_K
+    # W3 = 1/A_u + ω_T (1/A_l - 1/A_u)/A_u/(s + ω_T/A_u)
+    out[2, 0], out[2, 1], out[2, 3] = ω_T / A_u, ω_T * (1 / A_l - 1 / A_u) / A_u, 1.0 / A_u
+    for i in range(3):
+        residue = out[i, 1]
+        out[i, 1] = np.sqrt(abs(residue))
+        out[i, 2] = np.copysign(np.sqrt(abs(residue)), residue)
+    return out
+
+
+@njit(cache=True)
+def generalized_plant(A, B, C, w):
+    """A, B1, B2, C1, C2, d1, d2 of the generalized plant; D11 = [d1 I;0;0], D12 = [0;d2 I;0].
+
+    A (n, n), B (n, m), C (p, n) is the plant; the order is N = n + 2p + m.
+    """
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
+    f = first_order_weights(w)
+    N = n + 2 * p + m
+    i1, i2, i3 = n, n + p, n + p + m
+    Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p)), np.zeros((N, m))
+    C1, C2 = np.zeros((2 * p + m, N)), np.zeros((p, N))
+    Ag[:n, :n] = A
+    B2[:n, :] = B
+    C2[:, :n] = -C
+    C1[:p, :n] = -f[0, 3] * C
+    C1[p + m :, :n] = f[2, 3] * C
+    Ag[i1:i2, :n] = -f[0, 1] * C
+    Ag[i3:, :n] = f[2, 1] * C
+    for i in range(p):
+        Ag[i1 + i, i1 + i] = -f[0, 0]
+        B1[i1 + i, i] = f[0, 1]
+        C1[i, i1 + i] = f[0, 2]
+        Ag[i3 + i, i3 + i] = -f[2, 0]
+        C1[p + m + i, i3 + i] = f[2, 2]
+    for i in range(m):
+        Ag[i2 + i, i2 + i] = -f[1, 0]
+        B2[i2 + i, i] = f[1, 1]
+        C1[p + i, i2 + i] = f[1, 2]
+    return Ag, B1, B2, C1, C2, f[0, 3], f[1, 3]
+
+
+@njit(cache=True)
+def weight_magnitudes(w, ω):
+    """|W1(jω)|, |W2(jω)|, |W3(jω)| from their transfer functions, ω scaled."""
+    M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
+    return (
+        np.hypot(ω / M_S, ω_S) / np.hypot(ω, ω_S * A_S),
+        c_K * np.hypot(ω, ω_K) / np.hypot(ω, c_K * ω_K),
+        np.hypot(ω, ω_T / A_l) / np.hypot(A_u * ω, ω_T),
+    )

@@ -1,0 +1,162 @@
+"""The LAPACK routines that the compiled kernels call, taken from SciPy's own build of it.
+
+NumPy's linear algebra in numba has no ordered Schur form, no Sylvester solver and no
+eigenvalues of a real matrix with complex spectrum; these wrappers add just those. The
+symbols are registered by name, so that compiled kernels can be cached on disk.
+Matrices go in C order; the Fortran copies are made here.
+"""
+
+import llvmlite.binding as llvm
+import numpy as np
+from numba import njit, types
+from numba.extending import get_cython_function_address
+
+_F = types.CPointer(types.float64)
+_I = types.CPointer(types.int32)
+_C = types.CPointer(types.uint8)
+
+
+def _external(name: str, *args: types.Type) -> types.ExternalFunction:
+    symbol = "ccd_casadi_" + name
+    llvm.add_symbol(symbol, get_cython_function_address("scipy.linalg.cython_lapack", name))
+    return types.ExternalFunction(symbol, types.void(*args))
+
+
+# jobvs sort select n a lda sdim wr wi vs ldvs work lwork bwork info
+_dgees = _external("dgees", _C, _C, _I, _I, _F, _I, _I, _F, _F, _F, _I, _F, _I, _I, _I)
+# job compq select n t ldt q ldq wr wi m s sep work lwork iwork liwork info
+_dtrsen = _external(
+    "dtrsen", _C, _C, _I, _I, _F, _I, _F, _I, _F, _F, _I, _F, _F, _F, _I, _I, _I, _I
+)
+# trana tranb isgn m n a lda b ldb c ldc scale info
+_dtrsyl = _external("dtrsyl", _C, _C, _I, _I, _I, _F, _I, _F, _I, _F, _I, _F, _I)
+# jobvl jobvr n a lda wr wi vl ldvl vr ldvr work lwork info
+_dgeev = _external("dgeev", _C, _C, _I, _F, _I, _F, _F, _F, _I, _F, _I, _F, _I, _I)
+# n ilo ihi a lda tau work lwork info
+_dgehrd = _external("dgehrd", _I, _I, _I, _F, _I, _F, _F, _I, _I)
+# n ilo ihi a lda tau work lwork info
+_dorghr = _external("dorghr", _I, _I, _I, _F, _I, _F, _F, _I, _I)
+
+
+@njit(cache=True)
+def _int(value):
+    return np.full(1, value, np.int32)
+
+
+@njit(cache=True)
+def _char(value):
+    return np.full(1, value, np.uint8)
+
+
+@njit(cache=True)
+def schur(A):
+    """Real Schur form A = Q T Qᵀ (dgees). Returns T, Q in Fortran order, wr, wi, info."""
+    n = A.shape[0]
+    T = np.asfortranarray(A.copy())
+    Q = np.asfortranarray(np.zeros((n, n)))
+    wr, wi = np.empty(n), np.empty(n)
+    lwork = max(1, 16 * n)
+    work = np.empty(lwork)
+    info, sdim, logical = _int(0), _int(0), np.zeros(n, np.int32)
+    N = _int(n)
+    _dgees(
+        _char(86).ctypes, _char(78).ctypes, logical.ctypes, N.ctypes, T.ctypes, N.ctypes,
+        sdim.ctypes, wr.ctypes, wi.ctypes, Q.ctypes, N.ctypes, work.ctypes,
+        _int(lwork).ctypes, logical.ctypes, info.ctypes,
+    )  # fmt: skip
+    return T, Q, wr, wi, info[0]
+
+
+@njit(cache=True)
+def stable_subspace(H):
+    """Schur form of a 2N x 2N matrix, reordered with its left-half-plane part first.
+
+    Returns T11 (N x N, quasi upper triangular), U1, U2 (N x N) with
+    H [U1; U2] = [U1; U2] T11, the smallest |Re λ|/max(|λ|, tiny), and ok: False where the
+    spectrum does not split N to N, or LAPACK reports a failure.
+    """
+    n = H.shape[0]
+    half = n // 2
+    T, Q, wr, wi, info = schur(H)
+    gap = np.inf
+    count = 0
+    select = np.zeros(n, np.int32)
+    for i in range(n):
+        size = np.hypot(wr[i], wi[i])
+        gap = min(gap, abs(wr[i]) / max(size, 1e-300))
+        if wr[i] < 0.0:
+            select[i] = 1
+            count += 1
+    ok = info == 0 and count == half
+    if ok:
+        N, m, one = _int(n), _int(0), _int(1)
+        s, sep, work = np.zeros(1), np.zeros(1), np.empty(max(1, n))
+        iwork, lwork, flag = np.zeros(1, np.int32), _int(max(1, n)), _int(0)
+        _dtrsen(
+            _char(78).ctypes, _char(86).ctypes, select.ctypes, N.ctypes, T.ctypes, N.ctypes,
+            Q.ctypes, N.ctypes, wr.ctypes, wi.ctypes, m.ctypes, s.ctypes, sep.ctypes,
+            work.ctypes, lwork.ctypes, iwork.ctypes, one.ctypes, flag.ctypes,
+        )  # fmt: skip
+        ok = flag[0] == 0 and m[0] == half
+    T11 = np.ascontiguousarray(T[:half, :half])
+    U1 = np.ascontiguousarray(Q[:half, :half])
+    U2 = np.ascontiguousarray(Q[half:, :half])
+    return T11, U1, U2, gap, ok
+
+
+@njit(cache=True)
+def lyapunov_triangular(T, C, transposed):
+    """Z with Tᵀ Z + Z T = C (transposed) or T Z + Z Tᵀ = C, T quasi upper triangular."""
+    n = T.shape[0]
+    F = np.asfortranarray(T.copy())
+    Z = np.asfortranarray(C.copy())
+    N, scale, info = _int(n), np.ones(1), _int(0)
+    first = 84 if transposed else 78
+    second = 78 if transposed else 84
+    _dtrsyl(
+        _char(first).ctypes, _char(second).ctypes, _int(1).ctypes, N.ctypes, N.ctypes,
+        F.ctypes, N.ctypes, F.ctypes, N.ctypes, Z.ctypes, N.ctypes, scale.ctypes, info.ctypes,
+    )  # fmt: skip
+    return np.ascontiguousarray(Z) / scale[0]
+
+
+@njit(cache=True)
+def eigenvalues(A):
+    """Eigenvalues of a real matrix (dgeev, balanced). Returns Re, Im, info."""
+    n = A.shape[0]
+    F = np.asfortranarray(A.copy())
+    wr, wi, dummy = np.empty(n), np.empty(n), np.zeros(1)
+    lwork = max(1, 16 * n)
+    work = np.empty(lwork)
+    N, one, info = _int(n), _int(1), _int(0)
+    _dgeev(
+        _char(78).ctypes, _char(78).ctypes, N.ctypes, F.ctypes, N.ctypes, wr.ctypes, wi.ctypes,
+        dummy.ctypes, one.ctypes, dummy.ctypes, one.ctypes, work.ctypes, _int(lwork).ctypes,
+        info.ctypes,
+    )  # fmt: skip
+    return wr, wi, info[0]
+
+
+@njit(cache=True)
+def hessenberg(A):
+    """Hessenberg form A = Q H Qᵀ (dgehrd, dorghr). Returns H, Q in C order."""
+    n = A.shape[0]
+    F = np.asfortranarray(A.copy())
+    tau = np.zeros(max(1, n - 1))
+    lwork = max(1, 16 * n)
+    work = np.empty(lwork)
+    N, one, info, size = _int(n), _int(1), _int(0), _int(lwork)
+    _dgehrd(
+        N.ctypes, one.ctypes, N.ctypes, F.ctypes, N.ctypes, tau.ctypes, work.ctypes,
+        size.ctypes, info.ctypes,
+    )  # fmt: skip
+    Q = np.asfortranarray(F.copy())
+    _dorghr(
+        N.ctypes, one.ctypes, N.ctypes, Q.ctypes, N.ctypes, tau.ctypes, work.ctypes,
+        size.ctypes, info.ctypes,
+    )  # fmt: skip
+    H = np.ascontiguousarray(F)
+    for i in range(2, n):
+        for j in range(i - 1):
+            H[i, j] = 0.0
+    return H, np.ascontiguousarray(Q)

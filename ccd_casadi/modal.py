@@ -1,0 +1,104 @@
+"""Modal form of a plant, its rigid-body suspension and modal damping, with derivatives.
+
+Both are functions of the matrix M⁻¹K: K_s = M h(M⁻¹K) and D_s = M g(M⁻¹K), where h and g act
+on the eigenvalues λ = ω². Their derivatives follow from divided differences,
+
+    dh(Λ)_ij = h[λ_i, λ_j] dΛ_ij    (Daleckii and Krein),
+
+which is exact at double eigenvalues too. Rigid-body poles on the axis would make the
+mixed-sensitivity problem singular; the suspension puts them at (ω_r, ζ_r).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ccd_casadi.plant import Array, Mechanics, PlantError
+
+RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
+
+
+@dataclass(frozen=True)
+class Suspension:
+    """Where the rigid-body poles are put: frequency in Hz and damping ratio."""
+
+    frequency_hz: float = 0.1
+    damping_ratio: float = 0.7
+
+
+@dataclass(frozen=True)
+class ModalPlant:
+    """q̈ + D q̇ + K q = B u, y = C q in mass-normalised modal coordinates at one θ, SI.
+
+    `natural` holds the natural frequencies in rad/s before the suspension, `rigid` marks the
+    rigid-body modes, `modes` the mode shapes as columns. The `d…` arrays are derivatives to θ,
+    leading axis θ, in coordinates frozen at this θ, where M = I but dM is not zero.
+    """
+
+    K: Array
+    D: Array
+    B: Array
+    C: Array
+    natural: Array
+    rigid: np.ndarray
+    modes: Array
+    dM: Array
+    dK: Array
+    dD: Array
+    dB: Array
+    dC: Array
+
+
+def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
+    """Mass-normalised modal coordinates, with suspension and modal damping.
+
+    Raises PlantError where a stiffness is negative: the plant must be stable once suspended.
+    """
+    lam, modes = eigh(system.K, system.M)
+    w_r = 2.0 * np.pi * suspension.frequency_hz
+    threshold = max((RIGID_RATIO**2) * lam[-1], (1e-3 * w_r) ** 2)
+    if lam[0] < -threshold:
+        raise PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")
+    rigid = np.abs(lam) <= threshold
+    lam = np.where(rigid, 0.0, lam)
+    root = np.sqrt(lam)
+    h = np.where(rigid, w_r**2, lam)
+    given = system.damping_ratio is None
+    zeta = 0.0 if given else float(system.damping_ratio or 0.0)
+    g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
+
+    def to_modal(matrix: Array) -> Array:
+        return modes.T @ matrix @ modes
+
+    D_given = to_modal(system.D)
+    dM, dD, dK, dB, dC = system.derivatives
+    dM, dK = to_modal(dM), to_modal(dK)
+    dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I
+    dh = dM * h + _divided_differences(lam, h, rigid, np.ones_like(lam)) * dA
+    slope_g = np.divide(zeta, root, out=np.zeros_like(root), where=~rigid)
+    dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
+    return ModalPlant(
+        K=np.diag(h),
+        D=D_given + np.diag(g),
+        B=modes.T @ system.B,
+        C=system.C @ modes,
+        natural=root,
+        rigid=rigid,
+        modes=modes,
+        dM=dM,
+        dK=dh,
+        dD=to_modal(dD) + dg,
+        dB=modes.T @ dB,
+        dC=dC @ modes,
+    )
+
+
+def _divided_differences(lam: Array, values: Array, rigid: np.ndarray, slope: Array) -> Array:
+    """h[λ_i, λ_j]; among rigid modes zero, since they stay rigid at every θ."""
+    gap = lam[:, None] - lam[None, :]
+    close = np.abs(gap) <= 1e-9 * np.maximum(lam[:, None], lam[None, :])
+    safe = np.where(close, 1.0, gap)
+    mean_slope = 0.5 * (slope[:, None] + slope[None, :])
+    out = np.where(close, mean_slope, (values[:, None] - values[None, :]) / safe)
+    return np.where(rigid[:, None] & rigid[None, :], 0.0, out)

@@ -1,0 +1,142 @@
+"""The plant M(θ)ẍ + D(θ)ẋ + K(θ)x = B(θ)u, y = C(θ)x as CasADi expressions of θ.
+
+A model is a function of theta (a mapping of names to floats or CasADi symbols) and keyword
+options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one of `damping` or
+`damping_ratio`, `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0).
+(Paper, equations (1) and (2).)
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from ccd_casadi.errors import UserError
+
+Array = NDArray[np.float64]
+ModelFunction = Callable[..., Mapping[str, Any]]
+
+_REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
+_KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
+
+
+class PlantError(UserError):
+    """A model returned something that is no plant; the message says what and how to mend it."""
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """M, D, K (n, n), B (n, m), C (p, n) at one θ in SI, with their derivatives to θ.
+
+    `derivatives` holds ∂M, ∂D, ∂K, ∂B, ∂C as arrays with a leading axis over θ.
+    With `damping_ratio` given, D is the modal damping still to be made of it, here zero.
+    """
+
+    M: Array
+    D: Array
+    K: Array
+    B: Array
+    C: Array
+    damping_ratio: float | None
+    derivatives: tuple[Array, Array, Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A model bound to its parameters: the CasADi functions that the design loop calls."""
+
+    names: tuple[str, ...]
+    constraint_names: tuple[str, ...]
+    damping_ratio: float | None
+    matrices: ca.Function
+    hardware: ca.Function  # θ -> f, λ
+    outputs: int
+    inputs: int
+
+
+def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
+    """Trace `model` once with CasADi symbols and check what it returns.
+
+    Raises PlantError with a remedy where a key is missing or unknown, or a shape is wrong.
+    """
+    theta = ca.SX.sym("theta", len(names))
+    try:
+        result = model({name: theta[i] for i, name in enumerate(names)}, **options)
+    except TypeError as error:
+        raise PlantError(f"the plant model does not take its options: {error}") from error
+    except KeyError as error:
+        raise PlantError(f"the plant model asks for a theta that the case lacks: {error}") from None
+    missing = [key for key in _REQUIRED if key not in result]
+    if missing:
+        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
+    unknown = sorted(set(result) - _KNOWN)
+    if unknown:
+        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
+    if ("damping" in result) == ("damping_ratio" in result):
+        raise PlantError("the plant model must return either damping or damping_ratio; give one")
+    M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
+    n = M.shape[0]
+    D = ca.SX(result["damping"]) if "damping" in result else ca.SX.zeros(n, n)
+    shapes = {"mass": (M, (n, n)), "stiffness": (K, (n, n)), "damping": (D, (n, n))}
+    for key, (matrix, shape) in shapes.items():
+        if matrix.shape != shape:
+            raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
+    if B.shape[0] != n or C.shape[1] != n:
+        raise PlantError(f"input is {B.shape} and output {C.shape}; expected (n, m), (p, n), n={n}")
+    ratio = result.get("damping_ratio")
+    if ratio is not None and not 0.0 < float(ratio) < 1.0:
+        raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
+    constraints = dict(result.get("constraints", {}))
+    lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
+    dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]
+    slopes = [ca.densify(ca.jacobian(ca.vec(matrix), theta)) for matrix in dense]
+    return Plant(
+        names=tuple(names),
+        constraint_names=tuple(constraints),
+        damping_ratio=None if ratio is None else float(ratio),
+        matrices=ca.Function("matrices", [theta], dense + slopes),
+        hardware=ca.Function("hardware", [theta], [result["hardware_cost"], lam]),
+        outputs=C.shape[0],
+        inputs=B.shape[1],
+    )
+
+
+def mechanics(plant: Plant, theta: Sequence[float]) -> Mechanics:
+    """The plant's matrices and exact derivatives at θ.
+
+    Raises PlantError where they are not finite, M or K not symmetric, or M not positive definite.
+    """
+    values = [np.array(value) for value in plant.matrices(np.asarray(theta, float))]
+    if not all(np.isfinite(value).all() for value in values):
+        raise PlantError(f"the plant is not finite at theta = {_words(plant, theta)}")
+    M, D, K, B, C = values[:5]
+    for name, matrix in (("mass", M), ("stiffness", K)):
+        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+            raise PlantError(f"{name} is not symmetric at theta = {_words(plant, theta)}")
+    try:
+        np.linalg.cholesky(M)
+    except np.linalg.LinAlgError:
+        message = f"mass is not positive definite at theta = {_words(plant, theta)}"
+        raise PlantError(message) from None
+    slopes = tuple(
+        value.reshape(matrix.shape[1], matrix.shape[0], len(plant.names)).transpose(2, 1, 0).copy()
+        for matrix, value in zip(values[:5], values[5:], strict=True)
+    )
+    return Mechanics(M, D, K, B, C, plant.damping_ratio, slopes)  # type: ignore[arg-type]
+
+
+def hardware_cost(plant: Plant, theta: Sequence[float]) -> float:
+    """f(θ)."""
+    return float(plant.hardware(np.asarray(theta, float))[0])
+
+
+def constraint_values(plant: Plant, theta: Sequence[float]) -> Array:
+    """λ(θ), one value a name of `plant.constraint_names`; met where <= 0."""
+    return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
+
+
+def _words(plant: Plant, theta: Sequence[float]) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in zip(plant.names, theta, strict=True))

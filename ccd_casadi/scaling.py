@@ -1,0 +1,127 @@
+"""The scaled plant: time, force and state units in which every loop looks alike.
+
+Time is counted in 1/ω₀ with ω₀² = M_K ‖C‖ ‖B‖ (mass-normalised), the frequency at which M_K
+times the inertial compliance is about one; force in M_K times the unit of y. So the scaled
+plant M_K G(jω₀ω) has no units and does not change when the user's units do.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eig
+
+from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.modal import ModalPlant
+from ccd_casadi.plant import Array, PlantError
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """ẋ = A x + B v, z = C x + D v."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+
+@dataclass(frozen=True)
+class ScaledPlant:
+    """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
+
+    `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
+    the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
+    with ω₀ and the coordinates frozen.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    omega_0: float
+    force: float
+    grid: Array
+    gain: Array
+    natural: Array
+    dA: Array
+    dB: Array
+    dC: Array
+
+    def plant_si(self) -> StateSpace:
+        """The plant, force to displacement, time in s."""
+        w0 = self.omega_0
+        D = np.zeros((self.C.shape[0], self.B.shape[1]))
+        return StateSpace(w0 * self.A, w0 / self.force * self.B, self.C.copy(), D)
+
+    def controller_si(self, A: Array, B: Array, C: Array) -> StateSpace:
+        """A controller of the scaled plant, error in to force out, time in s."""
+        D = np.zeros((C.shape[0], B.shape[1]))
+        return StateSpace(self.omega_0 * A, self.omega_0 * B, self.force * C, D)
+
+
+def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
+    """Scale a modal plant for weights with this M_K; M_K in N/m (force over displacement).
+
+    Raises PlantError where no mode is both driven and measured.
+    """
+    b = np.linalg.norm(modal.B, axis=1)
+    c = np.linalg.norm(modal.C, axis=0)
+    omega_0 = float(np.sqrt(M_K * np.linalg.norm(b) * np.linalg.norm(c)))
+    if not omega_0 > 0.0:
+        raise PlantError("input or output is zero: no mode is both driven and measured")
+    K, D = modal.K / omega_0**2, modal.D / omega_0
+    drive = M_K / omega_0**2
+    # Stretch x1 = s q so that ẋ1 = s x2 and ẋ2 = -(K/s) x1 weigh alike; mode sizes by a, so
+    # that each mode is driven as strongly as it is measured.
+    s = np.maximum(np.sqrt(np.diag(K)), 1.0)
+    both = (b > 1e-12 * b.max()) & (c > 1e-12 * c.max())
+    a = np.sqrt(np.divide(drive * b * s, c, out=np.ones_like(b), where=both))
+    n, m, p = K.shape[0], modal.B.shape[1], modal.C.shape[0]
+    left, right = 1.0 / a, a
+
+    def lower(M: Array) -> Array:
+        return left[:, None] * M * right
+
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:] = np.diag(s)
+    A[n:, :n] = -lower(K) / s
+    A[n:, n:] = -lower(D)
+    B = np.vstack([np.zeros((n, m)), left[:, None] * drive * modal.B])
+    C = np.hstack([modal.C * right / s, np.zeros((p, n))])
+    count = modal.dM.shape[0]
+    dA, dB = np.zeros((count, 2 * n, 2 * n)), np.zeros((count, 2 * n, m))
+    dC = np.zeros((count, p, 2 * n))
+    for i in range(count):
+        dK = modal.dK[i] / omega_0**2 - modal.dM[i] @ K
+        dD = modal.dD[i] / omega_0 - modal.dM[i] @ D
+        dA[i, n:, :n] = -lower(dK) / s
+        dA[i, n:, n:] = -lower(dD)
+        dB[i, n:] = left[:, None] * drive * (modal.dB[i] - modal.dM[i] @ modal.B)
+        dC[i, :, :n] = modal.dC[i] * right / s
+    grid = _frequency_grid(A, B, C)
+    gain = np.array([plant_gain(A, B, C, omega) for omega in grid])
+    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC)
+
+
+def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
+    """A logarithmic grid with points crowded around lightly damped poles and zeros."""
+    roots = np.concatenate([np.linalg.eigvals(A), _transmission_zeros(A, B, C)])
+    roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
+    pieces = [np.geomspace(1e-5, 1e5, 121)]
+    flanks = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
+    for root in roots:
+        half = max(abs(root.real), 1e-9 * root.imag)
+        pieces += [root.imag + half * flanks, root.imag - half * flanks[1:]]
+    grid = np.unique(np.concatenate(pieces))
+    return np.ascontiguousarray(grid[(grid >= 1e-5) & (grid <= 1e5)])
+
+
+def _transmission_zeros(A: Array, B: Array, C: Array) -> np.ndarray:
+    """Finite invariant zeros of a square plant; none where it is not square."""
+    n, m = B.shape
+    if C.shape[0] != m:
+        return np.empty(0, complex)
+    system = np.block([[A, B], [C, np.zeros((m, m))]])
+    shape = np.zeros_like(system)
+    shape[:n, :n] = np.eye(n)
+    values = eig(system, shape, right=False)
+    return values[np.isfinite(values) & (np.abs(values) < 1e5)]

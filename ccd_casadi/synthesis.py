@@ -1,0 +1,158 @@
+"""Certified mixed-sensitivity H∞ synthesis at one θ and one pair (ω_S, ω_T).
+
+    K* = argmin ‖[W_S S; W_KS KS; W_T T]‖∞        (paper, equation (3))
+
+by one Riccati equation, at γ = gamma_backoff·γ_opt, certified from the rebuilt closed loop.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.kernels.design import Code, Figure, design
+from ccd_casadi.kernels.design import sweep as _sweep
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import ScaledPlant, StateSpace
+from ccd_casadi.weights import Weights
+
+
+class Outcome(StrEnum):
+    """How a synthesis ended. Only CERTIFIED designs are ever used; the value says why not."""
+
+    CERTIFIED = "certified"
+    GAMMA_NOT_CONVERGED = "the search for gamma_opt did not converge"
+    RICCATI_FAILED = "the Hamiltonian has eigenvalues on the axis: no stabilising Riccati solution"
+    NOT_FINITE = "the controller is not finite"
+    UNSTABLE_LOOP = "the rebuilt closed loop is not stable"
+    NORM_EXCEEDED = "the closed loop's norm exceeds gamma on the frequency grid"
+    LEVEL_TEST_FAILED = "the Hamiltonian test finds a gain above gamma"
+    NO_BANDWIDTH = "sigma_max(S) never crosses -3 dB from below"
+    EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
+    PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
+
+
+_OUTCOMES = {code: Outcome[code.name] for code in Code}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Evidence from the rebuilt loop: stability, and the norm against the bound it had to meet."""
+
+    stable: bool
+    max_real_pole: float  # 1/s
+    norm: float
+    norm_bound: float
+    passed: bool
+
+
+@dataclass(frozen=True)
+class DesignFigures:
+    """What one synthesis gave, in SI (rad/s); NaN where it ended before the figure was known."""
+
+    omega_S: float
+    omega_T: float
+    outcome: Outcome
+    gamma_opt: float
+    gamma_lower_bound: float
+    gamma: float
+    limited_by_bound: bool  # γ_opt = γ_jω, the limit that no controller passes
+    bandwidth: float
+    sensitivity_peak: float
+    sensitivity_peak_frequency: float
+    sensitivity_low: float
+    certificate: Certificate
+
+    @property
+    def certified(self) -> bool:
+        """Whether the design may be used at all."""
+        return self.outcome is Outcome.CERTIFIED
+
+
+@dataclass(frozen=True)
+class Design:
+    """A synthesis with its controller, input e = r - y, output u, in SI."""
+
+    figures: DesignFigures
+    weights: Weights
+    controller: StateSpace
+
+
+def synthesise(
+    plant: ScaledPlant,
+    weights: Weights,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+    guess: float = 0.0,
+) -> Design:
+    """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none)."""
+    row, Ak, Bk, Ck = design(
+        plant.A,
+        plant.B,
+        plant.C,
+        weights.scaled(plant.omega_0),
+        plant.grid,
+        plant.gain,
+        gamma_backoff,
+        omega_low / plant.omega_0,
+        guess,
+    )
+    figures = figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
+    return Design(figures, weights, plant.controller_si(Ak, Bk, Ck))
+
+
+def sweep(
+    plant: ScaledPlant,
+    weights: Weights,
+    omega_S: Array,
+    omega_T: Array,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+) -> list[DesignFigures]:
+    """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
+    w0 = plant.omega_0
+    rows = _sweep(
+        plant.A,
+        plant.B,
+        plant.C,
+        weights.scaled(w0),
+        np.asarray(omega_S, float) / w0,
+        np.asarray(omega_T, float) / w0,
+        plant.grid,
+        plant.gain,
+        gamma_backoff,
+        omega_low / w0,
+    )
+    return [
+        figures_from_row(rows[i, j], float(S), float(T), w0)
+        for i, S in enumerate(omega_S)
+        for j, T in enumerate(omega_T)
+    ]
+
+
+def figures_from_row(row: Array, omega_S: float, omega_T: float, omega_0: float) -> DesignFigures:
+    """A kernel's row of scaled figures in SI."""
+    code = Code(int(row[Figure.CODE]))
+    pole = float(row[Figure.MAX_REAL_POLE]) * omega_0
+    return DesignFigures(
+        omega_S=omega_S,
+        omega_T=omega_T,
+        outcome=_OUTCOMES[code],
+        gamma_opt=float(row[Figure.GAMMA_OPT]),
+        gamma_lower_bound=float(row[Figure.GAMMA_LOWER_BOUND]),
+        gamma=float(row[Figure.NORM]),
+        limited_by_bound=bool(row[Figure.LIMITED_BY_BOUND]),
+        bandwidth=float(row[Figure.BANDWIDTH]) * omega_0,
+        sensitivity_peak=float(row[Figure.PEAK]),
+        sensitivity_peak_frequency=float(row[Figure.PEAK_FREQUENCY]) * omega_0,
+        sensitivity_low=float(row[Figure.LOW]),
+        certificate=Certificate(
+            stable=pole < 0.0,
+            max_real_pole=pole,
+            norm=float(row[Figure.NORM]),
+            norm_bound=float(row[Figure.GAMMA]),
+            passed=code in (Code.CERTIFIED, Code.NO_BANDWIDTH),
+        ),
+    )
