@@ -1,0 +1,89 @@
+"""Total derivatives of a certified design's figures to θ and to the weights.
+
+The controller, γ_opt and the Riccati solution move with the plant; the paper's own gradient,
+with K held fixed (its equations (10) to (13)), comes along for the baseline.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.kernels.gradients import design_with_gradients
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import ScaledPlant
+from ccd_casadi.synthesis import DesignFigures, figures_from_row
+from ccd_casadi.weights import Weights
+
+MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
+_WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Figures of one design with their gradients.
+
+    `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt.
+    `to_theta` (4, n_θ) per unit of θ; `to_weights` maps a weight's name to the derivatives (4,)
+    to its logarithm. `fixed_controller` (n_θ) is dω_b/dθ with K held fixed.
+    `simple` tells whether σ_max is a simple singular value at the three frequencies; where it is
+    not, the gradient is one of several one-sided ones.
+    """
+
+    figures: DesignFigures
+    values: Array
+    to_theta: Array
+    to_weights: dict[str, Array]
+    fixed_controller: Array
+    simple: tuple[bool, bool, bool]
+
+    @property
+    def to_break_frequencies(self) -> Array:
+        """Derivatives (4, 2) to (ln ω_S, ln ω_T)."""
+        return np.column_stack([self.to_weights["omega_S"], self.to_weights["omega_T"]])
+
+
+def sensitivities(
+    plant: ScaledPlant,
+    weights: Weights,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+    guess: float = 0.0,
+) -> Sensitivities:
+    """Synthesise, certify and differentiate at one point; gradients are NaN if not certified."""
+    w0 = plant.omega_0
+    w = weights.scaled(w0)
+    row, _, _, _, gradient, fixed, gaps = design_with_gradients(
+        plant.A,
+        plant.B,
+        plant.C,
+        w,
+        plant.grid,
+        plant.gain,
+        gamma_backoff,
+        omega_low / w0,
+        guess,
+        plant.dA,
+        plant.dB,
+        plant.dC,
+    )
+    figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    gradient[0] *= w0
+    count = plant.dA.shape[0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        values = np.array(
+            [
+                figures.bandwidth,
+                np.log(figures.sensitivity_peak),
+                np.log(figures.sensitivity_low),
+                figures.gamma_opt,
+            ]
+        )
+    return Sensitivities(
+        figures=figures,
+        values=values,
+        to_theta=gradient[:, :count],
+        to_weights={name: gradient[:, count + i] * w[i] for i, name in enumerate(_WEIGHTS)},
+        fixed_controller=fixed * w0,
+        simple=(bool(gaps[0] > MULTIPLE_GAP), bool(gaps[1] > MULTIPLE_GAP), bool(gaps[2] > MULTIPLE_GAP)),
+    )
