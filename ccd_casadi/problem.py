@@ -1,0 +1,150 @@
+"""A co-design problem: everything that determines the true ω_b*(θ), and the way to ask for it.
+
+It is made of plain values, so that it can be sent to a worker process, hashed, and written
+beside the samples that it determines.
+"""
+
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.derivatives import Sensitivities
+from ccd_casadi.errors import UserError
+from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
+from ccd_casadi.inner_search import search_inner
+from ccd_casadi.modal import Suspension, modal_plant
+from ccd_casadi.models import MODELS
+from ccd_casadi.plant import Array, ModelFunction, Plant, build_plant, mechanics
+from ccd_casadi.scaling import ScaledPlant, scale_plant
+from ccd_casadi.weights import Weights
+
+NUMERICS = 1  # raised whenever a change of ours moves the numbers that a sample holds
+
+
+@dataclass(frozen=True)
+class PlantSource:
+    """Where the model comes from: a name of MODELS, or `file.py:function`, and its options."""
+
+    model: str | None
+    file: str | None
+    function: str | None
+    options: tuple[tuple[str, object], ...]
+
+    def identity(self) -> dict[str, object]:
+        """What determines the plant; a file counts by its content, not by where it lies."""
+        digest = None
+        if self.file is not None:
+            digest = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+        return {
+            "model": self.model,
+            "function": self.function,
+            "source": digest,
+            "options": dict(self.options),
+        }
+
+
+@dataclass(frozen=True)
+class CoDesignProblem:
+    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout."""
+
+    source: PlantSource
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    start: tuple[float, ...]
+    w1: float
+    w2: float
+    weights: Weights
+    inner: InnerProblem
+    suspension: Suspension
+    method: str = "search"  # how the inner problem is solved: "search" or "sweep"
+
+    def identity(self) -> dict[str, object]:
+        """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
+
+        S_max, S_low, bounds and the objective are not in it: the samples answer any of them.
+        """
+        w = self.weights
+        return {
+            "numerics": NUMERICS,
+            "plant": self.source.identity(),
+            "theta": list(self.names),
+            "suspension": [self.suspension.frequency_hz, self.suspension.damping_ratio],
+            "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u],
+            "omega_low": self.inner.omega_low,
+            "gamma_backoff": self.inner.gamma_backoff,
+        }
+
+    def inner_identity(self) -> dict[str, object]:
+        """What else determines ω_b*(θ)."""
+        inner = self.inner
+        return {
+            "S_max": inner.S_max,
+            "S_low": inner.S_low,
+            "omega_S": list(inner.omega_S),
+            "omega_T": list(inner.omega_T),
+            "sweep_points": list(inner.sweep_points),
+            "method": self.method,
+        }
+
+
+def plant_of(problem: CoDesignProblem) -> Plant:
+    """The CasADi plant, traced once in a process."""
+    return _plant(problem.source, problem.names)
+
+
+@lru_cache(maxsize=8)
+def _plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+    return build_plant(_model(source), names, dict(source.options))
+
+
+def _model(source: PlantSource) -> ModelFunction:
+    if source.model is not None:
+        return MODELS[source.model]
+    assert source.file is not None and source.function is not None
+    path = Path(source.file)
+    spec = importlib.util.spec_from_file_location("user_plant_" + path.stem, path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"{path}: not a Python file; name a file.py")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        message = f"{path}: cannot be loaded: {type(error).__name__}: {error}"
+        raise UserError(message) from error
+    function = getattr(module, source.function, None)
+    if not callable(function):
+        raise UserError(f"{path}: defines no function {source.function}; check plant.function")
+    return function
+
+
+def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
+    """The scaled plant at θ."""
+    modal = modal_plant(mechanics(plant_of(problem), theta), problem.suspension)
+    return scale_plant(modal, problem.weights.M_K)
+
+
+def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
+    """The true inner problem at θ, by the problem's method."""
+    solve = sweep_inner if problem.method == "sweep" else search_inner
+    return solve(scaled_plant(problem, theta), problem.weights, problem.inner)
+
+
+def true_design(
+    problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
+) -> Sensitivities:
+    """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s."""
+    return evaluate(
+        scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
+    )
+
+
+def box(problem: CoDesignProblem) -> tuple[Array, Array]:
+    """Lower and upper bounds of θ as arrays."""
+    return np.array(problem.lower), np.array(problem.upper)

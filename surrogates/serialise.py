@@ -1,0 +1,128 @@
+"""Surrogates as JSON files: readable, exact to the bit, and no code inside.
+
+    {"schema": "surrogates/1", "surrogates": [{"kind": ..., ...}], "extra": {...}}
+
+Python writes the shortest decimal that reads back as the same double, so arrays as
+nested lists lose nothing. The Cholesky factor is not stored but recomputed.
+"""
+
+import json
+import os
+import typing
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogates.gaussian_process import GaussianProcess
+from surrogates.interface import Surrogate
+
+SCHEMA = "surrogates/1"
+KINDS: dict[str, type[Any]] = {"gaussian_process": GaussianProcess}
+
+
+class SurrogateFileError(ValueError):
+    """The file is not a readable surrogate file of a schema this package knows."""
+
+
+def save(
+    surrogates: Surrogate | Sequence[Surrogate],
+    path: str | os.PathLike[str],
+    extra: dict[str, Any] | None = None,
+) -> None:
+    """Write surrogates to a JSON file, replacing it in one step or not at all.
+
+    `extra` is stored alongside and may hold anything JSON can: where the samples came
+    from, units, names.
+
+    Raises:
+        TypeError: a surrogate of unknown kind, or `extra` is not JSON.
+        ValueError: a number that is not finite.
+    """
+    members = list(surrogates) if isinstance(surrogates, Sequence) else [surrogates]
+    text = json.dumps(
+        {
+            "schema": SCHEMA,
+            "surrogates": [{"kind": _kind(member), **_encode(member)} for member in members],
+            "extra": extra or {},
+        },
+        allow_nan=False,
+    )
+    target = Path(path)
+    # In the same folder, since a rename is atomic only within one file system.
+    draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        with draft.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(draft, target)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str, Any]]:
+    """Return the surrogates of a file written by `save`, and its `extra`.
+
+    Raises:
+        SurrogateFileError: the file is truncated, foreign, of another schema, or its
+            arrays contradict each other.
+        OSError: the file cannot be read.
+    """
+    try:
+        document = json.loads(Path(path).read_bytes(), parse_constant=_refuse)
+    except ValueError as error:  # covers JSON, UTF-8 and the refused constants
+        raise SurrogateFileError(f"{path}: not a complete JSON file ({error})") from error
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema != SCHEMA:
+        raise SurrogateFileError(f"{path}: expected schema {SCHEMA!r}, found {schema!r}")
+    try:
+        members = []
+        for record in document["surrogates"]:
+            body = dict(record)
+            members.append(_decode(KINDS[body.pop("kind")], body))
+        extra = document["extra"]
+        if not isinstance(extra, dict):
+            raise TypeError("extra is not an object")
+    except (KeyError, TypeError, ValueError) as error:
+        raise SurrogateFileError(f"{path}: damaged record ({error!r})") from error
+    return tuple(members), extra
+
+
+def _kind(surrogate: Surrogate) -> str:
+    for name, cls in KINDS.items():
+        if type(surrogate) is cls:
+            return name
+    raise TypeError(f"cannot save a {type(surrogate).__name__}; known kinds: {sorted(KINDS)}")
+
+
+def _encode(value: Any) -> Any:
+    if is_dataclass(value):
+        return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.value if isinstance(value, Enum) else value
+
+
+def _decode(cls: Any, value: Any) -> Any:
+    if is_dataclass(cls):
+        hints = typing.get_type_hints(cls)
+        names = {f.name for f in fields(cls)}
+        if names != set(value):
+            raise ValueError(f"fields differ by {sorted(names ^ set(value))}")
+        return typing.cast(Any, cls)(**{k: _decode(hints[k], value[k]) for k in names})
+    if typing.get_origin(cls) is np.ndarray:
+        array = np.array(value, dtype=float)
+        if not np.isfinite(array).all():  # null and 1e999 come in as nan and inf
+            raise ValueError("an array holds what is no finite number")
+        return array
+    if cls is float and (type(value) not in (int, float) or not np.isfinite(value)):
+        raise ValueError(f"expected a finite number, found {value!r}")
+    return cls(value)
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(f"{constant} is no number")
