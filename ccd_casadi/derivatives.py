@@ -11,7 +11,7 @@ import numpy as np
 from ccd_casadi.kernels.gradients import design_with_gradients
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import DesignFigures, figures_from_row
+from ccd_casadi.synthesis import DesignFigures, failed_row, figures_from_row
 from ccd_casadi.weights import Weights
 
 MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
@@ -34,7 +34,7 @@ class Sensitivities:
     to_theta: Array
     to_weights: dict[str, Array]
     fixed_controller: Array
-    simple: tuple[bool, bool, bool]
+    simple: tuple[bool, ...]
 
     @property
     def to_break_frequencies(self) -> Array:
@@ -53,23 +53,18 @@ def sensitivities(
     """Synthesise, certify and differentiate at one point; gradients are NaN if not certified."""
     w0 = plant.omega_0
     w = weights.scaled(w0)
-    row, _, _, _, gradient, fixed, gaps = design_with_gradients(
-        plant.A,
-        plant.B,
-        plant.C,
-        w,
-        plant.grid,
-        plant.gain,
-        gamma_backoff,
-        omega_low / w0,
-        guess,
-        plant.dA,
-        plant.dB,
-        plant.dC,
-    )
+    arguments = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, gamma_backoff)
+    slopes = (plant.dA, plant.dB, plant.dC)
+    count = plant.dA.shape[0]
+    try:
+        row, _, _, _, gradient, fixed, gaps = design_with_gradients(
+            *arguments, omega_low / w0, guess, *slopes
+        )
+    except np.linalg.LinAlgError:
+        row, gradient = failed_row(), np.full((4, count + 8), np.nan)
+        fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     gradient[0] *= w0
-    count = plant.dA.shape[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.array(
             [
@@ -85,5 +80,5 @@ def sensitivities(
         to_theta=gradient[:, :count],
         to_weights={name: gradient[:, count + i] * w[i] for i, name in enumerate(_WEIGHTS)},
         fixed_controller=fixed * w0,
-        simple=(bool(gaps[0] > MULTIPLE_GAP), bool(gaps[1] > MULTIPLE_GAP), bool(gaps[2] > MULTIPLE_GAP)),
+        simple=tuple(bool(gap > MULTIPLE_GAP) for gap in gaps),
     )

@@ -245,3 +245,9 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         f"nearest design has a peak of {nearest.sensitivity_peak:.4g} and "
         f"|S(j omega_low)| = {nearest.sensitivity_low:.4g}"
     )
+
+
+if __name__ == "__main__":
+    from ccd_casadi.inner_command import main
+
+    raise SystemExit(main())

@@ -6,14 +6,14 @@ when the certificate passes, and not otherwise.
 """
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.kernels.design import Figure, assess
+from ccd_casadi.closed_loop import measure
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import Design, figures_from_row
+from ccd_casadi.synthesis import Design
 from ccd_casadi.weights import Weights
 
 
@@ -59,11 +59,14 @@ def synthesise_sb10ad(
             made = slycot.sb10ad(*size, gamma, A, B, C, D, job=4, gtol=tolerance)
     except (slycot.exceptions.SlycotError, ValueError) as error:
         return Sb10adResult(np.nan, None, str(error).strip())
-    Ak, Bk, Ck, Dk = (np.ascontiguousarray(matrix) for matrix in made[1:5])
-    row = np.full(int(Figure.COUNT), np.nan)
-    row[Figure.GAMMA_OPT], row[Figure.LIMITED_BY_BOUND] = gamma_opt, 0.0
-    omega_low /= plant.omega_0
-    assess(plant.A, plant.B, plant.C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row)
-    figures = figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
-    controller = plant.controller_si(Ak, Bk, Ck)
+    scaled = plant.controller_si(made[1], made[2], made[3])
+    controller = replace(scaled, D=plant.force * made[4])
+    figures = measure(
+        plant,
+        controller,
+        weights,
+        gamma=gamma,
+        omega_low=omega_low,
+        gamma_opt=gamma_opt,
+    )
     return Sb10adResult(gamma_opt, Design(figures, weights, controller), figures.outcome.value)

@@ -87,18 +87,13 @@ def synthesise(
     guess: float = 0.0,
 ) -> Design:
     """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none)."""
-    row, Ak, Bk, Ck = design(
-        plant.A,
-        plant.B,
-        plant.C,
-        weights.scaled(plant.omega_0),
-        plant.grid,
-        plant.gain,
-        gamma_backoff,
-        omega_low / plant.omega_0,
-        guess,
-    )
-    figures = figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
+    w0 = plant.omega_0
+    arguments = (plant.A, plant.B, plant.C, weights.scaled(w0), plant.grid, plant.gain)
+    try:
+        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess)
+    except np.linalg.LinAlgError:
+        row, Ak, Bk, Ck = failed_row(), *(np.full((1, 1), np.nan) for _ in range(3))
+    figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     return Design(figures, weights, plant.controller_si(Ak, Bk, Ck))
 
 
@@ -113,23 +108,30 @@ def sweep(
 ) -> list[DesignFigures]:
     """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
     w0 = plant.omega_0
-    rows = _sweep(
-        plant.A,
-        plant.B,
-        plant.C,
-        weights.scaled(w0),
-        np.asarray(omega_S, float) / w0,
-        np.asarray(omega_T, float) / w0,
-        plant.grid,
-        plant.gain,
-        gamma_backoff,
-        omega_low / w0,
-    )
+    S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
+    w = weights.scaled(w0)
+    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0)
+    try:
+        rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
+    except np.linalg.LinAlgError:  # one bad point must not take the others along
+        points = [[weights.at(float(s), float(t)) for t in T] for s in S]
+        return [
+            synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff).figures
+            for line in points
+            for point in line
+        ]
     return [
-        figures_from_row(rows[i, j], float(S), float(T), w0)
-        for i, S in enumerate(omega_S)
-        for j, T in enumerate(omega_T)
+        figures_from_row(rows[i, j], float(s), float(t), w0)
+        for i, s in enumerate(S)
+        for j, t in enumerate(T)
     ]
+
+
+def failed_row() -> Array:
+    """The row of a design whose linear algebra met an infinite or undefined number."""
+    row = np.full(int(Figure.COUNT), np.nan)
+    row[Figure.CODE], row[Figure.LIMITED_BY_BOUND] = float(Code.NOT_FINITE), 0.0
+    return row
 
 
 def figures_from_row(row: Array, omega_S: float, omega_T: float, omega_0: float) -> DesignFigures:

@@ -1,0 +1,124 @@
+"""`python -m ccd_casadi.inner CASE.toml --theta m1=60,m2=60`: the true inner loop at one θ."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+from ccd_casadi.case import HZ, CaseError, load_case, parse_theta, problem_of
+from ccd_casadi.closed_loop import local_peaks
+from ccd_casadi.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.inner import active_constraints
+from ccd_casadi.plant import hardware_cost
+from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
+from ccd_casadi.results import clean, controller_dict, figures_dict, versions, write_json
+from ccd_casadi.synthesis import DesignFigures, synthesise
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Print one JSON object; with both break frequencies given, of that single synthesis."""
+    case = load_case(options.case)
+    problem = problem_of(case)
+    theta = parse_theta(case, options.theta)
+    single = (options.omega_S_hz, options.omega_T_hz)
+    if (single[0] is None) != (single[1] is None):
+        raise CaseError(f"{case.path}: give both --omega-s-hz and --omega-t-hz, or neither")
+    began = perf_counter()
+    cost = hardware_cost(plant_of(problem), theta)
+    head: dict[str, Any] = {
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "hardware_cost": cost,
+    }
+    rows: tuple[DesignFigures, ...] = ()
+    if single[0] is not None:
+        point = (HZ * single[0], HZ * single[1])
+        syntheses, shortfall = 1, ""
+    else:
+        found = true_inner(problem, theta)
+        syntheses, shortfall, rows = found.syntheses, found.shortfall, found.rows
+        if found.optimum is None:
+            answer = head | {"status": "infeasible", "reason": shortfall, "syntheses": syntheses}
+            _print(answer, rows, options, began)
+            return ExitCode.INFEASIBLE
+        point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
+    code, answer, controller = _design(problem, theta, point)
+    answer = head | answer | {"syntheses": syntheses}
+    answer["objective"] = problem.w1 * cost + problem.w2 * HZ * (answer["bandwidth_hz"] or 0.0)
+    _print(answer, rows, options, began)
+    if options.out is not None:
+        folder = run_folder(options.case, options.out)
+        write_json(folder / "controller.json", controller)
+    return code
+
+
+def _design(
+    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
+) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
+    plant = scaled_plant(problem, theta)
+    made = synthesise(
+        plant,
+        problem.weights.at(*point),
+        omega_low=problem.inner.omega_low,
+        gamma_backoff=problem.inner.gamma_backoff,
+    )
+    figures = made.figures
+    feasible = problem.inner.feasible(figures)
+    status = "verified" if figures.certified else "not_verified"
+    answer = {
+        "status": status,
+        **clean(figures_dict(figures)),
+        "active": list(active_constraints(problem.inner, figures)) if feasible else [],
+        "feasible": feasible,
+        "local_peaks": [
+            {"hz": omega / HZ, "sensitivity": gain} for omega, gain in local_peaks(plant, made.controller)
+        ],
+        "natural_hz": [float(omega) / HZ for omega in plant.natural],
+    }
+    code = ExitCode.DONE if figures.certified else ExitCode.NOT_VERIFIED
+    return code, answer, controller_dict(made.controller)
+
+
+def _print(
+    answer: dict[str, Any],
+    rows: tuple[DesignFigures, ...],
+    options: argparse.Namespace,
+    began: float,
+) -> None:
+    answer = answer | {
+        "seconds": perf_counter() - began,
+        "seed": options.seed,
+        "formulation": "inner",
+        "versions": versions(),
+        "sweep": [clean(figures_dict(row)) for row in rows],
+    }
+    json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
+    print()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = parser(
+        "ccd_casadi.inner", "The true inner problem at one theta, as JSON on stdout."
+    )
+    arguments.add_argument("--theta", required=True, metavar="m1=60,m2=60")
+    for name in ("S", "T"):
+        arguments.add_argument(
+            f"--omega-{name.lower()}-hz",
+            dest=f"omega_{name}_hz",
+            type=_frequency,
+            metavar="X",
+            help=f"with the other one: a single synthesis at this omega_{name}",
+        )
+    return run(command, arguments, argv)
+
+
+def _frequency(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a frequency above 0")
+    return value

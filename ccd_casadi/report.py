@@ -1,0 +1,2 @@
+def write_report(folder, case, problem, solution) -> None:
+    (folder / "report.html").write_text("")

@@ -1,0 +1,213 @@
+"""`python -m ccd_casadi.solve CASE.toml`: sample, fit, IPOPT, verify; writes the run folder."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from surrogates import design, save
+
+from ccd_casadi.case import Case, case_to_toml, load_case, problem_of
+from ccd_casadi.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.direct import solve_direct
+from ccd_casadi.iterates import FormulationResult
+from ccd_casadi.lifted import solve_lifted
+from ccd_casadi.nested import solve_nested
+from ccd_casadi.parallel import Workers
+from ccd_casadi.problem import box, plant_of
+from ccd_casadi.results import (
+    controller_dict,
+    infeasible_dict,
+    result_dict,
+    write_json,
+)
+from ccd_casadi.sampling import Truth
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.verify import VerifiedDesign, verify
+
+FORMULATIONS = ("nested", "lifted", "direct")
+_CODES = {
+    "verified": ExitCode.DONE,
+    "not_verified": ExitCode.NOT_VERIFIED,
+    "infeasible": ExitCode.INFEASIBLE,
+}
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Everything a run found: the JSON result, and the objects behind it (None: infeasible)."""
+
+    result: dict[str, Any]
+    outcome: FormulationResult
+    verified: VerifiedDesign | None
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """The command's exit code."""
+        return _CODES[self.result["status"]]
+
+
+def solve(case: Case, truth: Truth, formulation: str, seed: int) -> Solution:
+    """Run one formulation, verify and polish its design on the truth."""
+    began = perf_counter()
+    outcome = _formulate(case, truth, formulation, seed)
+    if outcome.x is None:
+        outcome = _rescue(truth, outcome, seed)
+    if outcome.x is None:
+        result = infeasible_dict(
+            formulation,
+            outcome.message,
+            syntheses=truth.syntheses,
+            seconds=perf_counter() - began,
+            seed=seed,
+        )
+        return Solution(result, outcome, None)
+    verified = verify(truth, outcome.x)
+    result = result_dict(
+        truth.problem,
+        formulation,
+        outcome,
+        verified,
+        tolerance=case.outer.tolerance,
+        syntheses=truth.syntheses,
+        seconds=perf_counter() - began,
+        seed=seed,
+    )
+    return Solution(result, outcome, verified)
+
+
+def _formulate(case: Case, truth: Truth, formulation: str, seed: int) -> FormulationResult:
+    outer, sampling = case.outer, case.sampling
+    if formulation == "nested":
+        return solve_nested(
+            truth,
+            kind=sampling.design,
+            points=sampling.points,
+            starts=outer.starts,
+            tolerance=outer.tolerance,
+            max_refinements=outer.max_refinements,
+            seed=seed,
+        )
+    if formulation == "lifted":
+        # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
+        # gives n+1 numbers; eight times as many leave room for what is not quadratic.
+        points = sampling.lifted_points or 8 * (len(case.theta) + 4)
+        return solve_lifted(
+            truth,
+            points=points,
+            starts=outer.starts,
+            tolerance=outer.tolerance,
+            max_refinements=outer.max_refinements,
+            seed=seed,
+        )
+    return solve_direct(truth, starts=outer.direct_starts, seed=seed)
+
+
+def _rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationResult:
+    """Ask the true inner problem at a few θ: is the case infeasible, or did a formulation fail?"""
+    lower, upper = box(truth.problem)
+    points = design("sobol", lower, upper, 8, seed)
+    samples = truth.bandwidths(points, "looking for a feasible design")
+    feasible = [sample for sample in samples if sample.feasible]
+    if not feasible:
+        words = samples[0].shortfall or outcome.message
+        return FormulationResult(None, None, outcome.iterates, (), None, False, words)
+    best = max(feasible, key=lambda sample: sample.bandwidth)
+    x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
+    return FormulationResult(
+        x, None, outcome.iterates, outcome.surrogates, outcome.outer, False, outcome.message
+    )
+
+
+def write_run(folder: Path, case: Case, solution: Solution) -> None:
+    """Write case.toml, result.json, controller.json and surrogate.json."""
+    (folder / "case.toml").write_text(case_to_toml(case))
+    if solution.verified is not None:
+        write_json(
+            folder / "controller.json", controller_dict(solution.verified.design.controller)
+        )
+    if solution.outcome.surrogates:
+        save(
+            solution.outcome.surrogates,
+            folder / "surrogate.json",
+            {
+                "formulation": solution.result["formulation"],
+                "outputs": ["bandwidth"]
+                if len(solution.outcome.surrogates) == 1
+                else ["bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low"],
+                "loo": [vars(process.loo) for process in solution.outcome.surrogates],
+            },
+        )
+    write_json(folder / "result.json", solution.result)
+
+
+def summary(solution: Solution) -> str:
+    """The result in a few lines for the terminal."""
+    result = solution.result
+    if result["status"] == "infeasible":
+        return f"no feasible design: {result['reason']}"
+    units = result["units"]
+    theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
+    lines = [
+        f"status        {result['status']}  {result['reason']}".rstrip(),
+        f"theta         {theta}",
+        f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
+        f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "
+        f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
+        f"weights       omega_S = {result['omega_S_hz']:.5g} Hz, "
+        f"omega_T = {result['omega_T_hz']:.5g} Hz",
+        f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
+        f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        f"certificate   {'passed' if result['certificate']['passed'] else 'FAILED'}: norm "
+        f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
+        f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
+        f"binding       {', '.join(result['active']) or 'nothing'}",
+        f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
+        f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
+    ]
+    return "\n".join(lines)
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """The command itself."""
+    case = load_case(options.case)
+    problem = problem_of(case)
+    plant_of(problem)  # a wrong plant is told before anything is written
+    folder = run_folder(options.case, options.out)
+    store = folder / "samples.sqlite"
+    with SampleStore(store) as samples, Workers(options.workers) as workers:
+        truth = Truth(problem, samples, workers, quiet=options.quiet)
+        solution = solve(case, truth, options.formulation, options.seed)
+        write_run(folder, case, solution)
+    if solution.verified is not None:
+        from ccd_casadi.report import write_report  # matplotlib is slow to import
+
+        write_report(folder, case, problem, solution)
+    if not options.quiet:
+        print(summary(solution))
+        print(f"run folder    {folder}")
+    elif solution.exit_code is not ExitCode.DONE:
+        print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
+    return solution.exit_code
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = parser("ccd_casadi.solve", "Co-design a stage and its controller; see the README.")
+    arguments.add_argument(
+        "--formulation", choices=FORMULATIONS, default="nested", help="default: nested"
+    )
+    arguments.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on from the samples in the run folder (every run does; kept for scripts)",
+    )
+    return run(command, arguments, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,109 @@
+"""Verification of an optimum by the true synthesis, its controller, and optimality of the truth."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.closed_loop import measure
+from ccd_casadi.direct import acceptable, polish
+from ccd_casadi.inner import active_constraints
+from ccd_casadi.kkt import KktCertificate, kkt_certificate
+from ccd_casadi.modal import Suspension
+from ccd_casadi.outer import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.plant import Array, constraint_values, hardware_cost
+from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.sampling import Truth
+from ccd_casadi.synthesis import Design, DesignFigures, synthesise
+from ccd_casadi.true_function import TrueQuantities
+
+POLISH_ROUNDS = 3
+UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
+INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
+
+
+@dataclass(frozen=True)
+class VerifiedDesign:
+    """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
+
+    `inner_gap`: by how much (relative) the global inner problem at θ beats the design's ω_b.
+    `unsuspended`: the same controller on the plant with its rigid-body modes free.
+    """
+
+    x: Array
+    theta: tuple[float, ...]
+    design: Design
+    objective: float
+    hardware_cost: float
+    active: tuple[str, ...]
+    kkt: KktCertificate
+    inner_gap: float
+    feasible: bool
+    unsuspended: DesignFigures
+
+
+def verify(truth: Truth, x: Array) -> VerifiedDesign:
+    """Polish x on the true problem, ask the global inner problem there, certify what results."""
+    problem = truth.problem
+    count = len(problem.names)
+    quantities = TrueQuantities(problem, truth.record)
+    gap = np.inf
+    design = None
+    for _ in range(POLISH_ROUNDS):
+        x, design, _ = polish(truth, x)
+        at_bounds = _snapped(problem, x)
+        if acceptable(problem, at_bounds, quantities.at(at_bounds)):
+            x, design = at_bounds, quantities.at(at_bounds)
+        inner = truth.bandwidths(x[:count], "verifying")[0]
+        gap = inner.bandwidth / design.figures.bandwidth - 1.0 if inner.feasible else 0.0
+        if gap <= INNER_GAP:
+            break
+        # the inner problem has a better design at this θ: go on from there
+        x = np.array([*inner.theta, np.log(inner.omega_S), np.log(inner.omega_T)])
+    assert design is not None
+    theta = tuple(float(v) for v in x[:count])
+    figures = design.figures
+    plant = scaled_plant(problem, theta)
+    final = synthesise(
+        plant,
+        problem.weights.at(figures.omega_S, figures.omega_T),
+        omega_low=problem.inner.omega_low,
+        gamma_backoff=problem.inner.gamma_backoff,
+    )
+    free = replace(problem, suspension=Suspension(0.0, 0.0))
+    unsuspended = measure(
+        scaled_plant(free, theta),
+        final.controller,
+        final.weights,
+        gamma=UNBOUNDED,
+        omega_low=problem.inner.omega_low,
+    )
+    cost = hardware_cost(plant_of(problem), theta)
+    return VerifiedDesign(
+        x=x,
+        theta=theta,
+        design=final,
+        objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
+        hardware_cost=cost,
+        active=_active(problem, x, final.figures),
+        kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
+        inner_gap=float(gap),
+        feasible=acceptable(problem, x, design),
+        unsuspended=unsuspended,
+    )
+
+
+def _snapped(problem: CoDesignProblem, x: Array) -> Array:
+    """Put variables that IPOPT left within rounding of a bound onto it."""
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    x = np.where(np.abs(x - lower) <= 1e-9 * width, lower, x)
+    return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)
+
+
+def _active(problem: CoDesignProblem, x: Array, figures: DesignFigures) -> tuple[str, ...]:
+    program = lifted_program(problem, TrueQuantities(problem), exact_hessian=False)
+    bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
+    plant = plant_of(problem)
+    lam = constraint_values(plant, x[: len(problem.names)])
+    extra = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
+    return (*bounds, *active_constraints(problem.inner, figures), *extra)
