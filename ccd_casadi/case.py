@@ -4,7 +4,9 @@ Units are those of the file (Hz where a name says so); `problem_of` makes the SI
 """
 
 import difflib
+import inspect
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -15,7 +17,7 @@ from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
 from ccd_casadi.models import MODELS
-from ccd_casadi.problem import CoDesignProblem, PlantSource
+from ccd_casadi.problem import CoDesignProblem, PlantSource, plant_of
 from ccd_casadi.weights import Weights
 
 HZ = 2.0 * math.pi
@@ -28,15 +30,16 @@ class CaseError(UserError):
 Check = Callable[[Any], str | None]
 
 
-def _number(low: float, high: float, remedy: str) -> Check:
-    """An open interval; `remedy` says what to give."""
+def _number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
+    """Inside (low, high), or [low, high) if `closed`; `remedy` says what to give."""
 
     def check(value: Any) -> str | None:
         if isinstance(value, bool) or not isinstance(value, int | float):
             return f"is {_shown(value)}, not a number; {remedy}"
-        if not math.isfinite(value):
-            return f"is {value}; {remedy}"
-        return None if low < value < high else f"is {value:g}; {remedy}"
+        if _too_large(value) or not math.isfinite(value):
+            return f"is {_shown(value)}; {remedy}"
+        inside = low < value < high or (closed and value == low)
+        return None if inside else f"is {value:g}; {remedy}"
 
     return check
 
@@ -44,7 +47,9 @@ def _number(low: float, high: float, remedy: str) -> Check:
 def _count(least: int) -> Check:
     def check(value: Any) -> str | None:
         good = isinstance(value, int) and not isinstance(value, bool) and value >= least
-        return None if good else f"is {_shown(value)}; give a whole number of at least {least}"
+        if good and not _too_large(value):
+            return None
+        return f"is {_shown(value)}; give a whole number of at least {least}"
 
     return check
 
@@ -79,8 +84,18 @@ def _points(value: Any) -> str | None:
     return f"is {_shown(value)}; give two whole numbers of at least 2"
 
 
+def _too_large(value: Any) -> bool:
+    """TOML's integers have 64 bits; Python's parser takes any, and neither float nor repr do."""
+    return isinstance(value, int) and abs(value) >= 2**63
+
+
 def _shown(value: Any) -> str:
-    text = repr(list(value) if isinstance(value, tuple) else value).replace("\n", " ")
+    if _too_large(value):
+        return "an integer of more than 64 bits"
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except (ValueError, RecursionError):  # a huge integer or a very deep array inside
+        return "a value too long to show"
     return text if len(text) < 60 else text[:57] + "..."
 
 
@@ -120,7 +135,7 @@ class Parameter:
 class ObjectiveSection:
     """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s."""
 
-    w1: float = _key(_number(-1e-300, math.inf, "give 0 or more: J is minimised"))
+    w1: float = _key(_number(0.0, math.inf, "give 0 or more: J is minimised", closed=True))
     w2: float = _key(_number(-math.inf, 0.0, "give a negative number: J must reward bandwidth"))
 
 
@@ -198,6 +213,15 @@ class Case:
     outer: OuterSection
 
 
+# Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
+_ORDERED_WEIGHTS = (
+    ("A_S", "M_S", "W_S asks for more at low frequency"),
+    ("A_u", "A_l", "W_T asks for a roll-off"),
+)
+# What the models of the package take, as far as a function's signature does not say it.
+_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2")}
+_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {("two_mass", "zeta"): _FRACTION}
+
 _SECTIONS: dict[str, type] = {
     "objective": ObjectiveSection,
     "weights": WeightsSection,
@@ -211,17 +235,28 @@ _SECTIONS: dict[str, type] = {
 def load_case(path: str | Path) -> Case:
     """Read and check a case file. Raises CaseError on the first mistake."""
     path = Path(path)
+
+    def fail(words: str) -> CaseError:
+        return CaseError(_one_line(f"{path}: {words}"))
+
     try:
-        data = tomllib.loads(path.read_bytes().decode("utf-8"))
+        text = path.read_bytes().decode("utf-8-sig")  # some editors write a byte-order mark
     except FileNotFoundError:
-        raise CaseError(f"{path}: there is no such file; name a case file (TOML)") from None
-    except UnicodeDecodeError:
-        raise CaseError(f"{path}: is not UTF-8 text; name a case file (TOML)") from None
-    except tomllib.TOMLDecodeError as error:
-        raise CaseError(f"{path}: is not valid TOML: {_one_line(error)}; mend that line") from None
+        raise fail("there is no such file; name a case file (TOML)") from None
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise fail(f"line {line} is not UTF-8 text; save the file as UTF-8") from None
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or _one_line(error)
-        raise CaseError(f"{path}: cannot be read: {reason}; name a readable file") from None
+        reason = getattr(error, "strerror", None) or error
+        raise fail(f"cannot be read: {reason}; name a readable file") from None
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise fail(f"is not valid TOML: {error}; mend that line") from None
+    except RecursionError:
+        raise fail("is not valid TOML: nested too deeply; flatten its arrays") from None
+    except ValueError:
+        raise fail("holds an integer of thousands of digits; write it as a float") from None
     return parse_case(data, path)
 
 
@@ -246,12 +281,24 @@ def parse_case(data: Mapping[str, Any], path: Path) -> Case:
         if required and name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
         sections[name] = _section(kind, name, data.get(name, {}), fail)
-    return Case(
-        path=path,
-        plant=_plant(data["plant"], path, fail),
-        theta=_theta(data["theta"], fail),
-        **sections,
-    )
+    for low, high, why in _ORDERED_WEIGHTS:
+        below, above = getattr(sections["weights"], low), getattr(sections["weights"], high)
+        if not below < above:
+            words = f"is {above:g}, not above {low} = {below:g}; give {high} > {low}, so that {why}"
+            raise fail(f"weights.{high}", words)
+    plant = _plant(data["plant"], path, fail)
+    theta = _theta(data["theta"], fail)
+    needed = _MODEL_THETA.get(plant.model or "")
+    if needed is not None:
+        for name in data["theta"]:
+            if name not in needed:
+                hint = _closest(name, needed)
+                raise fail(f"theta.{name}", f"is no parameter of {plant.model}{hint}")
+        for name in needed:
+            if name not in data["theta"]:
+                words = f"is missing; add a table [theta.{name}], which {plant.model} needs"
+                raise fail(f"theta.{name}", words)
+    return Case(path=path, plant=plant, theta=theta, **sections)
 
 
 def _section(
@@ -298,23 +345,34 @@ def _plant(
         except (OSError, ValueError):
             exists = False
         if not exists:
-            raise fail(
-                "plant.function", f"there is no file {_shown(parts[0])} beside the case file"
-            )
+            words = f"there is no file {_shown(parts[0])}; give its path relative to the case file"
+            raise fail("plant.function", words)
+        # Absolute, so that the resolved case means the same from the run folder.
+        function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
+    takes = None if model is None else list(inspect.signature(MODELS[model]).parameters)[1:]
     for key, value in options.items():
-        wrong = _option(value)
-        if wrong or not key.isidentifier():
-            reason = wrong or "is no keyword; use a Python identifier"
-            raise fail(f"plant.{key}", reason)
+        if not key.isidentifier():
+            raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
+        if takes is not None and key not in takes:
+            raise fail(f"plant.{key}", f"is no option of {model}{_closest(key, takes)}")
+        wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
+        if wrong is not None:
+            raise fail(f"plant.{key}", wrong)
     return PlantSection(model, function, options)
 
 
 def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
+    if _too_large(value):
+        return f"is {_shown(value)}; write it as a float"
     if isinstance(value, list):
-        return next((wrong for wrong in map(_option, value) if wrong), None)
+        for item in value:
+            wrong = _option(item)
+            if wrong is not None:
+                return wrong
+        return None
     if isinstance(value, str | bool | int | float):
         return None
     return f"is {_shown(value)}; give a number, text, true or false, or a list of them"
@@ -348,7 +406,7 @@ def _theta(
             raise fail(f"{place}.lower", f"{lower:g} is above upper = {upper:g}; swap them")
         if lower == upper or not math.isfinite(upper - lower):
             raise fail(f"{place}.lower", f"{lower:g} to {upper:g} is no range; widen it")
-        start = float(entry.get("start", 0.5 * (lower + upper)))
+        start = float(entry.get("start", 0.5 * lower + 0.5 * upper))
         if not lower <= start <= upper:
             words = f"{start:g} is outside {lower:g} to {upper:g}; give a start within the bounds"
             raise fail(f"{place}.start", words)
@@ -362,7 +420,9 @@ def _closest(name: str, known: Any) -> str:
 
 
 def _one_line(value: object) -> str:
-    return " ".join(str(value).split())
+    """On one line, with what a terminal would obey (a key may hold it) written as escapes."""
+    words = " ".join(str(value).split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
 
 
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:
@@ -376,7 +436,9 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
     for part in text.split(","):
         name, equals, value = (item.strip() for item in part.partition("="))
         if not equals:
-            raise fail(f"{_shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
+            raise fail(
+                f"{_shown(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
+            )
         if name not in names:
             raise fail(f"{_shown(name)} is no parameter of the case{_closest(name, names)}")
         if name in found:
@@ -384,26 +446,29 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
         try:
             found[name] = float(value)
         except ValueError:
-            raise fail(f"{name} = {_shown(value)} is not a number") from None
+            raise fail(f"{name} = {_shown(value)} is not a number; give one") from None
     for parameter in case.theta:
         if parameter.name not in found:
             raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
-        value = found[parameter.name]
-        if not parameter.lower <= value <= parameter.upper:
+        number = found[parameter.name]
+        if not parameter.lower <= number <= parameter.upper:
             bounds = f"{parameter.lower:g} to {parameter.upper:g}"
-            raise fail(f"{parameter.name} = {value:g} is outside its bounds {bounds}")
+            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
     return tuple(found[name] for name in names)
 
 
 def problem_of(case: Case) -> CoDesignProblem:
-    """The case in SI, as the lower layers take it."""
+    """The case in SI, as the lower layers take it.
+
+    The plant is traced once here. Raises CaseError where it cannot be.
+    """
     inner, w = case.inner, case.weights
     file = function = None
     if case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
     options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
-    return CoDesignProblem(
+    problem = CoDesignProblem(
         source=PlantSource(case.plant.model, file, function, options),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
@@ -435,6 +500,16 @@ def problem_of(case: Case) -> CoDesignProblem:
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
     )
+    try:
+        plant_of(problem)
+    except UserError as error:
+        raise CaseError(_one_line(f"{case.path}: plant: {error}")) from error
+    except Exception as error:
+        if function is None:
+            raise
+        words = f"{function} raised {type(error).__name__}: {error}; mend it"
+        raise CaseError(_one_line(f"{case.path}: plant.function: {words}")) from error
+    return problem
 
 
 def _frozen(value: Any) -> Any:
@@ -447,14 +522,18 @@ def case_to_toml(case: Case) -> str:
     lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
     for parameter in case.theta:
         entry = {key: value for key, value in vars(parameter).items() if key != "name"}
-        lines += ["", f"[theta.{parameter.name}]", *_pairs(entry)]
+        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(entry)]
     for name in _SECTIONS:
         lines += ["", f"[{name}]", *_pairs(vars(getattr(case, name)))]
     return "\n".join(lines) + "\n"
 
 
 def _pairs(table: Mapping[str, Any]) -> list[str]:
-    return [f"{key} = {_toml(value)}" for key, value in table.items()]
+    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in table.items()]
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else _toml(key)
 
 
 def _toml(value: Any) -> str:

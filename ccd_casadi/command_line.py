@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from pathlib import Path
+from typing import NoReturn
 
 from ccd_casadi.errors import UserError
 from ccd_casadi.parallel import usable_cores
@@ -23,9 +24,17 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
-def parser(command: str, description: str, *, case_required: bool = False) -> argparse.ArgumentParser:
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, as for every other bad input, in place of the usage."""
+        self.exit(ExitCode.BAD_INPUT, f"{_one_line(message)}; see {self.prog} --help\n")
+
+
+def parser(
+    command: str, description: str, *, case_required: bool = False
+) -> argparse.ArgumentParser:
     """A parser with the positional CASE and --out, --workers, --seed, --quiet."""
-    result = argparse.ArgumentParser(prog=f"python -m {command}", description=description)
+    result = _Parser(prog=f"python -m {command}", description=description)
     if case_required:
         result.add_argument("case", metavar="CASE.toml", type=Path, help="the case file")
     else:
@@ -37,7 +46,7 @@ def parser(command: str, description: str, *, case_required: bool = False) -> ar
             default=Path(DEFAULT_CASE),
             help=f"the case file (default: {DEFAULT_CASE})",
         )
-    result.add_argument("--out", metavar="DIR", type=Path, help="the run folder")
+    result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
     result.add_argument(
         "--workers", metavar="N", type=_positive, default=usable_cores(),
         help="worker processes (default: all cores)",
@@ -53,22 +62,25 @@ def run(
     argv: Sequence[str] | None = None,
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
-    options = arguments.parse_args(argv)
+    code = ExitCode.INTERRUPTED
     try:
-        return int(main(options))
+        code = main(arguments.parse_args(argv))
+        sys.stdout.flush()  # here, where a reader that went away can still be dealt with
+    except SystemExit as ended:  # argparse, after --help or a wrong option
+        return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     except UserError as error:
-        print(error, file=sys.stderr)
+        print(_one_line(error), file=sys.stderr)
         return ExitCode.BAD_INPUT
     except KeyboardInterrupt:
         print(
-            "\ninterrupted: what is sampled is kept; the same command goes on from there",
+            "interrupted: what is sampled is kept; the same command resumes from there",
             file=sys.stderr,
         )
-        return ExitCode.INTERRUPTED
     except BrokenPipeError:
         # The reader of stdout went away; point it elsewhere so that the exit stays quiet.
+        # What main concluded stands; if it was cut short, it was interrupted.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return ExitCode.DONE
+    return int(code)
 
 
 def run_folder(case: Path, out: Path | None) -> Path:
@@ -90,14 +102,33 @@ def run_folder(case: Path, out: Path | None) -> Path:
     return folder
 
 
+def _folder(text: str) -> Path:
+    """A directory that is there and writable, or could be made; nothing is made yet."""
+    place = os.path.abspath(text)
+    while not os.path.lexists(place):
+        place = os.path.dirname(place)
+    if not os.path.isdir(place):
+        raise argparse.ArgumentTypeError(f"{place} is no directory; choose another")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"{place} is not writable; choose another")
+    return Path(text)
+
+
 def _positive(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return value
+    return _whole(text, 1)
 
 
 def _natural(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return _whole(text, 0)
+
+
+def _whole(text: str, least: int) -> int:
+    # Nine digits are enough for anyone, and within what every random generator takes.
+    if not (text.isdecimal() and len(text) < 10 and int(text) >= least):
+        words = f"{text[:20]!r} is no whole number from {least} to 999999999; give one"
+        raise argparse.ArgumentTypeError(words)
     return int(text)
+
+
+def _one_line(value: object) -> str:
+    return " ".join(str(value).split())

@@ -4,7 +4,6 @@ Nothing is approximated: each iteration is a certified synthesis with its total 
 """
 
 import numpy as np
-from surrogates import design
 
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.iterates import FormulationResult
@@ -20,6 +19,7 @@ from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling import Truth
 from ccd_casadi.true_function import TrueQuantities
+from surrogates import design
 
 
 def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:

@@ -72,7 +72,8 @@ def _design(
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [
-            {"hz": omega / HZ, "sensitivity": gain} for omega, gain in local_peaks(plant, made.controller)
+            {"hz": omega / HZ, "sensitivity": gain}
+            for omega, gain in local_peaks(plant, made.controller)
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
     }

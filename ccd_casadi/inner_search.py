@@ -14,6 +14,7 @@ from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, refine
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant
+from ccd_casadi.synthesis import DesignFigures
 from ccd_casadi.weights import Weights
 
 INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
@@ -47,7 +48,7 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
     return refine(plant, weights, problem, rows, _starts(problem, rows))
 
 
-def _starts(problem: InnerProblem, rows: list) -> list[tuple[float, float]]:
+def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
     """The best feasible design, and the best one that is within 2 % of feasible."""
     near = sorted(
         (row for row in rows if row.certified and _excess(problem, row) < 0.02),
@@ -62,7 +63,7 @@ def _starts(problem: InnerProblem, rows: list) -> list[tuple[float, float]]:
     return [(row.omega_S, row.omega_T) for row in chosen]
 
 
-def _excess(problem: InnerProblem, row) -> float:
+def _excess(problem: InnerProblem, row: DesignFigures) -> float:
     return max(
         np.log(row.sensitivity_peak / problem.S_max), np.log(row.sensitivity_low / problem.S_low)
     )

@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-from surrogates import GaussianProcess
-
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.outer import OuterSolution
 from ccd_casadi.plant import Array
+from surrogates import GaussianProcess
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,9 @@ def _derivatives(
     lam_values = np.array(plant.hardware(theta)[1]).ravel()
     levels = np.log([problem.inner.S_max, problem.inner.S_low])
     g = np.concatenate([design.values[1:3] - levels, lam_values])
-    jacobian = np.vstack([total[1:3], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])])
+    jacobian = np.vstack(
+        [total[1:3], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])]
+    )
     names = ("S_max", "S_low", *plant.constraint_names)
     return gradient * width, g, jacobian * width, names
 

@@ -6,7 +6,6 @@ and λ with no new synthesis.
 """
 
 import numpy as np
-from surrogates import GaussianProcess, design, fit_outputs, to_casadi
 
 from ccd_casadi.inner import MARGIN
 from ccd_casadi.iterates import FormulationResult, Iterate
@@ -20,8 +19,10 @@ from ccd_casadi.outer import (
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of, true_design
 from ccd_casadi.sampling import QuantitySample, Truth
+from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 
 STEP = 1e-4  # share of the box below which a step counts as small
+REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated anew
 FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 
@@ -45,10 +46,13 @@ def solve_lifted(
     iterates: list[Iterate] = []
     processes: tuple[GaussianProcess, ...] = ()
     solution: OuterSolution | None = None
-    agreed = False
+    agreed, fitted = False, 0
     incumbent: QuantitySample | None = None
     for round_number in range(max_refinements + 1):
-        processes = fit_quantities(problem, samples, seed)
+        if len(samples) >= REFIT * fitted:
+            processes, fitted = fit_quantities(problem, samples, seed), len(samples)
+        else:
+            processes = update_quantities(problem, samples, processes)
         program = lifted_program(problem, to_casadi(processes, std=False))
         spread = design("sobol", lower, upper, starts, seed + round_number)
         if incumbent is not None:
@@ -89,6 +93,28 @@ def fit_quantities(
     Y = np.array([sample.values[:3] for sample in samples])
     dY = np.array([sample.gradients[:3] for sample in samples]) if gradients else None
     return fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1)
+
+
+def update_quantities(
+    problem: CoDesignProblem,
+    samples: list[QuantitySample],
+    processes: tuple[GaussianProcess, ...],
+) -> tuple[GaussianProcess, ...]:
+    """The same processes conditioned on more samples, hyperparameters kept."""
+    lower, upper = lifted_bounds(problem)
+    X = np.array([sample.x for sample in samples])
+    return tuple(
+        condition(
+            process.hyperparameters,
+            X,
+            np.array([sample.values[i] for sample in samples]),
+            lower=lower,
+            upper=upper,
+            kernel=process.kernel,
+            dY=np.array([sample.gradients[i] for sample in samples]),
+        )
+        for i, process in enumerate(processes)
+    )
 
 
 def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:

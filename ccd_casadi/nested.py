@@ -6,13 +6,13 @@ where the surrogate promised too much, until prediction and truth agree there.
 """
 
 import numpy as np
-from surrogates import GaussianProcess, design, fit, to_casadi
 
 from ccd_casadi.iterates import FormulationResult, Iterate
 from ccd_casadi.outer import OuterFailure, OuterSolution, nested_program, solve_program
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, box, plant_of, true_design
 from ccd_casadi.sampling import BandwidthSample, Truth
+from surrogates import GaussianProcess, design, fit, to_casadi
 
 STEP = 1e-3  # share of the box below which a step counts as small
 
@@ -48,7 +48,9 @@ def solve_nested(
         program = nested_program(problem, to_casadi(surrogate, std=False))
         program = type(program)(**{**vars(program), "lower": low, "upper": high})
         try:
-            solution = solve_program(program, _starts(local, low, high, starts, seed + round_number))
+            solution = solve_program(
+                program, _starts(local, low, high, starts, seed + round_number)
+            )
         except OuterFailure:
             radius *= 0.5
             continue
@@ -67,8 +69,15 @@ def solve_nested(
             break
         if not agreed:
             radius = max(radius * (0.6 if improved else 0.4), 1e-3)
-            new = design("lhs", *_region(problem, _best(problem, samples), radius), 2 * len(theta) + 1, seed + round_number)
-            samples += truth.bandwidths(_allowed(problem, new), f"refining round {round_number + 1}")
+            new = design(
+                "lhs",
+                *_region(problem, _best(problem, samples), radius),
+                2 * len(theta) + 1,
+                seed + round_number,
+            )
+            samples += truth.bandwidths(
+                _allowed(problem, new), f"refining round {round_number + 1}"
+            )
         elif not improved:
             radius *= 0.5
     best = _best(problem, samples)
@@ -108,9 +117,7 @@ def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> Bandwidth
     return min(inside or feasible, key=lambda sample: _objective(problem, sample))
 
 
-def _region(
-    problem: CoDesignProblem, best: BandwidthSample, radius: float
-) -> tuple[Array, Array]:
+def _region(problem: CoDesignProblem, best: BandwidthSample, radius: float) -> tuple[Array, Array]:
     lower, upper = box(problem)
     half = radius * (upper - lower)
     return np.maximum(lower, best.theta - half), np.minimum(upper, best.theta + half)

@@ -8,6 +8,7 @@ the lifted problem on the true quantities.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -118,7 +119,7 @@ def solve_program(
     z = ca.MX.sym("z", program.x.shape[0])
     inside = program.lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options: dict[str, object] = {
+    options: dict[str, Any] = {
         "print_time": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
@@ -145,7 +146,8 @@ def solve_program(
             "ipopt.warm_start_slack_bound_frac": 1e-10,
             "ipopt.warm_start_mult_bound_push": 1e-10,
         }
-    solver = ca.nlpsol("outer", "ipopt", {"x": z, "f": f, "g": g}, options)
+    problem: dict[str, Any] = {"x": z, "f": f, "g": g}
+    solver = ca.nlpsol("outer", "ipopt", problem, options)
     found: list[LocalOptimum] = []
     for start in np.atleast_2d(starts):
         z0 = np.clip((start - program.lower) / width, 0.0, 1.0)

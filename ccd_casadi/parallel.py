@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -33,8 +34,10 @@ class Workers:
     Ctrl-C, which the parent handles, and end when the parent does, however it ends.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, patience: float = 0.0) -> None:
+        """`patience`: seconds of work below which starting processes would cost more than it saves."""
         self.count = max(1, count)
+        self.patience = patience
         self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> Self:
@@ -56,7 +59,14 @@ class Workers:
         if self.count == 1 or len(tasks) <= 1:
             yield from map(function, tasks)
             return
-        waiting = list(reversed(tasks))
+        began, done_here = time.monotonic(), 0
+        while self._pool is None and done_here < len(tasks):
+            each = (time.monotonic() - began) / done_here if done_here else 0.0
+            if self.patience == 0.0 or each * (len(tasks) - done_here) > self.patience:
+                break
+            yield function(tasks[done_here])
+            done_here += 1
+        waiting = list(reversed(tasks[done_here:]))
         retried: set[int] = set()
         running: dict[Future[R], T] = {}
         try:

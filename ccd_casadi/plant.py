@@ -128,12 +128,12 @@ def mechanics(plant: Plant, theta: Sequence[float]) -> Mechanics:
     return Mechanics(M, D, K, B, C, plant.damping_ratio, slopes)  # type: ignore[arg-type]
 
 
-def hardware_cost(plant: Plant, theta: Sequence[float]) -> float:
+def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:
     """f(θ)."""
     return float(plant.hardware(np.asarray(theta, float))[0])
 
 
-def constraint_values(plant: Plant, theta: Sequence[float]) -> Array:
+def constraint_values(plant: Plant, theta: Sequence[float] | Array) -> Array:
     """λ(θ), one value a name of `plant.constraint_names`; met where <= 0."""
     return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
 

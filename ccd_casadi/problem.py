@@ -107,7 +107,8 @@ def _plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
 def _model(source: PlantSource) -> ModelFunction:
     if source.model is not None:
         return MODELS[source.model]
-    assert source.file is not None and source.function is not None
+    assert source.file is not None
+    assert source.function is not None
     path = Path(source.file)
     spec = importlib.util.spec_from_file_location("user_plant_" + path.stem, path)
     if spec is None or spec.loader is None:

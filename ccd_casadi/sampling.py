@@ -66,9 +66,7 @@ class Truth:
         self.workers = workers
         self.quiet = quiet
         self.hash = problem_hash(problem.identity())
-        self.inner_hash = problem_hash(
-            {"problem": self.hash, "inner": problem.inner_identity()}
-        )
+        self.inner_hash = problem_hash({"problem": self.hash, "inner": problem.inner_identity()})
         store.put_problem(self.hash, problem.identity())
         self._spent: dict[str, int] = {}
 
@@ -92,10 +90,10 @@ class Truth:
                 progress.advance()
         found = []
         for key, theta in zip(keys, points, strict=True):
-            payload = payloads[key]
-            assert payload is not None
-            self._spent[key] = payload["syntheses"]
-            found.append(_bandwidth_sample(theta, payload))
+            known = payloads[key]
+            assert known is not None
+            self._spent[key] = known["syntheses"]
+            found.append(_bandwidth_sample(theta, known))
         return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:

@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from surrogates import design, save
 
 from ccd_casadi.case import Case, case_to_toml, load_case, problem_of
 from ccd_casadi.command_line import ExitCode, parser, run, run_folder
@@ -25,10 +24,12 @@ from ccd_casadi.results import (
     result_dict,
     write_json,
 )
-from ccd_casadi.sampling import Truth
 from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import Truth
 from ccd_casadi.verify import VerifiedDesign, verify
+from surrogates import design, save
 
+PATIENCE = 2.0  # s of work that is not worth starting processes for
 FORMULATIONS = ("nested", "lifted", "direct")
 _CODES = {
     "verified": ExitCode.DONE,
@@ -127,9 +128,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """Write case.toml, result.json, controller.json and surrogate.json."""
     (folder / "case.toml").write_text(case_to_toml(case))
     if solution.verified is not None:
-        write_json(
-            folder / "controller.json", controller_dict(solution.verified.design.controller)
-        )
+        write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
     if solution.outcome.surrogates:
         save(
             solution.outcome.surrogates,
@@ -179,7 +178,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
     store = folder / "samples.sqlite"
-    with SampleStore(store) as samples, Workers(options.workers) as workers:
+    with SampleStore(store) as samples, Workers(options.workers, PATIENCE) as workers:
         truth = Truth(problem, samples, workers, quiet=options.quiet)
         solution = solve(case, truth, options.formulation, options.seed)
         write_run(folder, case, solution)

@@ -7,7 +7,8 @@ certified the values are NaN, which makes IPOPT shorten its step. Hessians are n
 use a quasi-Newton method (`ipopt.hessian_approximation = "limited-memory"`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -71,14 +72,14 @@ class TrueQuantities(ca.Callback):
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         return ca.Sparsity.dense(4, 1)
 
-    def eval(self, arguments: list[ca.DM]) -> list[Array]:
+    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
         return [self.values(np.array(arguments[0]))]
 
     def has_jacobian(self) -> bool:
         return True
 
     def get_jacobian(
-        self, name: str, inames: list[str], onames: list[str], options: dict[str, object]
+        self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
     ) -> ca.Function:
         parent = self
 
@@ -99,7 +100,7 @@ class TrueQuantities(ca.Callback):
             def get_sparsity_out(self, i: int) -> ca.Sparsity:
                 return ca.Sparsity.dense(4, len(parent.problem.names) + 2)
 
-            def eval(self, arguments: list[ca.DM]) -> list[Array]:
+            def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
                 return [parent.jacobian_at(np.array(arguments[0]))]
 
         self._jacobian = Jacobian()
