@@ -84,6 +84,12 @@ def _points(value: Any) -> str | None:
     return f"is {_shown(value)}; give two whole numbers of at least 2"
 
 
+def _steps(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and value and all(_FRACTION(v) is None for v in value):
+        return None
+    return f"is {_shown(value)}; give a list of numbers between 0 and 1"
+
+
 def _too_large(value: Any) -> bool:
     """TOML's integers have 64 bits; Python's parser takes any, and neither float nor repr do."""
     return isinstance(value, int) and abs(value) >= 2**63
@@ -199,6 +205,20 @@ class OuterSection:
 
 
 @dataclass(frozen=True)
+class BaselineSection:
+    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
+
+    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
+    and a Latin hypercube.
+    """
+
+    first_resonance_hz: float = _key(_POSITIVE, 250.0)
+    steps: tuple[float, ...] = _key(_steps, (0.02, 0.05, 0.1))
+    starts: int = _key(_count(1), 3)
+    max_iterations: int = _key(_count(1), 100)
+
+
+@dataclass(frozen=True)
 class Case:
     """A checked case file."""
 
@@ -211,6 +231,7 @@ class Case:
     suspension: SuspensionSection
     sampling: SamplingSection
     outer: OuterSection
+    baseline: BaselineSection
 
 
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
@@ -229,6 +250,7 @@ _SECTIONS: dict[str, type] = {
     "suspension": SuspensionSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
+    "baseline": BaselineSection,
 }
 
 

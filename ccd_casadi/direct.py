@@ -7,6 +7,7 @@ import numpy as np
 
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.iterates import FormulationResult
+from ccd_casadi.kkt import kkt_certificate
 from ccd_casadi.outer import (
     LocalOptimum,
     OuterFailure,
@@ -20,6 +21,8 @@ from ccd_casadi.problem import CoDesignProblem, plant_of
 from ccd_casadi.sampling import Truth
 from ccd_casadi.true_function import TrueQuantities
 from surrogates import design
+
+STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 
 
 def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:
@@ -53,6 +56,8 @@ def polish(truth: Truth, x: Array) -> tuple[Array, Sensitivities, OuterSolution 
     quantities = TrueQuantities(problem, truth.record)
     program = lifted_program(problem, quantities, exact_hessian=False)
     start = quantities.at(x)
+    if acceptable(problem, x, start) and _stationary(problem, x, start):
+        return x, start, None
     solution: OuterSolution | None = None
     try:
         solution = solve_program(program, x, warm=True)
@@ -73,6 +78,12 @@ def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> boo
     """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
     lam = constraint_values(plant_of(problem), x[: len(problem.names)])
     return problem.inner.feasible(design.figures) and bool((lam <= 1e-9).all())
+
+
+def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
+    """Whether the true optimality conditions hold already, to what IPOPT would reach."""
+    kkt = kkt_certificate(problem, x, design)
+    return max(kkt.stationarity, kkt.complementarity) <= STATIONARY
 
 
 def _no_worse(

@@ -7,7 +7,6 @@ and λ with no new synthesis.
 
 import numpy as np
 
-from ccd_casadi.inner import MARGIN
 from ccd_casadi.iterates import FormulationResult, Iterate
 from ccd_casadi.outer import (
     OuterFailure,
@@ -23,6 +22,9 @@ from surrogates import GaussianProcess, condition, design, fit_outputs, to_casad
 
 STEP = 1e-4  # share of the box below which a step counts as small
 REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated anew
+# IPOPT aims this far inside ln S_max and ln S_low: about the surrogates' error at the end, so
+# that the truth is feasible there and has nothing left to be polished.
+MARGIN = 1e-7
 FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 
@@ -53,7 +55,7 @@ def solve_lifted(
             processes, fitted = fit_quantities(problem, samples, seed), len(samples)
         else:
             processes = update_quantities(problem, samples, processes)
-        program = lifted_program(problem, to_casadi(processes, std=False))
+        program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
         spread = design("sobol", lower, upper, starts, seed + round_number)
         if incumbent is not None:
             spread = np.vstack([incumbent.x, spread[: starts // 2]])

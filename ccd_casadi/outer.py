@@ -75,7 +75,11 @@ def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> Nonlinea
 
 
 def lifted_program(
-    problem: CoDesignProblem, quantities: ca.Function, *, exact_hessian: bool = True
+    problem: CoDesignProblem,
+    quantities: ca.Function,
+    *,
+    exact_hessian: bool = True,
+    margin: float = MARGIN,
 ) -> NonlinearProgram:
     """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln‖S‖∞, ln|S(jω_low)|."""
     plant = plant_of(problem)
@@ -85,7 +89,7 @@ def lifted_program(
     q = quantities(x)
     f, lam = _hardware(plant, theta)
     inner = problem.inner
-    levels = np.log([inner.S_max, inner.S_low]) - MARGIN
+    levels = np.log([inner.S_max, inner.S_low]) - margin
     lower, upper = lifted_bounds(problem)
     return NonlinearProgram(
         x=x,

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -35,7 +37,7 @@ class Workers:
     """
 
     def __init__(self, count: int, patience: float = 0.0) -> None:
-        """`patience`: seconds of work below which starting processes would cost more than it saves."""
+        """`patience`: seconds of work below which starting processes does not pay."""
         self.count = max(1, count)
         self.patience = patience
         self._pool: ProcessPoolExecutor | None = None
@@ -66,18 +68,18 @@ class Workers:
                 break
             yield function(tasks[done_here])
             done_here += 1
-        waiting = list(reversed(tasks[done_here:]))
+        waiting = list(range(len(tasks) - 1, done_here - 1, -1))
         retried: set[int] = set()
-        running: dict[Future[R], T] = {}
+        running: dict[Future[R], int] = {}
         try:
             while waiting or running:
                 pool = self._started()
                 try:
                     while waiting and len(running) < IN_FLIGHT * self.count:
-                        task = waiting.pop()
-                        running[pool.submit(function, task)] = task
+                        running[pool.submit(function, tasks[waiting[-1]])] = waiting[-1]
+                        waiting.pop()
                 except BrokenProcessPool:
-                    waiting.append(task)
+                    pass  # seen below; the task still waits
                 done, _ = wait(running, return_when=FIRST_COMPLETED) if running else (set(), None)
                 lost = [f for f in done if isinstance(f.exception(), BrokenProcessPool)]
                 for future in done - set(lost):
@@ -85,11 +87,12 @@ class Workers:
                     yield future.result()
                 if lost or self._broken():
                     # One death breaks the whole pool: every task in flight goes again, once.
-                    for task in running.values():
-                        if id(task) in retried:
-                            raise WorkerLost(f"a worker process died twice on the task {task!r}")
-                        retried.add(id(task))
-                        waiting.append(task)
+                    for index in running.values():
+                        if index in retried:
+                            task = repr(tasks[index])[:200]
+                            raise WorkerLost(f"a worker process died twice on the task {task}")
+                        retried.add(index)
+                        waiting.append(index)
                     running.clear()
                     self._stop()
         except BaseException:
@@ -107,8 +110,13 @@ class Workers:
                 self._pool = ProcessPoolExecutor(
                     self.count, multiprocessing.get_context("spawn"), initializer=_prepare
                 )
-                # Processes start on demand: make them start while the environment is set.
-                list(self._pool.map(_nothing, range(self.count)))
+                # Processes start on demand: make them start while the environment is set, and
+                # deaf to Ctrl-C from their first instruction, before they can ignore it.
+                with _interrupts_held():
+                    started = self._pool.map(_nothing, range(self.count))
+                list(started)
+            except BrokenProcessPool:
+                raise WorkerLost("the worker processes died as they started") from None
             finally:
                 for name, value in before.items():
                     if value is None:
@@ -127,6 +135,20 @@ class Workers:
             process.kill()
         for process in processes:
             process.join()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold SIGINT back here, delivered at the end; processes started inside never get it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it would unblock the signal where it is started later
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _nothing(value: Any) -> Any:

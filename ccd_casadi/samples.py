@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
@@ -114,7 +115,8 @@ class SampleStore:
         with self._worded():
             self._db = sqlite3.connect(self.path, timeout=BUSY_SECONDS, isolation_level=None)
             try:
-                self._db.execute("pragma journal_mode = wal")
+                self._check()
+                self._write_ahead()
                 self._db.execute("pragma synchronous = normal")
                 with self._transaction():
                     # one by one: executescript would end the transaction
@@ -122,17 +124,40 @@ class SampleStore:
                         self._db.execute(statement)
                     insert = "insert or ignore into meta values ('schema', ?)"
                     self._db.execute(insert, (str(SCHEMA),))
-                found = self._db.execute("select value from meta where name = 'schema'").fetchone()
-                columns = {row[1] for row in self._db.execute("pragma table_info(samples)")}
             except BaseException:
                 self._db.close()
                 raise
-        if found[0] != str(SCHEMA) or not set(_COLUMNS) <= columns:
-            self._db.close()
+
+    def _check(self) -> None:
+        """Refuse, untouched, a database that is not ours or has another schema."""
+        query = "select name from sqlite_master where type = 'table'"
+        tables = {name for (name,) in self._db.execute(query)}
+        if not tables:
+            return  # new, or being made by another process in one transaction
+        if not {"meta", "problems", "samples", "results"} <= tables:
             raise SampleStoreError(
-                f"{self.path}: is a sample store of schema {found[0]}, not {SCHEMA}; "
+                f"{self.path}: is a database of another program; choose another --out"
+            )
+        found = self._db.execute("select * from meta where name = 'schema'").fetchone()
+        columns = {row[1] for row in self._db.execute("pragma table_info(samples)")}
+        schema = None if found is None else found[1]
+        if schema != str(SCHEMA) or not set(_COLUMNS) <= columns:
+            raise SampleStoreError(
+                f"{self.path}: is a sample store of schema {schema}, not {SCHEMA}; "
                 "choose another --out"
             )
+
+    def _write_ahead(self) -> None:
+        """Switch to the write-ahead log; SQLite does not wait for that lock by itself."""
+        deadline = time.monotonic() + BUSY_SECONDS
+        while True:
+            try:
+                self._db.execute("pragma journal_mode = wal")
+                return
+            except sqlite3.OperationalError as error:
+                if "locked" not in str(error) or time.monotonic() > deadline:
+                    raise
+            time.sleep(0.01)
 
     def __enter__(self) -> Self:
         return self
@@ -190,13 +215,13 @@ class SampleStore:
         """The payload of a unit of work, None where it is not known."""
         with self._worded():
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
-        return None if row is None else json.loads(row[0])
+            return None if row is None else _decoded(row[0])
 
     def select(self) -> list[Sample]:
         """Every sample, ordered by θ, ω_S and ω_T."""
         with self._worded():
             rows = self._db.execute(f"select {', '.join(_COLUMNS)} from samples").fetchall()
-        samples = [_from_row(row) for row in rows]
+            samples = [_from_row(row) for row in rows]
         return sorted(samples, key=lambda s: (s.theta, s.omega_S, s.omega_T, s.key))
 
     def count(self) -> int:
@@ -228,8 +253,8 @@ class SampleStore:
         """SQLite's errors as one line that says what to do."""
         try:
             yield
-        except sqlite3.DatabaseError as error:
-            text = str(error)
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            text = " ".join(str(error).split())
             if "locked" in text:
                 advice = "another process holds it; wait or stop that one"
             elif "readonly" in text or "unable to open" in text:
@@ -256,12 +281,19 @@ def _to_row(sample: Sample) -> tuple[object, ...]:
 
 def _from_row(row: Sequence[Any]) -> Sample:
     values = dict(zip(_COLUMNS, row, strict=True))
-    values["theta"] = tuple(json.loads(values["theta"]))
+    values["theta"] = tuple(_decoded(values["theta"]))
     if values["gradients"] is not None:
-        numbers = json.loads(values["gradients"])
+        numbers = _decoded(values["gradients"])
         values["gradients"] = tuple(math.nan if item is None else item for item in numbers)
     values["certified"] = bool(values["certified"])
     for name in _REALS:
         if values[name] is None:
             values[name] = math.nan
     return Sample(**values)
+
+
+def _decoded(text: Any) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, TypeError) as error:
+        raise sqlite3.DatabaseError("a row is damaged") from error

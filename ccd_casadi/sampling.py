@@ -13,8 +13,8 @@ import numpy as np
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.envelope import bandwidth_gradient
 from ccd_casadi.parallel import Workers
-from ccd_casadi.plant import Array
-from ccd_casadi.problem import CoDesignProblem, true_design, true_inner
+from ccd_casadi.plant import Array, constraint_values, hardware_cost
+from ccd_casadi.problem import CoDesignProblem, plant_of, true_design, true_inner
 from ccd_casadi.progress import Progress
 from ccd_casadi.samples import Sample, SampleStore, problem_hash, sample_key
 from ccd_casadi.synthesis import DesignFigures
@@ -51,6 +51,16 @@ class QuantitySample:
     certified: bool
 
 
+@dataclass(frozen=True)
+class TraceEntry:
+    """After `syntheses` true syntheses: θ, its feasible bandwidth (rad/s) and J; NaN if none."""
+
+    syntheses: int
+    theta: tuple[float, ...]
+    bandwidth: float
+    objective: float
+
+
 class Truth:
     """The true synthesis behind a store and a pool of workers, counting what a run spends.
 
@@ -69,6 +79,7 @@ class Truth:
         self.inner_hash = problem_hash({"problem": self.hash, "inner": problem.inner_identity()})
         store.put_problem(self.hash, problem.identity())
         self._spent: dict[str, int] = {}
+        self.trace: list[TraceEntry] = []
 
     @property
     def syntheses(self) -> int:
@@ -92,8 +103,9 @@ class Truth:
         for key, theta in zip(keys, points, strict=True):
             known = payloads[key]
             assert known is not None
-            self._spent[key] = known["syntheses"]
-            found.append(_bandwidth_sample(theta, known))
+            sample = _bandwidth_sample(theta, known)
+            found.append(sample)
+            self._spend(key, sample.syntheses, theta, sample.bandwidth)
         return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:
@@ -109,23 +121,52 @@ class Truth:
                 self.store.put(samples, self.hash)
                 known |= {sample.key: sample for sample in samples}
                 progress.advance(len(samples))
-        for key in keys:
-            self._spent[key] = 1
         count = len(self.problem.names)
+        for x, key in zip(points, keys, strict=True):
+            sample = known[key]
+            self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
         return [_quantity_sample(x, known[k], count) for x, k in zip(points, keys, strict=True)]
+
+    def design(self, x: Array) -> Sensitivities:
+        """One true design at x, recorded."""
+        point = np.asarray(x, float)
+        made = true_design(self.problem, tuple(point[:-2]), *_frequencies(self.problem, point))
+        self.record(point, made)
+        return made
 
     def record(self, x: Array, design: Sensitivities) -> None:
         """Keep a design made outside the pool (IPOPT on the true function)."""
         point = tuple(float(v) for v in x)
         key = self._design_key(point)
-        self._spent[key] = 1
-        self.store.put([_sample(key, point[:-2], design.figures, 0.0, design)], self.hash)
+        sample = _sample(key, point[:-2], design.figures, 0.0, design)
+        self.store.put([sample], self.hash)
+        self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
+
+    def _spend(self, key: str, count: int, theta: tuple[float, ...], bandwidth: float) -> None:
+        """Count a unit once, and keep what it was worth: NaN where it is not feasible."""
+        if key in self._spent:
+            return
+        self._spent[key] = count
+        objective = np.nan
+        plant = plant_of(self.problem)
+        if np.isfinite(bandwidth) and (constraint_values(plant, theta) <= 1e-9).all():
+            cost = hardware_cost(plant, theta)
+            objective = self.problem.w1 * cost + self.problem.w2 * bandwidth
+        self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(objective)))
+
+    def _meets(self, sample: Sample) -> bool:
+        inner = self.problem.inner
+        return (
+            sample.certified
+            and sample.sensitivity_peak <= inner.S_max
+            and sample.sensitivity_low <= inner.S_low
+        )
 
     def _design_key(self, x: tuple[float, ...]) -> str:
         return sample_key(self.hash, x[:-2], *_frequencies(self.problem, x))
 
 
-def _frequencies(problem: CoDesignProblem, x: Sequence[float]) -> tuple[float, float]:
+def _frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
     """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
     inner = problem.inner
     return (

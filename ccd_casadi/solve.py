@@ -95,8 +95,8 @@ def _formulate(case: Case, truth: Truth, formulation: str, seed: int) -> Formula
         )
     if formulation == "lifted":
         # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
-        # gives n+1 numbers; eight times as many leave room for what is not quadratic.
-        points = sampling.lifted_points or 8 * (len(case.theta) + 4)
+        # gives n+1 numbers: 6n samples are twelve times what it needs at n = 4, six times at n = 8.
+        points = sampling.lifted_points or 6 * (len(case.theta) + 2)
         return solve_lifted(
             truth,
             points=points,
