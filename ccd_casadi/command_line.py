@@ -8,6 +8,8 @@ from enum import IntEnum
 from pathlib import Path
 from typing import NoReturn
 
+from threadpoolctl import threadpool_limits
+
 from ccd_casadi.errors import UserError
 from ccd_casadi.parallel import usable_cores
 
@@ -64,7 +66,9 @@ def run(
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
     code = ExitCode.INTERRUPTED
     try:
-        code = main(arguments.parse_args(argv))
+        # One BLAS thread: the matrices are small, and results must not depend on the cores.
+        with threadpool_limits(limits=1):
+            code = main(arguments.parse_args(argv))
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except SystemExit as ended:  # argparse, after --help or a wrong option
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE

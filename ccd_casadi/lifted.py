@@ -21,6 +21,7 @@ from ccd_casadi.sampling import QuantitySample, Truth
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 
 STEP = 1e-4  # share of the box below which a step counts as small
+SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
 REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated anew
 # IPOPT aims this far inside ln S_max and ln S_low: about the surrogates' error at the end, so
 # that the truth is feasible there and has nothing left to be polished.
@@ -70,11 +71,14 @@ def solve_lifted(
         sample = truth.quantities(x, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, incumbent, sample, predicted)
         iterates.append(iterate)
+        settled = incumbent is not None and abs(
+            iterate.objective - _objective(problem, incumbent)
+        ) <= SETTLED * tolerance * abs(iterate.objective)
         if sample.certified:
             samples.append(sample)
             incumbent = _better(problem, incumbent, sample)
         agreed = iterate.error <= tolerance
-        if agreed and iterate.step <= STEP:
+        if agreed and (iterate.step <= STEP or settled):
             break
     if incumbent is None:
         message = "no design near the predicted optima meets S_max and S_low"

@@ -8,6 +8,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -46,13 +47,16 @@ class Mechanics:
 
 @dataclass(frozen=True)
 class Plant:
-    """A model bound to its parameters: the CasADi functions that the design loop calls."""
+    """A model bound to its parameters: what the design loop asks of any plant.
+
+    `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
+    `hardware` maps θ to (f, λ) as a casadi.Function in either case.
+    """
 
     names: tuple[str, ...]
     constraint_names: tuple[str, ...]
-    damping_ratio: float | None
-    matrices: ca.Function
-    hardware: ca.Function  # θ -> f, λ
+    evaluate: Callable[[Sequence[float]], Mechanics]
+    hardware: ca.Function
     outputs: int
     inputs: int
 
@@ -91,13 +95,14 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
         raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
     constraints = dict(result.get("constraints", {}))
     lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
+    damping_ratio = None if ratio is None else float(ratio)
     dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]
     slopes = [ca.densify(ca.jacobian(ca.vec(matrix), theta)) for matrix in dense]
+    matrices = ca.Function("matrices", [theta], dense + slopes)
     return Plant(
         names=tuple(names),
         constraint_names=tuple(constraints),
-        damping_ratio=None if ratio is None else float(ratio),
-        matrices=ca.Function("matrices", [theta], dense + slopes),
+        evaluate=partial(_from_casadi, matrices, damping_ratio),
         hardware=ca.Function("hardware", [theta], [result["hardware_cost"], lam]),
         outputs=C.shape[0],
         inputs=B.shape[1],
@@ -109,10 +114,11 @@ def mechanics(plant: Plant, theta: Sequence[float]) -> Mechanics:
 
     Raises PlantError where they are not finite, M or K not symmetric, or M not positive definite.
     """
-    values = [np.array(value) for value in plant.matrices(np.asarray(theta, float))]
+    system = plant.evaluate(theta)
+    M, K = system.M, system.K
+    values = (M, system.D, K, system.B, system.C, *system.derivatives)
     if not all(np.isfinite(value).all() for value in values):
         raise PlantError(f"the plant is not finite at theta = {_words(plant, theta)}")
-    M, D, K, B, C = values[:5]
     for name, matrix in (("mass", M), ("stiffness", K)):
         if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
             raise PlantError(f"{name} is not symmetric at theta = {_words(plant, theta)}")
@@ -121,11 +127,19 @@ def mechanics(plant: Plant, theta: Sequence[float]) -> Mechanics:
     except np.linalg.LinAlgError:
         message = f"mass is not positive definite at theta = {_words(plant, theta)}"
         raise PlantError(message) from None
+    return system
+
+
+def _from_casadi(
+    matrices: ca.Function, damping_ratio: float | None, theta: Sequence[float]
+) -> Mechanics:
+    values = [np.array(value) for value in matrices(np.asarray(theta, float))]
+    M, D, K, B, C = values[:5]
     slopes = tuple(
-        value.reshape(matrix.shape[1], matrix.shape[0], len(plant.names)).transpose(2, 1, 0).copy()
+        value.reshape(matrix.shape[1], matrix.shape[0], len(theta)).transpose(2, 1, 0).copy()
         for matrix, value in zip(values[:5], values[5:], strict=True)
     )
-    return Mechanics(M, D, K, B, C, plant.damping_ratio, slopes)  # type: ignore[arg-type]
+    return Mechanics(M, D, K, B, C, damping_ratio, slopes)  # type: ignore[arg-type]
 
 
 def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:
