@@ -1,18 +1,19 @@
 """The case file: TOML into frozen dataclasses, every mistake in one line that says the remedy.
 
-Units are those of the file (Hz where a name says so); `problem_of` makes the SI problem of it.
+`problem_of` makes of it the problem in SI that the lower layers take.
 """
 
 import difflib
 import inspect
 import math
-import re
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.case_checks import ANY, FRACTION, Check, shown, text, too_large
+from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
@@ -27,213 +28,6 @@ class CaseError(UserError):
     """One line: file, key, what is wrong, what to do."""
 
 
-Check = Callable[[Any], str | None]
-
-
-def _number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
-    """Inside (low, high), or [low, high) if `closed`; `remedy` says what to give."""
-
-    def check(value: Any) -> str | None:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return f"is {_shown(value)}, not a number; {remedy}"
-        if _too_large(value) or not math.isfinite(value):
-            return f"is {_shown(value)}; {remedy}"
-        inside = low < value < high or (closed and value == low)
-        return None if inside else f"is {value:g}; {remedy}"
-
-    return check
-
-
-def _count(least: int) -> Check:
-    def check(value: Any) -> str | None:
-        good = isinstance(value, int) and not isinstance(value, bool) and value >= least
-        if good and not _too_large(value):
-            return None
-        return f"is {_shown(value)}; give a whole number of at least {least}"
-
-    return check
-
-
-def _choice(*names: str) -> Check:
-    def check(value: Any) -> str | None:
-        if value in names:
-            return None
-        return f"is {_shown(value)}; choose one of {', '.join(names)}"
-
-    return check
-
-
-def _text(value: Any) -> str | None:
-    return None if isinstance(value, str) else f"is {_shown(value)}; give a text in quotes"
-
-
-def _range(value: Any) -> str | None:
-    remedy = "give two positive numbers [low, high] with low < high"
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        return f"is {_shown(value)}; {remedy}"
-    for item in value:
-        if _POSITIVE(item) is not None:
-            return f"is {_shown(value)}; {remedy}"
-    return None if value[0] < value[1] else f"is an empty range {_shown(value)}; {remedy}"
-
-
-def _points(value: Any) -> str | None:
-    good = isinstance(value, list | tuple) and len(value) == 2
-    if good and all(_count(2)(item) is None for item in value):
-        return None
-    return f"is {_shown(value)}; give two whole numbers of at least 2"
-
-
-def _steps(value: Any) -> str | None:
-    if isinstance(value, list | tuple) and value and all(_FRACTION(v) is None for v in value):
-        return None
-    return f"is {_shown(value)}; give a list of numbers between 0 and 1"
-
-
-def _too_large(value: Any) -> bool:
-    """TOML's integers have 64 bits; Python's parser takes any, and neither float nor repr do."""
-    return isinstance(value, int) and abs(value) >= 2**63
-
-
-def _shown(value: Any) -> str:
-    if _too_large(value):
-        return "an integer of more than 64 bits"
-    try:
-        text = repr(list(value) if isinstance(value, tuple) else value)
-    except (ValueError, RecursionError):  # a huge integer or a very deep array inside
-        return "a value too long to show"
-    return text if len(text) < 60 else text[:57] + "..."
-
-
-_ANY = _number(-math.inf, math.inf, "give a finite number")
-_POSITIVE = _number(0.0, math.inf, "give a number above 0")
-_FRACTION = _number(0.0, 1.0, "give a number between 0 and 1")
-_ABOVE_ONE = _number(1.0, math.inf, "give a number above 1")
-
-
-def _key(check: Check, default: Any = MISSING) -> Any:
-    if default is MISSING:
-        return field(metadata={"check": check})
-    return field(default=default, metadata={"check": check})
-
-
-@dataclass(frozen=True)
-class PlantSection:
-    """[plant]: a model's name or function = "file.py:name"; all other keys are its options."""
-
-    model: str | None
-    function: str | None
-    options: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter."""
-
-    name: str
-    lower: float
-    upper: float
-    start: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class ObjectiveSection:
-    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s."""
-
-    w1: float = _key(_number(0.0, math.inf, "give 0 or more: J is minimised", closed=True))
-    w2: float = _key(_number(-math.inf, 0.0, "give a negative number: J must reward bandwidth"))
-
-
-@dataclass(frozen=True)
-class WeightsSection:
-    """[weights] of the paper's Table 1; M_K in force over displacement."""
-
-    M_S: float = _key(_POSITIVE)
-    A_S: float = _key(_FRACTION)
-    c_K: float = _key(_ABOVE_ONE)
-    omega_K_hz: float = _key(_POSITIVE)
-    M_K: float = _key(_POSITIVE)
-    A_l: float = _key(_POSITIVE)
-    A_u: float = _key(_FRACTION)
-
-
-@dataclass(frozen=True)
-class InnerSection:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
-
-    S_max: float = _key(
-        _number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral")
-    )
-    S_low: float = _key(_FRACTION)
-    omega_low_hz: float = _key(_POSITIVE)
-    omega_S_hz: tuple[float, float] = _key(_range)
-    omega_T_hz: tuple[float, float] = _key(_range)
-    gamma_backoff: float = _key(_ABOVE_ONE, 1.02)
-    sweep_points: tuple[int, int] = _key(_points, (20, 20))
-    method: str = _key(_choice("search", "sweep"), "search")
-
-
-@dataclass(frozen=True)
-class SuspensionSection:
-    """[suspension]: where rigid-body poles are put."""
-
-    frequency_hz: float = _key(_POSITIVE, 0.1)
-    damping_ratio: float = _key(_POSITIVE, 0.7)
-
-
-@dataclass(frozen=True)
-class SamplingSection:
-    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
-
-    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
-    """
-
-    design: str = _key(_choice("grid", "sobol", "lhs"), "grid")
-    points: int = _key(_count(2), 5)
-    lifted_points: int = _key(_count(0), 0)
-
-
-@dataclass(frozen=True)
-class OuterSection:
-    """[outer]: IPOPT starts, agreement of prediction and truth, and rounds of refinement."""
-
-    starts: int = _key(_count(1), 16)
-    direct_starts: int = _key(_count(1), 4)
-    tolerance: float = _key(_FRACTION, 1e-3)
-    max_refinements: int = _key(_count(0), 12)
-
-
-@dataclass(frozen=True)
-class BaselineSection:
-    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
-
-    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
-    and a Latin hypercube.
-    """
-
-    first_resonance_hz: float = _key(_POSITIVE, 250.0)
-    steps: tuple[float, ...] = _key(_steps, (0.02, 0.05, 0.1))
-    starts: int = _key(_count(1), 3)
-    max_iterations: int = _key(_count(1), 100)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A checked case file."""
-
-    path: Path
-    plant: PlantSection
-    theta: tuple[Parameter, ...]
-    objective: ObjectiveSection
-    weights: WeightsSection
-    inner: InnerSection
-    suspension: SuspensionSection
-    sampling: SamplingSection
-    outer: OuterSection
-    baseline: BaselineSection
-
-
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
 _ORDERED_WEIGHTS = (
     ("A_S", "M_S", "W_S asks for more at low frequency"),
@@ -241,17 +35,7 @@ _ORDERED_WEIGHTS = (
 )
 # What the models of the package take, as far as a function's signature does not say it.
 _MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2")}
-_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {("two_mass", "zeta"): _FRACTION}
-
-_SECTIONS: dict[str, type] = {
-    "objective": ObjectiveSection,
-    "weights": WeightsSection,
-    "inner": InnerSection,
-    "suspension": SuspensionSection,
-    "sampling": SamplingSection,
-    "outer": OuterSection,
-    "baseline": BaselineSection,
-}
+_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {("two_mass", "zeta"): FRACTION}
 
 
 def load_case(path: str | Path) -> Case:
@@ -288,17 +72,17 @@ def parse_case(data: Mapping[str, Any], path: Path) -> Case:
     def fail(key: str, words: str) -> CaseError:
         return CaseError(_one_line(f"{path}: {key}: {words}"))
 
-    known = ("plant", "theta", *_SECTIONS)
+    known = ("plant", "theta", *SECTIONS)
     for name, table in data.items():
         if name not in known:
             raise fail(name, f"unknown section{_closest(name, known)}")
         if not isinstance(table, Mapping):
-            raise fail(name, f"is {_shown(table)}; write a table [{name}]")
+            raise fail(name, f"is {shown(table)}; write a table [{name}]")
     for name in ("plant", "theta"):
         if name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
     sections = {}
-    for name, kind in _SECTIONS.items():
+    for name, kind in SECTIONS.items():
         required = any(item.default is MISSING for item in fields(kind))
         if required and name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
@@ -357,17 +141,17 @@ def _plant(
         raise fail("plant", "give either model or function, and not both")
     if model is not None and (not isinstance(model, str) or model not in MODELS):
         hint = _closest(str(model), MODELS)
-        raise fail("plant.model", f"is {_shown(model)}, not a known model{hint}; or use function")
+        raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
         if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
-            raise fail("plant.function", f'is {_shown(function)}; write "my_plant.py:model"')
+            raise fail("plant.function", f'is {shown(function)}; write "my_plant.py:model"')
         try:
             exists = (path.parent / parts[0]).is_file()
         except (OSError, ValueError):
             exists = False
         if not exists:
-            words = f"there is no file {_shown(parts[0])}; give its path relative to the case file"
+            words = f"there is no file {shown(parts[0])}; give its path relative to the case file"
             raise fail("plant.function", words)
         # Absolute, so that the resolved case means the same from the run folder.
         function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
@@ -387,8 +171,8 @@ def _plant(
 def _option(value: Any) -> str | None:
     if isinstance(value, float) and not math.isfinite(value):
         return f"is {value}; give a finite number"
-    if _too_large(value):
-        return f"is {_shown(value)}; write it as a float"
+    if too_large(value):
+        return f"is {shown(value)}; write it as a float"
     if isinstance(value, list):
         for item in value:
             wrong = _option(item)
@@ -397,7 +181,7 @@ def _option(value: Any) -> str | None:
         return None
     if isinstance(value, str | bool | int | float):
         return None
-    return f"is {_shown(value)}; give a number, text, true or false, or a list of them"
+    return f"is {shown(value)}; give a number, text, true or false, or a list of them"
 
 
 def _theta(
@@ -405,14 +189,14 @@ def _theta(
 ) -> tuple[Parameter, ...]:
     if not table:
         raise fail("theta", "names no parameter; add a table [theta.NAME]")
-    checks = {"lower": _ANY, "upper": _ANY, "start": _ANY, "unit": _text}
+    checks = {"lower": ANY, "upper": ANY, "start": ANY, "unit": text}
     found = []
     for name, entry in table.items():
         place = f"theta.{name}"
         if not name.isidentifier():
             raise fail(place, "is no identifier; use letters, digits and _")
         if not isinstance(entry, Mapping):
-            raise fail(place, f"is {_shown(entry)}; write a table [theta.{name}]")
+            raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
         for key in entry:
             if key not in checks:
                 raise fail(f"{place}.{key}", f"unknown key{_closest(key, checks)}")
@@ -458,17 +242,15 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
     for part in text.split(","):
         name, equals, value = (item.strip() for item in part.partition("="))
         if not equals:
-            raise fail(
-                f"{_shown(part)} is not of the form name=value; give {'=..,'.join(names)}=.."
-            )
+            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
         if name not in names:
-            raise fail(f"{_shown(name)} is no parameter of the case{_closest(name, names)}")
+            raise fail(f"{shown(name)} is no parameter of the case{_closest(name, names)}")
         if name in found:
             raise fail(f"{name} is given twice; give it once")
         try:
             found[name] = float(value)
         except ValueError:
-            raise fail(f"{name} = {_shown(value)} is not a number; give one") from None
+            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
     for parameter in case.theta:
         if parameter.name not in found:
             raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
@@ -536,40 +318,3 @@ def problem_of(case: Case) -> CoDesignProblem:
 
 def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def case_to_toml(case: Case) -> str:
-    """The resolved case, defaults included, as TOML."""
-    plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
-    lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
-    for parameter in case.theta:
-        entry = {key: value for key, value in vars(parameter).items() if key != "name"}
-        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(entry)]
-    for name in _SECTIONS:
-        lines += ["", f"[{name}]", *_pairs(vars(getattr(case, name)))]
-    return "\n".join(lines) + "\n"
-
-
-def _pairs(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in table.items()]
-
-
-def _toml_key(key: str) -> str:
-    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else _toml(key)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        escaped = "".join(_escape(letter) for letter in value)
-        return f'"{escaped}"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return repr(value)
-
-
-def _escape(letter: str) -> str:
-    if letter in '"\\':
-        return "\\" + letter
-    return letter if letter.isprintable() else f"\\U{ord(letter):08X}"

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.case import HZ, Case, case_to_toml, load_case, problem_of
+from ccd_casadi.case import HZ, load_case, problem_of
+from ccd_casadi.case_sections import Case
+from ccd_casadi.case_toml import case_to_toml
 from ccd_casadi.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.conclusions import conclusions
 from ccd_casadi.derivatives import Sensitivities

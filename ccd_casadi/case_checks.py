@@ -1,0 +1,89 @@
+"""Checks of single values in a case file: None where a value is good, else what is wrong and what
+to give instead."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+Check = Callable[[Any], str | None]
+
+
+def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
+    """Inside (low, high), or [low, high) if `closed`; `remedy` says what to give."""
+
+    def check(value: Any) -> str | None:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return f"is {shown(value)}, not a number; {remedy}"
+        if too_large(value) or not math.isfinite(value):
+            return f"is {shown(value)}; {remedy}"
+        inside = low < value < high or (closed and value == low)
+        return None if inside else f"is {value:g}; {remedy}"
+
+    return check
+
+
+def count(least: int) -> Check:
+    def check(value: Any) -> str | None:
+        good = isinstance(value, int) and not isinstance(value, bool) and value >= least
+        if good and not too_large(value):
+            return None
+        return f"is {shown(value)}; give a whole number of at least {least}"
+
+    return check
+
+
+def choice(*names: str) -> Check:
+    def check(value: Any) -> str | None:
+        if value in names:
+            return None
+        return f"is {shown(value)}; choose one of {', '.join(names)}"
+
+    return check
+
+
+def text(value: Any) -> str | None:
+    return None if isinstance(value, str) else f"is {shown(value)}; give a text in quotes"
+
+
+def interval(value: Any) -> str | None:
+    remedy = "give two positive numbers [low, high] with low < high"
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        return f"is {shown(value)}; {remedy}"
+    for item in value:
+        if POSITIVE(item) is not None:
+            return f"is {shown(value)}; {remedy}"
+    return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
+
+
+def points(value: Any) -> str | None:
+    good = isinstance(value, list | tuple) and len(value) == 2
+    if good and all(count(2)(item) is None for item in value):
+        return None
+    return f"is {shown(value)}; give two whole numbers of at least 2"
+
+
+def steps(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and value and all(FRACTION(v) is None for v in value):
+        return None
+    return f"is {shown(value)}; give a list of numbers between 0 and 1"
+
+
+def too_large(value: Any) -> bool:
+    """TOML's integers have 64 bits; Python's parser takes any, and neither float nor repr do."""
+    return isinstance(value, int) and abs(value) >= 2**63
+
+
+def shown(value: Any) -> str:
+    if too_large(value):
+        return "an integer of more than 64 bits"
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except (ValueError, RecursionError):  # a huge integer or a very deep array inside
+        return "a value too long to show"
+    return text if len(text) < 60 else text[:57] + "..."
+
+
+ANY = number(-math.inf, math.inf, "give a finite number")
+POSITIVE = number(0.0, math.inf, "give a number above 0")
+FRACTION = number(0.0, 1.0, "give a number between 0 and 1")
+ABOVE_ONE = number(1.0, math.inf, "give a number above 1")
