@@ -11,9 +11,11 @@ from typing import NoReturn
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.errors import UserError
-from ccd_casadi.parallel import usable_cores
+from ccd_casadi.parallel import WorkerLost, usable_cores
+from ccd_casadi.plant import PlantError
 
 DEFAULT_CASE = "runs/two_mass.toml"
+_RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
 
 class ExitCode(IntEnum):
@@ -65,21 +67,25 @@ def run(
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
     code = ExitCode.INTERRUPTED
+    options = None
     try:
+        options = arguments.parse_args(argv)
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with threadpool_limits(limits=1):
-            code = main(arguments.parse_args(argv))
+            code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except SystemExit as ended:  # argparse, after --help or a wrong option
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
+        print(_one_line(f"{getattr(options, 'case', '')}: plant: {error}"), file=sys.stderr)
+        return ExitCode.BAD_INPUT
     except UserError as error:
         print(_one_line(error), file=sys.stderr)
         return ExitCode.BAD_INPUT
+    except WorkerLost as error:
+        print(f"interrupted: {_one_line(error)}; {_RESUMABLE}", file=sys.stderr)
     except KeyboardInterrupt:
-        print(
-            "interrupted: what is sampled is kept; the same command resumes from there",
-            file=sys.stderr,
-        )
+        print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
     except BrokenPipeError:
         # The reader of stdout went away; point it elsewhere so that the exit stays quiet.
         # What main concluded stands; if it was cut short, it was interrupted.

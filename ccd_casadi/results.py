@@ -110,10 +110,14 @@ def infeasible_dict(
 
 
 def predicted_bandwidth(outcome: FormulationResult, verified: VerifiedDesign) -> float:
-    """What the last surrogate says at the verified design, rad/s; IPOPT's own truth for direct."""
+    """What the last surrogate says at the verified design, rad/s.
+
+    Without a surrogate: the truth at IPOPT's own optimum, or at the design itself where IPOPT
+    found none.
+    """
     if not outcome.surrogates:
-        assert outcome.design is not None
-        return outcome.design.figures.bandwidth
+        made = verified.design if outcome.design is None else outcome.design
+        return made.figures.bandwidth
     process = outcome.surrogates[0]
     x = verified.x[: process.lower.size]
     return float(process.predict(x[None, :])[0])
