@@ -12,7 +12,7 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from pathlib import Path
 from types import TracebackType
@@ -59,6 +59,7 @@ class Sample:
 
 _COLUMNS = tuple(field.name for field in fields(Sample))
 _REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
+_THETA, _CERTIFIED, _GRADIENTS = map(_COLUMNS.index, ("theta", "certified", "gradients"))
 _TABLES = """
 create table if not exists meta (name text primary key, value text not null);
 create table if not exists problems (hash text primary key, json text not null);
@@ -94,11 +95,17 @@ def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: fl
 
 def _canonical(value: object) -> object:
     if isinstance(value, Mapping):
-        return {str(key): _canonical(item) for key, item in value.items()}
+        if not all(isinstance(key, str) for key in value):
+            raise TypeError("a name that is no text cannot be part of a key")
+        return {key: _canonical(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
-    if value is None or isinstance(value, str | bool):
+    if value is None or isinstance(value, bool):
         return value
+    if isinstance(value, str):
+        return f"'{value}"  # the mark keeps a text apart from the number that it spells
+    if isinstance(value, Integral) and abs(int(value)) > 2**53:
+        return str(int(value))  # no float is exact
     if isinstance(value, Integral | Real):
         number = float(value) + 0.0  # -0.0 becomes 0.0
         if not math.isfinite(number):
@@ -217,17 +224,19 @@ class SampleStore:
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
             return None if row is None else _decoded(row[0])
 
-    def select(self) -> list[Sample]:
-        """Every sample, ordered by θ, ω_S and ω_T."""
+    def select(self, problem: str | None = None) -> list[Sample]:
+        """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
+        query = f"select {', '.join(_COLUMNS)} from samples where ? is null or problem = ?"
         with self._worded():
-            rows = self._db.execute(f"select {', '.join(_COLUMNS)} from samples").fetchall()
+            rows = self._db.execute(query, (problem, problem)).fetchall()
             samples = [_from_row(row) for row in rows]
         return sorted(samples, key=lambda s: (s.theta, s.omega_S, s.omega_T, s.key))
 
-    def count(self) -> int:
-        """Number of samples."""
+    def count(self, problem: str | None = None) -> int:
+        """Number of samples (of one problem hash, if given)."""
+        query = "select count(*) from samples where ? is null or problem = ?"
         with self._worded():
-            return int(self._db.execute("select count(*) from samples").fetchone()[0])
+            return int(self._db.execute(query, (problem, problem)).fetchone()[0])
 
     def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
         marks = ", ".join("?" * (len(_COLUMNS) + 1))
@@ -240,19 +249,22 @@ class SampleStore:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        self._db.execute("begin immediate")
         try:
+            self._db.execute("begin immediate")
             yield
+            self._db.execute("commit")
         except BaseException:
-            self._db.execute("rollback")
+            if self._db.in_transaction:  # a full disk has already rolled it back
+                self._db.execute("rollback")
             raise
-        self._db.execute("commit")
 
     @contextmanager
     def _worded(self) -> Iterator[None]:
         """SQLite's errors as one line that says what to do."""
         try:
             yield
+        except (sqlite3.ProgrammingError, sqlite3.IntegrityError):
+            raise  # a mistake of the program, not of the file
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             text = " ".join(str(error).split())
             if "locked" in text:
@@ -267,8 +279,9 @@ class SampleStore:
 
 
 def _to_row(sample: Sample) -> tuple[object, ...]:
-    row = []
-    for name, value in zip(_COLUMNS, astuple(sample), strict=True):
+    row: list[object] = []
+    for name in _COLUMNS:
+        value = getattr(sample, name)
         if name == "theta" or (name == "gradients" and value is not None):
             value = json.dumps([None if math.isnan(item) else item for item in value])
         elif name == "certified":
@@ -280,16 +293,16 @@ def _to_row(sample: Sample) -> tuple[object, ...]:
 
 
 def _from_row(row: Sequence[Any]) -> Sample:
-    values = dict(zip(_COLUMNS, row, strict=True))
-    values["theta"] = tuple(_decoded(values["theta"]))
-    if values["gradients"] is not None:
-        numbers = _decoded(values["gradients"])
-        values["gradients"] = tuple(math.nan if item is None else item for item in numbers)
-    values["certified"] = bool(values["certified"])
-    for name in _REALS:
-        if values[name] is None:
-            values[name] = math.nan
-    return Sample(**values)
+    values: list[Any] = [
+        math.nan if value is None and name in _REALS else value
+        for name, value in zip(_COLUMNS, row, strict=True)
+    ]
+    values[_THETA] = tuple(_decoded(values[_THETA]))
+    values[_CERTIFIED] = bool(values[_CERTIFIED])
+    if values[_GRADIENTS] is not None:
+        numbers = _decoded(values[_GRADIENTS])
+        values[_GRADIENTS] = tuple(math.nan if item is None else item for item in numbers)
+    return Sample(*values)
 
 
 def _decoded(text: Any) -> Any:
