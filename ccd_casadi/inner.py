@@ -62,7 +62,10 @@ class InnerStatus(StrEnum):
 
 @dataclass(frozen=True)
 class InnerResult:
-    """The optimum (None if infeasible), what binds there, and every synthesis on the way."""
+    """The optimum (None if infeasible), what binds there, and every synthesis on the way.
+
+    `violation` is the least one in ln S_max and ln S_low of any certified design; zero if solved.
+    """
 
     status: InnerStatus
     optimum: Sensitivities | None
@@ -70,6 +73,7 @@ class InnerResult:
     rows: tuple[DesignFigures, ...]
     syntheses: int
     shortfall: str = ""
+    violation: float = 0.0
 
     @property
     def bandwidth(self) -> float:
@@ -97,12 +101,16 @@ def refine(
     problem: InnerProblem,
     rows: Sequence[DesignFigures],
     starts: Iterable[tuple[float, float]],
+    limit: int = 40,
 ) -> InnerResult:
-    """Local constrained solves from `starts` (rad/s); the best feasible design of all wins."""
+    """Local constrained solves from `starts` (rad/s); the best feasible design of all wins.
+
+    `limit` bounds the syntheses of each local solve.
+    """
     tried = list(rows)
     best: Sensitivities | None = None
     for start in starts:
-        for step in local_solve(plant, weights, problem, start):
+        for step in local_solve(plant, weights, problem, start, limit):
             tried.append(step.figures)
             if problem.feasible(step.figures) and (
                 best is None or step.figures.bandwidth > best.figures.bandwidth
@@ -114,9 +122,10 @@ def refine(
         best = evaluate(plant, weights, problem, (top.omega_S, top.omega_T))
         tried.append(best.figures)
     if best is None:
-        return InnerResult(
-            InnerStatus.INFEASIBLE, None, (), tuple(tried), len(tried), shortfall(problem, tried)
-        )
+        least = min((_violation(problem, row) for row in tried if row.certified), default=np.inf)
+        words = shortfall(problem, tried)
+        status = InnerStatus.INFEASIBLE
+        return InnerResult(status, None, (), tuple(tried), len(tried), words, least)
     active = active_constraints(problem, best.figures)
     return InnerResult(InnerStatus.SOLVED, best, active, tuple(tried), len(tried))
 

@@ -20,6 +20,7 @@ from ccd_casadi.weights import Weights
 INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
 FINE = 81  # points a side on which the interpolant is searched
 ADDED = 8  # designs that the interpolant may ask for
+BUDGET = 40  # syntheses in all, the local solve included
 LENGTHS = np.array([0.35, 0.6])  # correlation lengths as fractions of the box
 
 
@@ -45,7 +46,7 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
         points.append(new)
         designs.append(_design(plant, weights, problem, bounds, new))
     rows = [design.figures for design in designs]
-    return refine(plant, weights, problem, rows, _starts(problem, rows))
+    return refine(plant, weights, problem, rows, _starts(problem, rows), BUDGET - len(rows))
 
 
 def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:

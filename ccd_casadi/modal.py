@@ -62,6 +62,7 @@ def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
         raise PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")
     rigid = np.abs(lam) <= threshold
     lam = np.where(rigid, 0.0, lam)
+    modes = _aligned(modes, lam, rigid, system.C)
     root = np.sqrt(lam)
     h = np.where(rigid, w_r**2, lam)
     given = system.damping_ratio is None
@@ -78,11 +79,14 @@ def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
     dh = dM * h + _divided_differences(lam, h, rigid, np.ones_like(lam)) * dA
     slope_g = np.divide(zeta, root, out=np.zeros_like(root), where=~rigid)
     dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
+    C = system.C @ modes
+    seen = np.linalg.norm(C, axis=0)
+    C[:, seen <= 1e-12 * seen.max()] = 0.0
     return ModalPlant(
         K=np.diag(h),
         D=D_given + np.diag(g),
         B=modes.T @ system.B,
-        C=system.C @ modes,
+        C=C,
         natural=root,
         rigid=rigid,
         modes=modes,
@@ -92,6 +96,30 @@ def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
         dB=modes.T @ dB,
         dC=dC @ modes,
     )
+
+
+def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
+    """Rotate modes of one frequency so that what the sensors do not see stands alone.
+
+    Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
+    a direction that is not measured has c = 0 exactly; spread over several modes it would leave
+    the Riccati solution singular in a direction that rounding makes up.
+    """
+    modes = modes.copy()
+    n = lam.size
+    start = 0
+    while start < n:
+        end = start + 1
+        while end < n and (
+            (rigid[start] and rigid[end])
+            or (not rigid[start] and lam[end] - lam[end - 1] <= 1e-9 * lam[end])
+        ):
+            end += 1
+        if end - start > 1:
+            _, _, Vh = np.linalg.svd(C @ modes[:, start:end])
+            modes[:, start:end] = modes[:, start:end] @ Vh.T
+        start = end
+    return modes
 
 
 def _divided_differences(lam: Array, values: Array, rigid: np.ndarray, slope: Array) -> Array:

@@ -34,8 +34,7 @@ def solve_nested(
     thetas = _allowed(problem, np.unique(thetas, axis=0))
     samples = truth.bandwidths(thetas)
     if not any(sample.feasible for sample in samples):
-        nearest = min(samples, key=lambda s: len(s.shortfall))
-        return FormulationResult(None, None, (), (), None, False, nearest.shortfall)
+        return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
     iterates: list[Iterate] = []
     radius, agreed = 1.0, False
     surrogate: GaussianProcess | None = None

@@ -14,8 +14,10 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.inner import MARGIN
-from ccd_casadi.plant import Array, Plant
+from ccd_casadi.interrupts import interrupts_kept
+from ccd_casadi.plant import Array, Plant, constraint_values
 from ccd_casadi.problem import CoDesignProblem, plant_of
+from surrogates import design
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,8 @@ def solve_program(
     }
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
-        options["ipopt.max_iter"] = 60
+        # The true quantities carry rounding: there is no use in chasing the last digits.
+        options["ipopt.acceptable_iter"] = 4
     if warm:
         options |= {
             "ipopt.warm_start_init_point": "yes",
@@ -155,7 +158,8 @@ def solve_program(
     found: list[LocalOptimum] = []
     for start in np.atleast_2d(starts):
         z0 = np.clip((start - program.lower) / width, 0.0, 1.0)
-        result = solver(x0=z0, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
+        with interrupts_kept():
+            result = solver(x0=z0, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
         stats = solver.stats()
         point = np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)
         found.append(
@@ -196,6 +200,45 @@ def active_bounds(program: NonlinearProgram, x: Array, tolerance: float = 1e-6) 
         for i, name in enumerate(program.variables)
         for end, bound in (("lower", program.lower[i]), ("upper", program.upper[i]))
         if abs(x[i] - bound) <= tolerance * width[i]
+    )
+
+
+def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
+    """Empty where some θ in its box meets λ(θ) <= 0; else which constraint fails, and by how much.
+
+    Minimises the largest λ, so that the words name what stands nearest to being met.
+    """
+    plant = plant_of(problem)
+    if not plant.constraint_names:
+        return ""
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    points = np.vstack([np.array(problem.start), design("sobol", lower, upper, starts, seed)])
+    values = np.array([constraint_values(plant, point) for point in points])
+    if (values <= 0.0).all(axis=1).any():
+        return ""
+    theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
+    lam = _hardware(plant, theta)[1]
+    size = float(np.abs(values).max())
+    program = NonlinearProgram(
+        x=ca.vertcat(theta, slack),
+        f=slack,
+        g=lam / size - slack,
+        lower=np.append(lower, -2.0),
+        upper=np.append(upper, 2.0),
+        variables=(*problem.names, "slack"),
+        constraints=plant.constraint_names,
+    )
+    try:
+        best = solve_program(program, np.column_stack([points, np.ones(len(points))])).best.x[:-1]
+    except OuterFailure:
+        best = points[np.argmin(values.max(axis=1))]
+    found = constraint_values(plant, best)
+    worst = int(np.argmax(found))
+    if found[worst] <= 1e-9 * size:
+        return ""
+    return (
+        f"constraint {plant.constraint_names[worst]} cannot be met in the bounds of theta: its "
+        f"least value found is {found[worst]:.4g}, above 0"
     )
 
 

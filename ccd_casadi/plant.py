@@ -94,6 +94,10 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     if ratio is not None and not 0.0 < float(ratio) < 1.0:
         raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
     constraints = dict(result.get("constraints", {}))
+    scalars = {"hardware_cost": result["hardware_cost"], **constraints}
+    for key, value in scalars.items():
+        if ca.SX(value).shape != (1, 1):
+            raise PlantError(f"{key} is {ca.SX(value).shape}, not a scalar; return one number")
     lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
     damping_ratio = None if ratio is None else float(ratio)
     dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]

@@ -24,7 +24,10 @@ CHUNK = 8  # single designs a unit
 
 @dataclass(frozen=True)
 class BandwidthSample:
-    """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible."""
+    """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
+
+    An infeasible one says what falls short, and by how much (ln) at least: `violation`.
+    """
 
     theta: tuple[float, ...]
     bandwidth: float
@@ -33,6 +36,7 @@ class BandwidthSample:
     omega_T: float
     active: tuple[str, ...]
     shortfall: str
+    violation: float
     syntheses: int
 
     @property
@@ -80,6 +84,7 @@ class Truth:
         store.put_problem(self.hash, problem.identity())
         self._spent: dict[str, int] = {}
         self.trace: list[TraceEntry] = []
+        self.nearest: BandwidthSample | None = None  # of the infeasible ones
 
     @property
     def syntheses(self) -> int:
@@ -105,6 +110,10 @@ class Truth:
             assert known is not None
             sample = _bandwidth_sample(theta, known)
             found.append(sample)
+            if not sample.feasible and (
+                self.nearest is None or sample.violation < self.nearest.violation
+            ):
+                self.nearest = sample
             self._spend(key, sample.syntheses, theta, sample.bandwidth)
         return found
 
@@ -197,6 +206,7 @@ def inner_unit(
         "omega_T": None if optimum is None else optimum.figures.omega_T,
         "active": list(result.active),
         "shortfall": result.shortfall,
+        "violation": _number(result.violation),
         "syntheses": len(rows),
     }
     return list(rows.values()), (key, theta, payload)
@@ -261,6 +271,7 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
         omega_T=payload["omega_T"] if feasible else nan,
         active=tuple(payload["active"]),
         shortfall=payload["shortfall"],
+        violation=np.inf if payload["violation"] is None else payload["violation"],
         syntheses=payload["syntheses"],
     )
 

@@ -18,6 +18,7 @@ from ccd_casadi.direct import solve_direct
 from ccd_casadi.iterates import FormulationResult
 from ccd_casadi.lifted import solve_lifted
 from ccd_casadi.nested import solve_nested
+from ccd_casadi.outer import unmet_constraint
 from ccd_casadi.parallel import Workers
 from ccd_casadi.problem import box, plant_of
 from ccd_casadi.results import (
@@ -57,9 +58,13 @@ class Solution:
 def solve(case: Case, truth: Truth, formulation: str, seed: int) -> Solution:
     """Run one formulation, verify and polish its design on the truth."""
     began = perf_counter()
-    outcome = _formulate(case, truth, formulation, seed)
-    if outcome.x is None:
-        outcome = _rescue(truth, outcome, seed)
+    forbidden = unmet_constraint(truth.problem, case.outer.starts, seed)
+    if forbidden:
+        outcome = FormulationResult(None, None, (), (), None, False, forbidden)
+    else:
+        outcome = _formulate(case, truth, formulation, seed)
+        if outcome.x is None:
+            outcome = _rescue(truth, outcome, seed)
     if outcome.x is None:
         result = infeasible_dict(
             formulation,
@@ -117,7 +122,8 @@ def _rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationR
     samples = truth.bandwidths(points, "looking for a feasible design")
     feasible = [sample for sample in samples if sample.feasible]
     if not feasible:
-        words = samples[0].shortfall or outcome.message
+        assert truth.nearest is not None
+        words = truth.nearest.shortfall
         return FormulationResult(None, None, outcome.iterates, (), None, False, words)
     best = max(feasible, key=lambda sample: sample.bandwidth)
     x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
@@ -127,8 +133,10 @@ def _rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationR
 
 
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
-    """Write case.toml, result.json, controller.json and surrogate.json."""
-    (folder / "case.toml").write_text(case_to_toml(case))
+    """Write case.toml, result.json, controller.json and surrogate.json; clear an earlier run's."""
+    for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    (folder / "case.toml").write_text(case_to_toml(case), encoding="utf-8")
     if solution.verified is not None:
         write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
     if solution.outcome.surrogates:

@@ -27,7 +27,7 @@ class Outcome(StrEnum):
     UNSTABLE_LOOP = "the rebuilt closed loop is not stable"
     NORM_EXCEEDED = "the closed loop's norm exceeds gamma on the frequency grid"
     LEVEL_TEST_FAILED = "the Hamiltonian test finds a gain above gamma"
-    NO_BANDWIDTH = "sigma_max(S) never crosses -3 dB from below"
+    NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
 

@@ -13,13 +13,16 @@ import control
 import numpy as np
 from hypothesis import settings
 from scipy.linalg import sqrtm
+from scipy.optimize import brentq, minimize_scalar
 
 from ccd_casadi.inner import InnerProblem
+from ccd_casadi.kernels.design import Figure, assess
 from ccd_casadi.modal import Suspension, modal_plant
 from ccd_casadi.models import MODELS
 from ccd_casadi.plant import Mechanics, Plant, build_plant, mechanics
 from ccd_casadi.problem import CoDesignProblem, PlantSource
 from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.synthesis import DesignFigures, figures_from_row
 from ccd_casadi.weights import Weights
 
 Array = np.ndarray
@@ -106,7 +109,7 @@ def random_model(
         t = [theta[f"p{i}"] for i in range(parameters)]
         k = sum((slope[i] * t[i] for i in range(parameters)), start=0.0)
         K = ca.DM(T.T) @ ca.diag(stiffness * ca.exp(k)) @ ca.DM(T)
-        M = ca.DM(T.T @ T) + sum((ca.DM(masses[i]) * t[i] ** 2 for i in range(parameters)))
+        M = ca.DM(T.T @ T) + sum(ca.DM(masses[i]) * t[i] ** 2 for i in range(parameters))
         out = {
             "mass": 0.5 * (M + M.T),
             "stiffness": 0.5 * (K + K.T),
@@ -177,6 +180,29 @@ def flexible_case(seed: int) -> FlexibleCase:
     return FlexibleCase(scaled(mechanics(model, theta), M_K), model, weights, theta)
 
 
+# ---- any controller, assessed as our own -----------------------------------------------------
+
+
+def in_time_unit(system: StateSpace, omega_0: float, force: float = 1.0) -> StateSpace:
+    """A controller handed out in SI, in the scaled plant's units."""
+    return StateSpace(system.A / omega_0, system.B / omega_0, system.C / force, system.D / force)
+
+
+def assessed(
+    plant: ScaledPlant, controller: StateSpace, weights: Weights, gamma: float,
+    omega_low: float = OMEGA_LOW,
+) -> DesignFigures:  # fmt: skip
+    """Certificate and figures of any controller in SI against the claim `gamma`."""
+    K = in_time_unit(controller, plant.omega_0, plant.force)
+    matrices = (np.ascontiguousarray(matrix) for matrix in (K.A, K.B, K.C, K.D))
+    row = np.full(int(Figure.COUNT), np.nan)
+    row[Figure.LIMITED_BY_BOUND] = 0.0
+    scaled_weights = weights.scaled(plant.omega_0)
+    low = omega_low / plant.omega_0
+    assess(plant.A, plant.B, plant.C, *matrices, scaled_weights, gamma, low, row)
+    return figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
+
+
 # ---- the reference ----------------------------------------------------------------------------
 
 
@@ -230,9 +256,7 @@ def sensitivity_gain(plant: StateSpace, controller: StateSpace, omega: Array) ->
     return np.linalg.norm(sensitivity(plant, controller, omega), 2, axis=(1, 2))
 
 
-def stack_gain(
-    plant: StateSpace, controller: StateSpace, weights: Weights, omega: Array
-) -> Array:
+def stack_gain(plant: StateSpace, controller: StateSpace, weights: Weights, omega: Array) -> Array:
     """σ_max([W1 S; W2 KS; W3 T]) at every ω in rad/s; W2 in SI."""
     K = state_response(controller, omega)
     S = sensitivity(plant, controller, omega)
@@ -252,6 +276,61 @@ def dense_grid(*systems: StateSpace, per_decade: int = 100) -> Array:
         pieces.append(pole.imag + abs(pole.real) * flanks)
     grid = np.unique(np.concatenate(pieces))
     return grid[grid > 0.0]
+
+
+def reference_plant(system: Mechanics, suspension: Suspension = SUSPENSION) -> StateSpace:
+    """State space of the SI matrices, states [x; ẋ]."""
+    M, D, K = reference_matrices(system, suspension)
+    n = M.shape[0]
+    lower = -np.linalg.solve(M, np.hstack([K, D]))
+    A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+    B = np.vstack([np.zeros_like(system.B), np.linalg.solve(M, system.B)])
+    C = np.hstack([system.C, np.zeros_like(system.C)])
+    return StateSpace(A, B, C, np.zeros((C.shape[0], B.shape[1])))
+
+
+def first_crossing(gain: Callable[[Array], Array], grid: Array, level: float) -> float:
+    """The first ω where gain(ω) passes the level from below: grid, then brentq."""
+    above = gain(grid) > level
+    i = int(np.flatnonzero(~above[:-1] & above[1:])[0])
+    return brentq(lambda w: float(gain(w)[0]) - level, grid[i], grid[i + 1], xtol=1e-12, rtol=1e-14)
+
+
+def highest(gain: Callable[[Array], Array], grid: Array) -> tuple[float, float]:
+    """The maximum of gain(ω) and where it is: grid, then a bounded search at the three best."""
+    values = gain(grid)
+    peaks = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    best, at = float(values.max()), float(grid[np.argmax(values)])
+    for i in peaks[np.argsort(-values[peaks])][:3]:
+        found = minimize_scalar(
+            lambda w: -float(gain(w)[0]), bounds=(grid[i - 1], grid[i + 1]), method="bounded",
+            options={"xatol": 1e-10 * grid[i]},
+        )  # fmt: skip
+        if -found.fun > best:
+            best, at = -float(found.fun), float(found.x)
+    return best, at
+
+
+def stack_system(plant: StateSpace, controller: StateSpace, weights: Weights):
+    """r to [W1 S; W2 KS; W3 T] r by python-control, from plant, controller and weights."""
+    G, K = to_control(plant), to_control(controller)
+    p, m = G.noutputs, G.ninputs
+    W1, W2, W3 = (control.ss(system) for system in control_weights(weights))
+    parts = control.append(G, K, *[W1] * p, *[W2] * m, *[W3] * p)
+    # inputs [u_G; e_K; W1; W2; W3] from outputs [y; u; z1; z2; z3] and r
+    outputs = p + m + 2 * p + m
+    route, inject = np.zeros((m + p + 2 * p + m, outputs)), np.zeros((m + p + 2 * p + m, p))
+    ones_p, ones_m = np.eye(p), np.eye(m)
+    route[:m, p : p + m] = ones_m
+    route[m : m + p, :p] = -ones_p
+    route[m + p : m + 2 * p, :p] = -ones_p
+    route[m + 2 * p : 2 * m + 2 * p, p : p + m] = ones_m
+    route[2 * m + 2 * p :, :p] = ones_p
+    inject[m : m + p] = ones_p
+    inject[m + p : m + 2 * p] = ones_p
+    loop = control.feedback(parts, control.ss([], [], [], route), sign=1)
+    select = np.hstack([np.zeros((2 * p + m, p + m)), np.eye(2 * p + m)])
+    return control.ss(loop.A, loop.B @ inject, select @ loop.C, select @ loop.D @ inject)
 
 
 def to_control(system: StateSpace) -> control.StateSpace:

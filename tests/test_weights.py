@@ -4,6 +4,7 @@ from dataclasses import astuple
 
 import control
 import numpy as np
+import pytest
 from helpers import HZ, PAPER, control_weights, few, random_plant, relative, scaled, state_response
 from hypothesis import given
 from hypothesis import strategies as st
@@ -73,7 +74,9 @@ def test_generalized_plant_is_the_mixed_sensitivity_one(
     """[W1, -W1 G; 0, W2; 0, W3 G; I, -G], block by block."""
     model = random_plant(seed, rigid=1, flexible=3, inputs=inputs, outputs=outputs)
     plant = scaled(mechanics(model, (0.5, 0.5)), w.M_K)
-    A, B1, B2, C1, C2, d1, d2 = generalized_plant(plant.A, plant.B, plant.C, w.scaled(plant.omega_0))
+    A, B1, B2, C1, C2, d1, d2 = generalized_plant(
+        plant.A, plant.B, plant.C, w.scaled(plant.omega_0)
+    )
     p, m = outputs, inputs
     D = np.zeros((2 * p + m + p, p + m))
     D[:p, :p] = d1 * np.eye(p)
@@ -108,7 +111,8 @@ def test_generalized_plant_of_the_paper_by_python_control() -> None:
     A, B1, B2, C1, C2, d1, d2 = generalized_plant(plant.A, plant.B, plant.C, PAPER.scaled(w0))
     unit = Weights(2.0, 1e-4, 800 * HZ / w0, 1e4, 100 * HZ / w0, 1.0, 1.0, 1e-2, 40 * HZ / w0)
     W = [control.ss(system) for system in control_weights(unit)]
-    expected = control.augw(control.ss(plant.A, plant.B, plant.C, 0.0), *W)
+    with pytest.warns(FutureWarning, match="connect"):
+        expected = control.augw(control.ss(plant.A, plant.B, plant.C, 0.0), *W)
     D = np.array([[d1, 0.0], [0.0, d2], [0.0, 0.0], [1.0, 0.0]])
     found = StateSpace(A, np.hstack([B1, B2]), np.vstack([C1, C2]), D)
     for omega in (1e-2, 0.3, 1.0, 7.0, 100.0):

@@ -1,0 +1,155 @@
+"""The inner problem: both methods, the prototype's optimum, dense sweeps, infeasibility."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
+
+from ccd_casadi.inner import (
+    InnerProblem,
+    InnerResult,
+    InnerStatus,
+    active_constraints,
+    sweep_inner,
+    sweep_starts,
+)
+from ccd_casadi.inner_search import search_inner
+from ccd_casadi.plant import hardware_cost
+from ccd_casadi.problem import plant_of, true_inner
+from ccd_casadi.synthesis import sweep
+
+BUDGET = 40
+
+
+def check_result(result: InnerResult, inner: InnerProblem) -> None:
+    """Feasible, counted, named by what binds, and stationary in what does not."""
+    assert result.status is InnerStatus.SOLVED
+    assert result.optimum is not None
+    best = result.optimum.figures
+    assert inner.feasible(best)
+    assert inner.omega_S[0] <= best.omega_S <= inner.omega_S[1]
+    assert inner.omega_T[0] <= best.omega_T <= inner.omega_T[1]
+    assert result.syntheses == len(result.rows)
+    assert result.bandwidth == max(r.bandwidth for r in result.rows if inner.feasible(r))
+    assert result.active == active_constraints(inner, best)
+    assert result.active  # ω_b grows with ω_S: something must bind
+
+
+def compare(theta: tuple[float, float], inner: InnerProblem) -> float:
+    """Difference of the two methods, relative; the search's budget is checked on the way."""
+    plant = two_mass(*theta)
+    swept, searched = (solve(plant, PAPER, inner) for solve in (sweep_inner, search_inner))
+    if swept.status is InnerStatus.INFEASIBLE:
+        assert searched.status is InnerStatus.INFEASIBLE
+        return 0.0
+    assert searched.syntheses <= BUDGET
+    check_result(swept, inner)
+    check_result(searched, inner)
+    return searched.bandwidth / swept.bandwidth - 1.0
+
+
+@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.slow)])
+def test_search_finds_the_optimum_of_the_sweep(count: int) -> None:
+    rng = np.random.default_rng(2)
+    errors = [compare(tuple(rng.uniform(55.0, 70.0, 2)), INNER) for _ in range(count)]
+    assert np.abs(errors).max() < 1e-6
+
+
+@pytest.mark.parametrize("count", [6, pytest.param(100, marks=pytest.mark.slow)])
+def test_search_finds_the_optimum_under_other_constraints(count: int) -> None:
+    rng = np.random.default_rng(4)
+    errors = []
+    for _ in range(count):
+        inner = replace(
+            INNER,
+            S_max=rng.uniform(1.7, 2.2),
+            S_low=log_uniform(rng, 0.012, 0.05),
+            omega_S=(10.0 * HZ, rng.uniform(800.0, 2000.0) * HZ),
+            omega_T=(25.0 * HZ, rng.uniform(200.0, 1000.0) * HZ),
+        )
+        errors.append(compare(tuple(rng.uniform(55.0, 70.0, 2)), inner))
+    assert np.abs(errors).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", ["search", "sweep"])
+def test_optimum_of_the_prototype(method: str) -> None:
+    case = problem(method=method)
+    result = true_inner(case, (55.0, 55.0))
+    check_result(result, case.inner)
+    cost = hardware_cost(plant_of(case), (55.0, 55.0))
+    assert cost == 110.0
+    assert case.w1 * cost + case.w2 * result.bandwidth == pytest.approx(-439.465, abs=5e-4)
+    assert result.active == ("S_max", "omega_S upper")
+    best = result.optimum.figures
+    assert best.bandwidth / HZ == pytest.approx(72.0452, abs=5e-5)
+    assert best.omega_T / HZ == pytest.approx(26.07, abs=0.005)
+    assert best.sensitivity_peak == pytest.approx(1.75, abs=2e-8)
+
+
+def check_against_dense_sweep(theta: tuple[float, float], points: int) -> float:
+    """How far the optimum lies below the best of a dense certified sweep, relative."""
+    plant = two_mass(*theta)
+    rows = sweep(
+        plant,
+        PAPER,
+        np.geomspace(*INNER.omega_S, points),
+        np.geomspace(*INNER.omega_T, points),
+        omega_low=INNER.omega_low,
+        gamma_backoff=INNER.gamma_backoff,
+    )
+    assert all(row.certified for row in rows)
+    dense = max(row.bandwidth for row in rows if INNER.feasible(row))
+    best = search_inner(plant, PAPER, INNER).bandwidth
+    assert best < dense * 1.05  # the sweep is dense enough to mean something
+    return 1.0 - best / dense
+
+
+@pytest.mark.parametrize("theta", [(60.0, 60.0), (58.33, 55.0)])
+def test_optimum_is_not_below_a_dense_sweep(theta: tuple[float, float]) -> None:
+    assert check_against_dense_sweep(theta, 60) < 1e-6
+
+
+@pytest.mark.slow
+def test_optimum_is_nowhere_below_a_denser_sweep() -> None:
+    rng = np.random.default_rng(9)
+    short = [check_against_dense_sweep(tuple(rng.uniform(55.0, 70.0, 2)), 200) for _ in range(20)]
+    assert max(short) < 1e-6
+
+
+@pytest.mark.parametrize("solve", [sweep_inner, search_inner])
+def test_infeasible_problem_names_what_cannot_be_met(solve) -> None:
+    plant = two_mass(60.0, 60.0)
+    result = solve(plant, PAPER, replace(INNER, S_max=1.05))
+    assert result.status is InnerStatus.INFEASIBLE
+    assert result.optimum is None
+    assert np.isnan(result.bandwidth)
+    least = min(row.sensitivity_peak for row in result.rows)
+    assert result.shortfall == (
+        f"S_max = 1.05 cannot be met: the least peak of S found is {least:.4g}"
+    )
+    assert least > 1.05
+    result = solve(plant, PAPER, replace(INNER, S_low=1e-4))
+    assert "S_low = 0.0001 cannot be met" in result.shortfall
+    # each bound can be met alone, both cannot
+    result = solve(plant, PAPER, replace(INNER, S_max=1.3, S_low=0.012))
+    assert "cannot be met together" in result.shortfall
+
+
+def test_sweep_starts_are_the_local_maxima_of_the_merit_best_first() -> None:
+    """ln ω_b - 3 times the violation in logarithms, over the eight neighbours of a grid point."""
+    inner = replace(INNER, sweep_points=(12, 9))
+    rows = sweep(two_mass(57.0, 66.0), PAPER, *inner.axes(), omega_low=inner.omega_low)
+    peaks = np.array([row.sensitivity_peak for row in rows]).reshape(12, 9)
+    low = np.array([row.sensitivity_low for row in rows]).reshape(12, 9)
+    excess = np.maximum(np.log(peaks / inner.S_max), np.log(low / inner.S_low)).clip(0.0)
+    merit = np.log([row.bandwidth for row in rows]).reshape(12, 9) - 3.0 * excess
+    expected = {
+        (rows[i * 9 + j].omega_S, rows[i * 9 + j].omega_T): merit[i, j]
+        for i in range(12)
+        for j in range(9)
+        if merit[i, j] == merit[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].max()
+    }
+    starts = sweep_starts(inner, rows)
+    assert starts == sorted(expected, key=lambda point: -expected[point])[:6]
+    assert sweep_starts(inner, rows, limit=1) == starts[:1]

@@ -1,0 +1,321 @@
+"""The run report: sound HTML without outside resources, every figure complete, in every case."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+import pytest
+
+from ccd_casadi.case import Case, load_case, problem_of
+from ccd_casadi.iterates import FormulationResult
+from ccd_casadi.parallel import Workers
+from ccd_casadi.problem import CoDesignProblem, true_inner
+from ccd_casadi.report import report_html, write_report
+from ccd_casadi.reporting.lifted_maximum import inner_maximum, mean
+from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
+from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
+from ccd_casadi.reporting.page import Section, Table, number, page, table_html
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import Truth
+from ccd_casadi.solve import Solution, solve
+
+HZ = 2.0 * np.pi
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+HOSTILE_UNIT = r'kg</td><script>alert(1)</script>"&$\\frac$'
+HOSTILE_STEM = 'a <img src=x onerror=alert(2)> & "b"'
+COMMON = """
+[objective]
+w1 = 0.1
+w2 = -1.0
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 1e7
+A_l = 1.0
+A_u = 1e-2
+[inner]
+S_max = 1.9
+S_low = 0.05
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1000.0]
+omega_T_hz = [25.0, 1000.0]
+"""
+PLANTS = """
+import casadi as ca
+SPRING = ca.DM([[1, -1], [-1, 1]])
+
+def line(m, k, end):
+    return {"mass": ca.diag(ca.vertcat(m, end)), "stiffness": k * SPRING, "damping_ratio": 0.02,
+            "input": ca.DM([1, 0]), "output": ca.DM([[1, 0]]), "hardware_cost": m + end}
+
+def one(theta):
+    return line(theta["m"], 2e7, 20.0)
+
+def three(theta):
+    plant = line(theta["m"], 2e7 * theta["k"], 20.0 + theta["o"])
+    return plant | {"constraints": {"room <b>": theta["m"] + theta["o"] - 34.0}}
+
+def mimo(theta):
+    a, b = theta["a"], theta["b"]
+    K = ca.SX(3, 3)
+    K[:2, :2] += 2e7 * a * SPRING
+    K[1:, 1:] += 2e7 * b * SPRING
+    return {"mass": ca.diag(ca.vertcat(20 * a, 8 * b, 10)), "stiffness": K, "damping_ratio": 0.02,
+            "input": ca.DM([[1, 0], [0, 0], [0, 1]]), "output": ca.DM([[1, 0, 0], [0, 0, 1]]),
+            "hardware_cost": a + b}
+"""
+
+
+def parameter(name: str, low: float, high: float, unit: str = "") -> str:
+    return f"[theta.{name}]\nlower = {low}\nupper = {high}\nunit = '{unit}'\n"
+
+
+CASES = {  # name: function, parameters, sampling and outer, formulation
+    "one": ("one", parameter("m", 10, 20, "kg"), "points = 4", "nested"),
+    "three": (
+        "three",
+        parameter("m", 10, 20, HOSTILE_UNIT) + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
+        "points = 2\n[outer]\nmax_refinements = 0\ntolerance = 1e-9",
+        "nested",
+    ),
+    "three_lifted": (
+        "three",
+        parameter("m", 10, 20, "kg") + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
+        "lifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1",
+        "lifted",
+    ),
+    "one_direct": (
+        "one",
+        parameter("m", 10, 20, "kg"),
+        "points = 4\n[outer]\ndirect_starts = 1",
+        "direct",
+    ),
+    "mimo": (
+        "mimo",
+        parameter("a", 0.5, 1.5) + parameter("b", 0.5, 1.5),
+        "lifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1",
+        "lifted",
+    ),
+}
+
+
+@cache
+def run(name: str) -> tuple[Path, Case, CoDesignProblem, Solution, str]:
+    """A solved case and its report; two_mass-* are the shipped case in three formulations."""
+    folder = Path(mkdtemp())
+    if name in CASES:
+        function, theta, rest, formulation = CASES[name]
+        (folder / "plants.py").write_text(PLANTS)
+        path = folder / f"{HOSTILE_STEM}.toml"
+        head = f'[plant]\nfunction = "plants.py:{function}"\n'
+        path.write_text(head + theta + COMMON + "[sampling]\n" + rest + "\n")
+    else:
+        formulation = name.split("-")[1]
+        path = Path(__file__).parents[1] / "runs" / "two_mass.toml"
+    case = load_case(path)
+    problem = problem_of(case)
+    with SampleStore(folder / "samples.sqlite") as store, Workers(1, 2.0) as workers:
+        solution = solve(case, Truth(problem, store, workers), formulation, 0)
+    written = write_report(folder, case, problem, solution)
+    return folder, case, problem, solution, written.read_text(encoding="utf-8")
+
+
+ALL = ("two_mass-nested", "two_mass-lifted", "two_mass-direct", *CASES)
+
+
+class Document(HTMLParser):
+    """Every tag closed in order; keeps tags with attributes, ids, and texts by open tag."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[tuple[str, ...], str]] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if data.strip():
+            self.texts.append((tuple(self.open), data.strip()))
+
+
+def figures(text: str) -> list[str]:
+    return re.findall(r"<figure>.*?</figure>", text, flags=re.DOTALL)
+
+
+def test_one_folder_is_as_it_says() -> None:
+    folder, *_ = run("two_mass-lifted")
+    assert (folder / "report.html").stat().st_size < 1_000_000
+    assert not (folder / "report.html.part").exists()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_html_is_well_formed_and_asks_for_nothing(name: str) -> None:
+    text = run(name)[4]
+    document = Document(text)
+    tags = {tag for tag, _ in document.tags}
+    assert not tags & {"script", "link", "img", "iframe", "object", "image", "foreignobject"}
+    ids = [attrs["id"] for _, attrs in document.tags if "id" in attrs]
+    assert len(ids) == len(set(ids))
+    for _, attrs in document.tags:
+        assert not any(key.startswith("on") or key == "src" for key in attrs)
+        target = attrs.get("href")
+        assert target is None or (target[0] == "#" and target[1:] in ids)
+    assert set(re.findall(r"url\(([^)]*)\)", text)) <= {f"#{i}" for i in ids}
+    assert "://" not in re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)
+    assert "@import" not in text
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_figure_has_units_a_caption_and_data(name: str) -> None:
+    found = figures(run(name)[4])
+    assert len(found) >= 3
+    for figure in found:
+        svg = figure[: figure.index("</svg>")]
+        words = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+        labels = [word for word in words if re.search(r" \(.+\)$", word)]
+        panels = svg.count("-axes_")
+        assert panels >= 1
+        assert len(labels) >= 2 * panels - svg.count("QuadMesh")
+        caption = re.search(r"<figcaption>(.*?)</figcaption>", figure, flags=re.DOTALL)
+        assert caption is not None
+        assert re.search(r"\d", caption[1])
+        assert not re.search(r"\bnan\b|\binf\b|None", caption[1])
+        assert figure.count("<details>") == 1
+        assert figure.count("<tr>") > 2
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_page_says_what_the_result_says(name: str) -> None:
+    _, case, problem, solution, text = run(name)
+    result = solution.result
+    good = result["status"] == "verified"
+    assert (f'class="badge {"good" if good else "bad"}"') in text
+    assert number(result["bandwidth_hz"]) in text
+    assert all(key in text for key in (*problem.names, "KKT", "Certificate", result["formulation"]))
+    for version in result["versions"].values():
+        assert version in text
+    assert re.search(r"<pre>\[plant\]", text)
+    assert case.path.suffix == ".toml"
+
+
+def test_what_binds_is_said_in_words() -> None:
+    text = run("two_mass-lifted")[4]
+    assert "m1 is at its lower bound, 55 kg; moving the bound outwards by 0.15 kg would" in text
+    assert "The peak of S is at S_max = 1.75; raising S_max by 1 % would lower J by 1.1" in text
+
+
+def test_unverified_result_says_why() -> None:
+    *_, solution, text = run("three")
+    assert solution.result["status"] == "not_verified"
+    assert "✕ not verified" in text
+    assert "failed: prediction" in text
+    assert "UNVERIFIED" in text
+
+
+def test_hostile_names_and_units_are_escaped() -> None:
+    text = run("three")[4]
+    assert "<script>" not in text
+    assert "<img" not in text
+    assert "alert(1)" in text  # it is shown, as text
+    assert "&lt;img src=x" in text
+    assert "room &lt;b&gt;" in text or "room <b>" not in text
+
+
+def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
+    _, case, problem, solution, _ = run("one")
+    kept = ("formulation", "syntheses", "seconds", "seed", "versions")
+    result = {key: solution.result[key] for key in kept}
+    result |= {"status": "infeasible", "reason": "S_max cannot be met by <0.1>"}
+    nothing = FormulationResult(None, None, (), (), None, False, "")
+    text = report_html(tmp_path, case, problem, Solution(result, nothing, None))
+    Document(text)
+    assert "S_max cannot be met by &lt;0.1&gt;" in text
+
+
+def test_mimo_shows_singular_values_without_phase() -> None:
+    text = run("mimo")[4]
+    assert "plant σ(G) (m/N)" in text
+    assert "phase of G" not in text
+
+
+def test_paper_frequencies_are_marked() -> None:
+    text = run("two_mass-lifted")[4]
+    assert "Resonances (▲) of the plant: 183.6 Hz; anti-resonances (▼): 129.8 Hz" in text
+
+
+def test_other_problems_in_the_store_are_left_out() -> None:
+    folder, case, problem, solution, _ = run("two_mass-lifted")
+    other = replace(problem, weights=replace(problem.weights, M_K=1e7))
+    text = report_html(folder, case, other, solution)
+    assert "Too few syntheses" in text
+
+
+def test_lifted_maximum_is_the_surrogates_and_near_the_truth() -> None:
+    _, _, problem, solution, _ = run("two_mass-lifted")
+    processes = solution.outcome.surrogates
+    rng = np.random.default_rng(0)
+    X = rng.uniform(processes[0].lower, processes[0].upper, (200, 4))
+    for process in processes:
+        assert np.abs(mean(process, X) - process.predict(X)).max() <= 1e-7 * process.output_scale
+    thetas = rng.uniform(problem.lower, problem.upper, (6, 2))
+    best = inner_maximum(problem, processes, thetas)
+    assert best.bandwidth == pytest.approx(processes[0].predict(best.x), rel=1e-4)
+    assert (processes[1].predict(best.x) <= np.log(problem.inner.S_max) + 1e-3).all()
+    truth = [true_inner(problem, tuple(theta)).bandwidth for theta in thetas]
+    assert best.bandwidth == pytest.approx(np.array(truth), rel=0.03)
+
+
+def test_figures_are_deterministic_and_keep_the_callers_style() -> None:
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    x = np.linspace(1.0, 10.0, 5)
+    panel = Panel("time (s)", "cost ($a$ & <b>) (–)", (Curve(x, x**2, "J"),), log_y=True)
+    drawn = [figure_lines([[panel]], key="k", title="<t>") for _ in range(2)]
+    assert drawn[0] == drawn[1]
+    assert "cost ($a$ &amp; &lt;b&gt;)" in drawn[0]
+    assert 'aria-label="&lt;t&gt;"' in drawn[0]
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_landscape_takes_several_paths_and_unknown_letters() -> None:
+    axis = np.linspace(0.0, 1.0, 5)
+    field = axis[:, None] + axis
+    field[0, 0] = np.nan
+    land = Landscape(
+        ("a", "b"), ("天", "x" * 90), axis, axis, field, np.array([[0.5, 0.5, 1.0]]),
+        np.empty((0, 2)), forbidden=field > 1.5, region=(0.2, 0.6, 0.2, 0.6),
+    )  # fmt: skip
+    paths = [ThetaPath(name, np.array([[0.1, 0.2], [0.9, 0.8]])) for name in ("ours", "theirs")]
+    svg = figure_landscape(land, paths, (0.9, 0.8), key="two")
+    Document(svg)
+    assert all(word in svg for word in ("ours", "theirs", "天", "…"))
+
+
+def test_tables_round_and_escape() -> None:
+    html = table_html(Table(("<a>", "n"), (("&", 1.0 / 3.0), ("x", float("nan")))))
+    Document(html)
+    assert "&lt;a&gt;" in html
+    assert "&amp;" in html
+    assert '<td class="n">0.33333</td>' in html
+    assert '<td class="n">–</td>' in html
+    Document(page("t", [Section("<h>", "<p>x</p>")]))

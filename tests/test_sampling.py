@@ -1,0 +1,325 @@
+"""Offline sampling: the same samples whatever interrupts it and however many workers there are."""
+
+import json
+import math
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import HZ, INNER, problem
+
+from ccd_casadi import sampling as module
+from ccd_casadi.parallel import Workers
+from ccd_casadi.problem import PlantSource
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import CHUNK, Truth
+
+ROOT = Path(__file__).parent.parent
+TWO_MASS = ROOT / "runs" / "two_mass.toml"
+THETAS = np.array([[55.0, 55.0], [62.5, 58.0], [70.0, 70.0], [55.0, 70.0]])
+X = np.array([[55.0 + i, 70.0 - i, np.log(400.0 + 90.0 * i), np.log(200.0)] for i in range(11)])
+
+
+def table(path: Path) -> dict[str, list[tuple[Any, ...]]]:
+    """All that a store holds but the seconds, which no two runs share."""
+    database = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    names = [row[1] for row in database.execute("pragma table_info(samples)")]
+    names.remove("seconds")
+    found = {"samples": database.execute(f"select {', '.join(names)} from samples").fetchall()}
+    for other in ("meta", "problems", "results"):
+        found[other] = database.execute(f"select * from {other}").fetchall()
+    database.close()
+    return {name: sorted(rows, key=repr) for name, rows in found.items()}
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Truth]]:
+    path = tmp_path_factory.mktemp("sampled") / "s.sqlite"
+    with SampleStore(path) as store:
+        truth = Truth(problem(), store, Workers(1))
+        truth.bandwidths(THETAS)
+        truth.quantities(X)
+        yield path, truth
+
+
+def untouchable(*_: Any) -> Any:
+    raise AssertionError("this was known already")
+
+
+def test_rows_do_not_depend_on_the_number_of_workers(
+    sampled: tuple[Path, Truth], tmp_path: Path
+) -> None:
+    path, first = sampled
+    with SampleStore(tmp_path / "s.sqlite") as store, Workers(2) as workers:
+        truth = Truth(problem(), store, workers)
+        bandwidths = truth.bandwidths(THETAS)
+        quantities = truth.quantities(X)
+        assert truth.syntheses == first.syntheses
+    assert bandwidths == first.bandwidths(THETAS)
+    for ours, theirs in zip(quantities, first.quantities(X), strict=True):
+        assert ours.x == theirs.x
+        assert ours.values.tobytes() == theirs.values.tobytes()
+        assert ours.gradients.tobytes() == theirs.gradients.tobytes()
+    found = table(tmp_path / "s.sqlite")
+    assert found == table(path)
+    assert len(found["samples"]) > 50
+
+
+def test_nothing_is_computed_twice(
+    sampled: tuple[Path, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, first = sampled
+    spent = first.syntheses
+    monkeypatch.setattr(module, "inner_unit", untouchable)
+    monkeypatch.setattr(module, "design_unit", untouchable)
+    with SampleStore(path) as store:
+        truth = Truth(problem(), store, Workers(1))
+        assert truth.syntheses == 0
+        turned = truth.bandwidths(THETAS[::-1])
+        truth.bandwidths(THETAS[[0, 0, 2]])
+        truth.quantities(np.vstack([X, X]))
+        assert truth.syntheses == spent, "what was found counts as what was computed"
+        with pytest.raises(AssertionError, match="known already"):
+            truth.bandwidths([[61.0, 61.0]])
+    assert [sample.theta for sample in turned] == [tuple(row) for row in THETAS[::-1]]
+    assert turned[::-1] == first.bandwidths(THETAS)
+
+
+def test_a_sample_says_what_the_inner_problem_found(sampled: tuple[Path, Truth]) -> None:
+    _, truth = sampled
+    light = truth.bandwidths(THETAS[:1])[0]
+    assert light.feasible
+    assert light.bandwidth / HZ == pytest.approx(72.0452, abs=1e-3)
+    assert light.omega_S / HZ == pytest.approx(1800.0, rel=1e-9)
+    assert set(light.active) == {"S_max", "omega_S upper"}
+    above = truth.bandwidths([[55.0 + 1e-3, 55.0]])[0]
+    slope = (above.bandwidth - light.bandwidth) / 1e-3
+    assert light.gradient[0] == pytest.approx(slope, rel=1e-3)
+
+
+def test_quantities_are_the_rows_figures_with_their_slopes(sampled: tuple[Path, Truth]) -> None:
+    path, truth = sampled
+    sample = truth.quantities(X[:1])[0]
+    for i, h in enumerate([0.02, 0.02, 1e-4, 1e-4]):
+        step = h * np.eye(4)[i]
+        ends = truth.quantities(np.array([X[0] + step, X[0] - step]))
+        slope = (ends[0].values - ends[1].values) / (2 * h)
+        np.testing.assert_allclose(sample.gradients[:, i], slope, rtol=2e-3, atol=1e-5)
+    with SampleStore(path) as store:
+        near = [s for s in store.select() if s.theta == tuple(X[0, :2]) and s.gradients]
+    omega = tuple(np.exp(X[0, 2:]))
+    row = next(s for s in near if (s.omega_S, s.omega_T) == omega)
+    assert sample.values[0] == row.bandwidth
+    assert sample.values[1] == np.log(row.sensitivity_peak)
+
+
+def test_designs_go_out_in_chunks_and_come_back_in_order(tmp_path: Path) -> None:
+    order = np.random.default_rng(0).permutation(len(X))
+    assert len(X) > CHUNK
+    with SampleStore(tmp_path / "s.sqlite") as store, Workers(2) as workers:
+        found = Truth(problem(), store, workers).quantities(X[order])
+    assert [sample.x for sample in found] == [tuple(x) for x in X[order]]
+
+
+def test_an_infeasible_theta_is_a_sample_too(tmp_path: Path) -> None:
+    hard = problem(inner=replace(INNER, S_max=1.05))
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        for _ in range(2):  # computed, then read
+            (sample,) = Truth(hard, store, Workers(1)).bandwidths(THETAS[:1])
+            assert not sample.feasible
+            assert math.isnan(sample.bandwidth)
+            assert all(map(math.isnan, sample.gradient))
+            assert "S_max = 1.05" in sample.shortfall
+            assert sample.syntheses == store.count() > 0
+
+
+def test_what_determines_a_synthesis_and_nothing_else_is_in_its_key(tmp_path: Path) -> None:
+    def hashes(**changes: Any) -> tuple[str, str]:
+        truth = Truth(problem(**changes), store, Workers(1))
+        return truth.hash, truth.inner_hash
+
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        base = hashes()
+        for same in ({"w1": 3.0}, {"lower": (50.0, 50.0)}, {"start": (60.0, 60.0)}):
+            assert hashes(**same) == base
+        for inner in (replace(INNER, S_max=1.5), replace(INNER, S_low=0.02)):
+            assert hashes(inner=inner)[0] == base[0], "the same designs answer another bound"
+            assert hashes(inner=inner)[1] != base[1]
+        assert hashes(method="sweep")[1] != base[1]
+        other = PlantSource("two_mass", None, None, (("zeta", 0.02),))
+        assert hashes(source=other)[0] != base[0]
+        assert hashes(inner=replace(INNER, gamma_backoff=1.03))[0] != base[0]
+        file = tmp_path / "plant.py"
+        own = PlantSource(None, str(file), "model", ())
+        file.write_text("def model(theta): return 1\n")
+        before = hashes(source=own)
+        file.write_text("def model(theta): return 2\n")
+        assert hashes(source=own)[0] != before[0], "a plant is known by what its file says"
+
+
+# ---- interruptions -------------------------------------------------------------------------------
+
+
+def command(folder: Path, *more: str) -> list[str]:
+    words = ["-m", "ccd_casadi.solve", str(TWO_MASS), "--out", str(folder), "--quiet", *more]
+    return [sys.executable, *words]
+
+
+def started(words: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def rows(path: Path) -> int:
+    """Samples in the store so far; 0 where it is not made yet."""
+    try:
+        database = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+        try:
+            return int(database.execute("select count(*) from samples").fetchone()[0])
+        finally:
+            database.close()
+    except sqlite3.OperationalError:
+        return 0
+
+
+def wait_for_rows(process: subprocess.Popen[str], path: Path, least: int) -> None:
+    limit = time.monotonic() + 60.0
+    while rows(path) < least and process.poll() is None:
+        assert time.monotonic() < limit
+        time.sleep(0.02)
+
+
+def result(folder: Path) -> dict[str, Any]:
+    found = json.loads((folder / "result.json").read_text())
+    assert found.pop("seconds") > 0.0
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "undisturbed"
+    done = subprocess.run(
+        command(folder), cwd=ROOT, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    return folder
+
+
+def interrupted_runs(folder: Path, kills: int, seed: int, span: float) -> list[int]:
+    """Kill and resume until `kills` kills have met a running command; rows left by each."""
+    rng, left = random.Random(seed), []
+    store = folder / "samples.sqlite"
+    while len(left) < kills:
+        process = started(command(folder))
+        if rng.random() < 0.7:  # while it samples
+            wait_for_rows(process, store, rows(store) + 1)
+            time.sleep(rng.uniform(0.0, 0.3))
+        else:  # at any moment: while it starts, fits, verifies or writes
+            time.sleep(rng.uniform(0.5, 0.5 + span))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode in (0, -signal.SIGKILL)
+        if process.returncode == 0:  # it had finished: begin again
+            for path in folder.iterdir():
+                path.unlink()
+        else:
+            left.append(rows(store))
+    return left
+
+
+@pytest.mark.parametrize(
+    ("kills", "seed", "span"),
+    [(3, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)],
+)
+def test_killed_and_resumed_ends_as_if_undisturbed(
+    undisturbed: Path, tmp_path: Path, kills: int, seed: int, span: float
+) -> None:
+    folder = tmp_path / "run"
+    left = interrupted_runs(folder, kills, seed, span)
+    assert len(set(left)) >= 2, "the kills met the sampling at different points"
+    done = subprocess.run(
+        command(folder, "--resume"), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert table(folder / "samples.sqlite") == table(undisturbed / "samples.sqlite")
+    assert result(folder) == result(undisturbed)
+    for name in ("controller.json", "surrogate.json", "case.toml"):
+        assert (folder / name).read_bytes() == (undisturbed / name).read_bytes()
+
+
+POOL = f"""
+import sys
+import numpy as np
+from ccd_casadi.case import load_case, problem_of
+from ccd_casadi.parallel import Workers
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import Truth
+
+if __name__ == "__main__":
+    problem = problem_of(load_case({str(TWO_MASS)!r}))
+    with SampleStore(sys.argv[1]) as store, Workers(int(sys.argv[2])) as workers:
+        truth = Truth(problem, store, workers)
+        truth.bandwidths(np.random.default_rng(0).uniform(55.0, 70.0, (10, 2)))
+        print(truth.syntheses)
+"""
+
+
+def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
+    script = tmp_path / "pool.py"
+    script.write_text(POOL)
+    rng, seen = random.Random(5), []
+    for _ in range(2):
+        process = started([sys.executable, str(script), str(tmp_path / "a.sqlite"), "2"])
+        wait_for_rows(process, tmp_path / "a.sqlite", (seen[-1] if seen else 0) + 1)
+        time.sleep(rng.uniform(0.0, 0.15))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        seen.append(rows(tmp_path / "a.sqlite"))
+    assert 0 < seen[0] < seen[1], "the second run went on from the first"
+    told = []
+    for name, workers in (("a", "2"), ("b", "1")):
+        words = [sys.executable, str(script), str(tmp_path / f"{name}.sqlite"), workers]
+        done = subprocess.run(words, capture_output=True, text=True, check=True)
+        told.append(done.stdout)
+    assert told[0] == told[1], "as many syntheses are counted as if nothing had happened"
+    assert seen[1] < rows(tmp_path / "b.sqlite")
+    assert table(tmp_path / "a.sqlite") == table(tmp_path / "b.sqlite")
+
+
+@pytest.mark.parametrize(
+    "formulation",
+    ["nested", "lifted", "direct"],
+)
+def test_ctrl_c_is_resumable(undisturbed: Path, tmp_path: Path, formulation: str) -> None:
+    """In the middle of sampling, or of IPOPT on the truth."""
+    folder = tmp_path / "run"
+    process = started(command(folder, "--formulation", formulation))
+    wait_for_rows(process, folder / "samples.sqlite", 20)
+    os.kill(process.pid, signal.SIGINT)
+    began = time.monotonic()
+    output, errors = process.communicate(timeout=20)
+    assert (process.returncode, output) == (130, "")
+    assert time.monotonic() - began < 2.0
+    assert len(errors.splitlines()) == 1, errors
+    assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")
+    assert not (folder / "result.json").exists()
+    if formulation == "nested":
+        kept = rows(folder / "samples.sqlite")
+        assert 20 <= kept < rows(undisturbed / "samples.sqlite")
+        again = subprocess.run(
+            command(folder), cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        assert again.returncode == 0
+        assert result(folder) == result(undisturbed)
