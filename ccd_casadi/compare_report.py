@@ -36,6 +36,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.published_figures import published_sections
 from ccd_casadi.reporting.truths import read_truths
+from ccd_casadi.steepest_descent import Descent
 from ccd_casadi.synthesis import synthesise
 
 
@@ -55,14 +56,13 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         sections.append(
             Section("Sensitivity, baseline against co-design", _loops(comparison, best))
         )
-    for method in comparison.methods:
-        if method.descent is not None and method.descent.iterates:
-            body = figure_html(
-                figure_histories(problem, method, key=method.name),
-                caption_histories(method),
-                table_histories(problem, method),
-            )
-            sections.append(Section(f"History: {LABELS[method.name]}", body))
+    for name, descent in histories(comparison).items():
+        body = figure_html(
+            figure_histories(problem, descent, key=f"history{len(sections)}"),
+            caption_histories(descent),
+            table_histories(problem, descent),
+        )
+        sections.append(Section(f"History: {name}", body))
     sections += published_sections(problem, answer)
     sections.append(Section("The case", preformatted(case_to_toml(comparison.case))))
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
@@ -84,6 +84,27 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
     return path
+
+
+def histories(comparison: Comparison) -> dict[str, Descent]:
+    """The best descent of each gradient, and the best one from the case's own start."""
+    found: dict[str, Descent] = {}
+    for method in comparison.methods:
+        if method.descent is None or not method.descent.iterates:
+            continue
+        label = LABELS[method.name]
+        own = [
+            descent
+            for descent in comparison.descents
+            if descent.gradient is method.descent.gradient
+            and descent.start == comparison.problem.start
+            and descent.iterates
+        ]
+        if own:
+            found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
+        if method.descent.start != comparison.problem.start:
+            found[f"{label}, best of all runs"] = method.descent
+    return found
 
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:

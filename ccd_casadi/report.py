@@ -136,7 +136,7 @@ def _theta(
         words = "There is no surrogate, and no design near the optimum to show in its place."
         return Section("Bandwidth over the hardware", paragraph(words))
     svg = figure_slices(slices, best)
-    caption = caption_slices(slices, best) + extra
+    caption = caption_slices(slices, best, lifted=len(processes) == 3) + extra
     return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables_slices(slices)))
 
 

@@ -104,7 +104,7 @@ def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
 
 def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
     """A logarithmic grid with points crowded around lightly damped poles and zeros."""
-    roots = np.concatenate([np.linalg.eigvals(A), _transmission_zeros(A, B, C)])
+    roots = np.concatenate([np.linalg.eigvals(A), transmission_zeros(A, B, C)])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
     pieces = [np.geomspace(1e-5, 1e5, 121)]
     flanks = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
@@ -115,8 +115,8 @@ def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
     return np.ascontiguousarray(grid[(grid >= 1e-5) & (grid <= 1e5)])
 
 
-def _transmission_zeros(A: Array, B: Array, C: Array) -> np.ndarray:
-    """Finite invariant zeros of a square plant; none where it is not square."""
+def transmission_zeros(A: Array, B: Array, C: Array) -> np.ndarray:
+    """Finite invariant zeros of a square plant in its own unit of time; none if not square."""
     n, m = B.shape
     if C.shape[0] != m:
         return np.empty(0, complex)

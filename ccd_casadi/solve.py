@@ -192,10 +192,9 @@ def command(options: argparse.Namespace) -> ExitCode:
         truth = Truth(problem, samples, workers, quiet=options.quiet)
         solution = solve(case, truth, options.formulation, options.seed)
         write_run(folder, case, solution)
-    if solution.verified is not None:
-        from ccd_casadi.report import write_report  # matplotlib is slow to import
+    from ccd_casadi.report import write_report  # matplotlib is slow to import
 
-        write_report(folder, case, problem, solution)
+    write_report(folder, case, problem, solution)
     if not options.quiet:
         print(summary(solution))
         print(f"run folder    {folder}")

@@ -79,9 +79,11 @@ def test_states_are_stable_and_inputs_weigh_as_outputs(seed, shape) -> None:
     plant = scaled(mechanics(random_plant(seed, **shape), (0.2, 0.4)), 1e5)
     assert np.linalg.eigvals(plant.A).real.max() < 0.0
     n = plant.A.shape[0] // 2
-    np.testing.assert_allclose(
-        np.linalg.norm(plant.B[n:], axis=1), np.linalg.norm(plant.C[:, :n], axis=0), rtol=1e-12
-    )
+    driven = np.linalg.norm(plant.B[n:], axis=1)
+    measured = np.linalg.norm(plant.C[:, :n], axis=0)
+    both = measured > 0.0  # where fewer are measured than rigid, one stands alone with c = 0
+    assert both.sum() >= min(n, plant.C.shape[0])
+    np.testing.assert_allclose(driven[both], measured[both], rtol=1e-12)
 
 
 @few(max_examples=15)

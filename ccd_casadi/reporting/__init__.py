@@ -1,0 +1,1 @@
+"""Building blocks of the reports: figures as SVG text, the page around them, and their data."""

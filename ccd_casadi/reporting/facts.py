@@ -1,0 +1,183 @@
+"""A design in words and numbers: the conclusion, the table of the design, and what binds."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.reporting.page import Table, number
+
+HZ = 2.0 * np.pi
+Fact = tuple[str, str, str]
+_FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
+
+
+def conclusion(result: Mapping[str, Any]) -> str:
+    """One sentence with the key numbers."""
+    if result["status"] == "infeasible":
+        return f"No feasible design: {result['reason']}"
+    certificate = result["certificate"]
+    proof = (
+        f"certified stable with ‖[W_S S; W_KS KS; W_T T]‖∞ ≤ {number(certificate['norm_bound'])}"
+        if certificate["passed"]
+        else "NOT certified"
+    )
+    verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
+    return (
+        f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}, with a "
+        f"closed-loop bandwidth of {number(result['bandwidth_hz'])} Hz at a hardware cost of "
+        f"{number(result['hardware_cost'])} (J = {number(result['objective'], 6)}), "
+        f"{proof}, predicted to {number(result['verification_error'], 2)} of the truth, after "
+        f"{result['syntheses']} true syntheses in {number(result['seconds'], 2)} s."
+    )
+
+
+def theta_words(result: Mapping[str, Any]) -> str:
+    """`m1 = 55 kg, m2 = 55 kg`."""
+    units = result.get("units", {})
+    return ", ".join(
+        f"{name} = {number(value)} {units.get(name, '')}".strip()
+        for name, value in result["theta"].items()
+    )
+
+
+def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
+    """Every parameter with its bounds, and where it lies between them."""
+    rows = []
+    for i, name in enumerate(problem.names):
+        value, low, high = result["theta"][name], problem.lower[i], problem.upper[i]
+        share = (value - low) / (high - low)
+        place = "at lower" if share <= 1e-6 else "at upper" if share >= 1 - 1e-6 else "inside"
+        unit = problem.units[i] or "–"
+        rows.append((name, unit, float(value), float(low), float(high), problem.start[i], place))
+    head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
+    return Table(head, tuple(rows))
+
+
+def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fact]:
+    """Quantity, value, remark: the design, its loop, its proof and its price."""
+    r, inner, certificate = result, problem.inner, result["certificate"]
+    proof = "all closed-loop poles stable" if certificate["stable"] else "UNSTABLE"
+    ranges = [
+        f"range {number(a / HZ)} to {number(b / HZ)} Hz" for a, b in (inner.omega_S, inner.omega_T)
+    ]
+    hz = {key: f"{number(r[key + '_hz'], 6)} Hz" for key in _FREQUENCIES}
+    poles = f"largest real part {number(certificate['max_real_pole'], 4)} 1/s"
+    norm = f"norm {number(certificate['norm'], 6)} ≤ {number(certificate['norm_bound'], 6)}"
+    bound = f"least possible norm; lower bound γ_jω = {number(r['gamma_lower_bound'], 6)}"
+    backoff = f"synthesised at {inner.gamma_backoff:g} γ_opt, recomputed from the closed loop"
+    J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) ω_b, ω_b in rad/s"
+    peak = f"at {hz['sensitivity_peak']}; S_max = {inner.S_max:g}"
+    error = f"relative error {number(r['verification_error'], 2)}"
+    return [
+        ("Objective J", number(r["objective"], 7), J),
+        ("Hardware cost f(θ)", number(r["hardware_cost"], 6), ""),
+        ("Bandwidth ω_b", hz["bandwidth"], "true: first -3 dB crossing of σ_max(S)"),
+        ("Predicted bandwidth", hz["surrogate_bandwidth"], error),
+        ("Weight on S: ω_S", hz["omega_S"], ranges[0]),
+        ("Weight on T: ω_T", hz["omega_T"], ranges[1]),
+        ("γ_opt", number(r["gamma_opt"], 6), bound),
+        ("γ achieved", number(r["gamma"], 6), backoff),
+        ("Peak of sensitivity ‖S‖∞", number(r["sensitivity_peak"], 6), peak),
+        (
+            f"|S| at {number(inner.omega_low / HZ)} Hz",
+            number(r["sensitivity_low"], 4),
+            f"S_low = {inner.S_low:g}",
+        ),
+        (
+            "Certificate",
+            "passed" if certificate["passed"] else "FAILED",
+            f"{proof} ({poles}); {norm}",
+        ),
+        *_without_suspension(r),
+        *_optimality(r),
+        ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
+    ]
+
+
+def _without_suspension(r: Mapping[str, Any]) -> list[Fact]:
+    free = r.get("without_suspension")
+    if not free:
+        return []
+    if free["bandwidth_hz"] is None:
+        words = "unstable" if not free["stable"] else "no bandwidth"
+        return [("Without the soft suspension", words, "same controller, rigid-body modes free")]
+    change = 100.0 * (free["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
+    stable = "stable" if free["stable"] else "UNSTABLE"
+    return [
+        (
+            "Without the soft suspension",
+            f"{number(free['bandwidth_hz'], 5)} Hz ({change:+.2f} %)",
+            f"same controller, rigid-body modes free: {stable}, peak of S "
+            f"{number(free['sensitivity_peak'], 5)}",
+        )
+    ]
+
+
+def _optimality(r: Mapping[str, Any]) -> list[Fact]:
+    kkt, globality = r["kkt"], r["globality"]
+    if kkt["vertex"]:
+        second = "a vertex: the binding constraints alone determine it"
+    elif kkt["second_order"] is None:
+        second = "second order not computed"
+    else:
+        second = f"least curvature of the Lagrangian {number(kkt['second_order'], 3)} (scaled)"
+    residual = number(kkt["stationarity"], 2)
+    facts = [("Optimality (KKT residual)", residual, f"on the true problem; {second}")]
+    optima = globality["optima"]
+    values = ", ".join(f"{number(o['objective'], 6)} ({o['starts']}×)" for o in optima[:6])
+    if optima:
+        count = f"{len(optima)} distinct optim{'um' if len(optima) == 1 else 'a'}"
+        facts.append(
+            ("Globality", f"{globality['starts']} starts, {count}", f"J (starts): {values}")
+        )
+    gap = r.get("inner_gap")
+    if gap is not None:
+        words = "relative excess of the global inner optimum at θ over the design's ω_b"
+        facts.append(("Inner problem's gap", number(gap, 2), words))
+    return facts
+
+
+def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
+    """A sentence for everything that binds, with what loosening it would change in J."""
+    multipliers: dict[str, float] = result["kkt"]["multipliers"]
+    names = list(dict.fromkeys([*multipliers, *result["active"]]))
+    return [_sentence(problem, name, multipliers.get(name)) for name in names]
+
+
+def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> str:
+    inner = problem.inner
+    if name == "S_max":
+        words = f"The peak of S is at S_max = {inner.S_max:g}"
+        gain = _gain(multiplier, 0.01, "raising S_max by 1 %")
+    elif name == "S_low":
+        words = f"|S| at ω_low is at S_low = {inner.S_low:g}"
+        gain = _gain(multiplier, 0.01, "raising S_low by 1 %")
+    else:
+        variable, _, end = name.rpartition(" ")
+        side = "widening the range there by 1 %"
+        if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
+            ends = inner.omega_S if variable == "omega_S" else inner.omega_T
+            value = ends[0 if end == "lower" else 1] / HZ
+            sign = variable.replace("omega", "ω")
+            words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
+            gain = _gain(multiplier, 0.01 / float(np.log(ends[1] / ends[0])), side)
+        elif end in ("lower", "upper") and variable in problem.names:
+            i = problem.names.index(variable)
+            value = (problem.lower if end == "lower" else problem.upper)[i]
+            width, unit = problem.upper[i] - problem.lower[i], problem.units[i]
+            words = f"{variable} is at its {end} bound, {number(value)} {unit}".rstrip()
+            step = 0.01 * width
+            side = f"moving the bound outwards by {number(step, 3)} {unit}".rstrip()
+            gain = _gain(multiplier, 0.01, side)
+        else:
+            words = f"The constraint {name} binds"
+            gain = _gain(multiplier, 1.0, "loosening it by one unit")
+    return words + gain
+
+
+def _gain(multiplier: float | None, step: float, what: str) -> str:
+    if multiplier is None:
+        return "."
+    return f"; {what} would lower J by {number(multiplier * step, 3)}, to first order."

@@ -1,0 +1,118 @@
+"""The inner problem at the optimum: ω_b over (ω_S, ω_T) from the store, or from the surrogates."""
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError
+
+from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.reporting.lifted_maximum import fields
+from ccd_casadi.reporting.lines import Array
+from ccd_casadi.reporting.maps import SweepMap
+from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.truths import Truths, feasible
+from surrogates import GaussianProcess
+
+HZ = 2.0 * np.pi
+LEAST_ROWS = 9
+GRID = 101
+LIFTED = "contours from the lifted surrogates, dots true"
+LINEAR = "contours interpolated linearly between the dots"
+NO_FIELD = "the dots alone"
+
+
+def sweep_data(
+    problem: CoDesignProblem,
+    processes: tuple[GaussianProcess, ...],
+    truths: Truths,
+    theta: tuple[float, ...],
+    optimum: tuple[float, float, float],
+) -> SweepMap | None:
+    """The map at θ, `optimum` = (ω_S, ω_T, ω_b) in Hz; None where too few syntheses are known."""
+    samples = [s for s in truths.near(problem, theta) if s.certified]
+    if len(samples) < LEAST_ROWS:
+        return None
+    rows = np.array(
+        [
+            (
+                s.omega_S / HZ,
+                s.omega_T / HZ,
+                s.bandwidth / HZ,
+                s.sensitivity_peak,
+                s.sensitivity_low,
+                float(feasible(problem, s)),
+            )
+            for s in samples
+        ]
+    )
+    inner = problem.inner
+    axes = [np.geomspace(*ends, GRID) for ends in (inner.omega_S, inner.omega_T)]
+    limits = np.log([inner.S_max, inner.S_low])
+    source, field = LINEAR, None
+    if len(processes) == 3:
+        source = LIFTED
+        field = fields(processes, np.array([theta]), *map(np.log, axes))[:, 0]
+    else:
+        field = _interpolated(rows, axes)
+    empty = np.empty((0, 0))
+    known = field is not None
+    return SweepMap(
+        rows=rows,
+        omega_S=axes[0] / HZ,
+        omega_T=axes[1] / HZ,
+        bandwidth_hz=field[0] / HZ if field is not None else empty,
+        peak=field[1] - limits[0] if field is not None else empty,
+        low=field[2] - limits[1] if field is not None else empty,
+        optimum=optimum,
+        source=source if known else NO_FIELD,
+    )
+
+
+def _interpolated(rows: Array, axes: list[Array]) -> Array | None:
+    """ω_b, ln‖S‖∞, ln|S(low)| between the rows, linear in logarithms; None if they span no area."""
+    places = np.log(HZ * rows[:, :2])
+    values = np.column_stack([HZ * rows[:, 2], np.log(rows[:, 3]), np.log(rows[:, 4])])
+    # refinements pile up near the optimum; triangles between them are only rounding
+    _, first = np.unique(np.round(places, 3), axis=0, return_index=True)
+    logs = [np.log(axis) for axis in axes]
+    # the box's ends come back from the store with a rounding error, just outside the hull
+    inside = [
+        np.clip(g, lo, hi) for g, lo, hi in zip(logs, places.min(0), places.max(0), strict=True)
+    ]
+    near = [np.where(np.abs(g - c) <= 1e-6, c, g) for g, c in zip(logs, inside, strict=True)]
+    try:
+        between = LinearNDInterpolator(places[first], values[first])
+    except QhullError:
+        return None
+    points = np.stack(np.meshgrid(*near, indexing="ij"), -1)
+    return np.moveaxis(between(points), -1, 0)
+
+
+def caption_sweep(sweep: SweepMap, *, S_max: float, S_low: float) -> str:
+    """How many syntheses, how many feasible, and what S_max costs."""
+    inside = sweep.rows[:, 5] > 0.5
+    words = (
+        f"{len(inside)} certified syntheses at the optimal θ, {int(inside.sum())} of them within "
+        f"S_max = {S_max:g} and S_low = {S_low:g} ({sweep.source}). The optimum (★) lies at "
+        f"ω_S = {number(sweep.optimum[0], 4)} Hz, ω_T = {number(sweep.optimum[1], 4)} Hz."
+    )
+    if (~inside).any():
+        hz = float(sweep.rows[~inside, 2].max())
+        if hz > sweep.optimum[2]:
+            worst = sweep.rows[~inside][sweep.rows[~inside, 2].argmax()]
+            words += (
+                f" Without the bounds on S there would be up to {number(hz, 4)} Hz, at "
+                f"‖S‖∞ = {number(float(worst[3]), 4)}."
+            )
+    if sweep.bandwidth_hz.size:
+        known = np.isfinite(sweep.peak)
+        bad = known & (np.maximum(sweep.peak, sweep.low) > 0.0)
+        words += f" Infeasible (hatched): {100.0 * bad.sum() / known.sum():.0f} % of the box shown."
+    return words
+
+
+def table_sweep(sweep: SweepMap) -> Table:
+    """Every synthesis at the optimum."""
+    head = ("ω_S Hz", "ω_T Hz", "ω_b Hz", "‖S‖∞", "|S(ω_low)|", "feasible")
+    return Table(
+        head, tuple((*map(float, row[:5]), "yes" if row[5] else "no") for row in sweep.rows)
+    )

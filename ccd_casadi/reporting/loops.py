@@ -1,0 +1,187 @@
+"""Closed loops over frequency: σ_max of S, KS and T against their bounds."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccd_casadi.closed_loop import local_peaks, responses
+from ccd_casadi.reporting.lines import Array, Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.svg import CYCLE, GREY
+from ccd_casadi.scaling import ScaledPlant, StateSpace, transmission_zeros
+from ccd_casadi.weights import Weights
+
+HZ = 2.0 * np.pi
+POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
+SHOWN = 45  # rows of a data table
+LIGHT = 0.3  # damping ratio below which a pole or zero counts as a resonance
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One design over frequency in Hz: G (k, p, m), K (k, m, p), gains of S, KS, T, and bounds.
+
+    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `peaks`: local maxima of σ_max(S) as (Hz, gain).
+    """
+
+    label: str
+    hz: Array
+    plant: NDArray[np.complex128]
+    controller: NDArray[np.complex128]
+    gains: Array
+    bounds: Array
+    bandwidth_hz: float
+    peaks: tuple[tuple[float, float], ...]
+    resonances_hz: tuple[float, ...]
+    antiresonances_hz: tuple[float, ...]
+
+
+def loop_data(
+    plant: ScaledPlant,
+    controller: StateSpace,
+    weights: Weights,
+    *,
+    gamma: float,
+    bandwidth_hz: float,
+    omega_low: float,
+    label: str = "",
+) -> Loop:
+    """Frequency responses of a design; `omega_low` in rad/s sets where the plots begin."""
+    poles = _light(np.linalg.eigvals(plant.A) * plant.omega_0)
+    zeros = _light(transmission_zeros(plant.A, plant.B, plant.C) * plant.omega_0)
+    peaks = tuple((omega / HZ, gain) for omega, gain in local_peaks(plant, controller))
+    tops = [hz for hz, gain in peaks if gain > 1.05]
+    low = min(omega_low / HZ, bandwidth_hz / 10.0) / 5.0
+    high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
+    around = plant.grid * plant.omega_0 / HZ
+    special = [*poles, *zeros, bandwidth_hz, *(hz for hz, _ in peaks)]
+    grid = np.unique(np.concatenate([np.geomspace(low, high, POINTS), around, special]))
+    hz = grid[(grid >= low) & (grid <= high)]
+    G, K, S = responses(plant, controller, HZ * hz)
+    KS = K @ S
+    stack = (S, KS, G @ KS)
+    gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in stack])
+    return Loop(
+        label=label,
+        hz=hz,
+        plant=G,
+        controller=K,
+        gains=gains,
+        bounds=gamma / np.abs(weights.responses(HZ * hz)),
+        bandwidth_hz=bandwidth_hz,
+        peaks=peaks,
+        resonances_hz=poles,
+        antiresonances_hz=zeros,
+    )
+
+
+def figure_gains(
+    loops: Sequence[Loop], *, S_max: float, key: str = "gains", bounds: bool = True
+) -> str:
+    """|S| over the full width, |KS| and |T| below it, for one design or several."""
+    names = ("S", "KS", "T")
+    units = ("–", "N/m", "–")
+    panels = []
+    for i in range(3):
+        curves, marks, levels = [], [], []
+        for j, loop in enumerate(loops):
+            colour = CYCLE[j]
+            label = loop.label or f"|{names[i]}|"
+            curves.append(Curve(loop.hz, loop.gains[i], label, colour))
+            if bounds:
+                words = "its bound γ/|W|" if len(loops) == 1 else ""
+                curves.append(Curve(loop.hz, loop.bounds[i], words, colour, "--", width=0.9))
+            text = f"ω_b {number(loop.bandwidth_hz, 4)} Hz"
+            levels.append(Level(loop.bandwidth_hz, text if i == 0 else "", True, colour))
+            if i == 0:
+                tops = [p for p in loop.peaks if p[1] > 1.05]
+                marks += _peak_marks(tops, colour)
+        if i == 0:
+            levels += [
+                Level(S_max, f"S_max {S_max:g}", colour=GREY),
+                Level(2**-0.5, "-3 dB", colour=GREY),
+            ]
+        panels.append(
+            Panel(
+                "frequency (Hz)",
+                f"σ_max({names[i]}) ({units[i]})",
+                tuple(curves),
+                marks=tuple(marks),
+                levels=tuple(levels),
+                log_x=True,
+                log_y=True,
+                x_range=(float(loops[0].hz[0]), float(loops[0].hz[-1])),
+                y_range=_gain_range(loops, i),
+                legend="best" if i else "lower right",
+            )
+        )
+    title = "Largest singular values of S, KS and T over frequency, with their bounds"
+    return figure_lines([panels[:1], panels[1:]], key=key, title=title, heights=(3.3, 2.7))
+
+
+def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
+    """The highest peak labelled above it, up to three others to their far side of it."""
+    ranked = sorted(tops, key=lambda p: -p[1])[:4]
+    marks = []
+    for hz, gain in ranked:
+        text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > ranked[0][0] else -7.0, 2.0)
+        if hz == ranked[0][0]:
+            text, offset = f"{gain:.3g} at {text}", (0.0, 7.0)
+        marks.append(Mark(hz, gain, text, colour=colour, offset=offset))
+    return marks
+
+
+def _gain_range(loops: Sequence[Loop], i: int) -> tuple[float, float]:
+    """From the gains, and no more of the bounds above them than a decade."""
+    gains = np.concatenate([loop.gains[i] for loop in loops])
+    low = float(gains.min())
+    return max(low / 1.5, 1e-6 * float(gains.max())), float(gains.max()) * 4.0
+
+
+def caption_gains(loop: Loop, *, S_max: float) -> str:
+    """What to see in the gains of one design, in numbers."""
+    share = loop.gains / loop.bounds
+    closest = share.argmax(axis=1)
+    parts = [
+        f"|{name}| comes to {100.0 * share[i, closest[i]]:.1f} % of its bound at "
+        f"{number(float(loop.hz[closest[i]]), 3)} Hz"
+        for i, name in enumerate(("S", "KS", "T"))
+    ]
+    tops = sorted((p for p in loop.peaks if p[1] > 1.05), key=lambda p: -p[1])
+    words = ""
+    if tops:
+        hz, gain = tops[0]
+        words = (
+            f" The highest peak of S is {number(gain, 5)} at {number(hz, 4)} Hz, "
+            f"{100.0 * gain / S_max:.2f} % of S_max = {S_max:g}"
+        )
+        others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
+        words += f"; further local peaks {', '.join(others)}." if others else "."
+    return (
+        f"σ_max(S) first passes -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
+        f"passes its bound γ/|W|, as certified: {', '.join(parts)}."
+    )
+
+
+def table_gains(loop: Loop) -> Table:
+    """Gains and bounds at some frequencies, the marked ones among them."""
+    rows = shown_rows(loop.hz, [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)])
+    pairs = zip(loop.gains, loop.bounds, strict=True)
+    columns = [loop.hz, *(column for pair in pairs for column in pair)]
+    head = ("Hz", "|S|", "bound", "|KS| N/m", "bound N/m", "|T|", "bound")
+    return Table(head, tuple(tuple(float(c[i]) for c in columns) for i in rows))
+
+
+def shown_rows(hz: Array, special: Sequence[float]) -> list[int]:
+    wanted = [*np.geomspace(hz[0], hz[-1], SHOWN), *special]
+    return sorted({int(np.abs(hz - value).argmin()) for value in wanted})
+
+
+def _light(roots: NDArray[Any]) -> tuple[float, ...]:
+    """Frequencies in Hz of lightly damped pairs, ascending."""
+    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
+    light = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
+    return tuple(sorted(float(value) for value in np.abs(light) / HZ))

@@ -1,0 +1,240 @@
+"""Maps over two variables: the landscape of ω_b*(θ) and the inner problem's (ω_S, ω_T)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ccd_casadi.reporting.lines import Array
+from ccd_casadi.reporting.svg import (
+    BLACK,
+    COLOUR_MAP,
+    CYCLE,
+    GREY,
+    ORANGE,
+    axis_label,
+    log_axis,
+    new_figure,
+    place,
+    style,
+    to_svg,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MAP_WIDTH = 8.4  # inches
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """ω_b*(θ) in Hz on a grid of two parameters (NaN: infeasible), and what is known of it.
+
+    `bandwidth_hz` (len(first), len(second)), empty where there is no surrogate. `truths` are
+    rows (θ₁, θ₂, Hz), `designs` rows (θ₁, θ₂). `forbidden` is where some λ(θ) > 0. `region` is
+    a trust region (low₁, high₁, low₂, high₂).
+    """
+
+    names: tuple[str, str]
+    units: tuple[str, str]
+    first: Array
+    second: Array
+    bandwidth_hz: Array
+    truths: Array
+    designs: Array
+    truth_label: str = "true ω_b*(θ), same colours"
+    forbidden: Array | None = None
+    region: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class ThetaPath:
+    """A method's way over θ, rows (θ₁, θ₂); numbered where `numbered`."""
+
+    label: str
+    theta: Array
+    numbered: bool = False
+
+
+@dataclass(frozen=True)
+class SweepMap:
+    """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
+
+    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low` = ln(|S(low)|/S_low) lie on the grid of
+    `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
+    where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
+    """
+
+    rows: Array
+    omega_S: Array
+    omega_T: Array
+    bandwidth_hz: Array
+    peak: Array
+    low: Array
+    optimum: tuple[float, float, float]
+    source: str
+
+
+def figure_landscape(
+    land: Landscape,
+    paths: Sequence[ThetaPath] = (),
+    optimum: tuple[float, float] | None = None,
+    *,
+    key: str = "landscape",
+) -> str:
+    """Filled contours of ω_b*(θ) with true samples, paths and the optimum."""
+    from matplotlib.patches import Rectangle
+
+    with style():
+        figure, axes = _map_axes()
+        axes.grid(False)
+        axes.set_facecolor("#eeeeee")
+        shown = land.bandwidth_hz if land.bandwidth_hz.size else land.truths[:, 2]
+        filled, norm = _contours(axes, land.first, land.second, land.bandwidth_hz, shown)
+        if land.forbidden is not None and land.forbidden.any():
+            _shade(axes, land.first, land.second, land.forbidden.astype(float) - 0.5)
+        if len(land.designs):
+            axes.plot(*land.designs.T, ".", color="white", markersize=3.5, markeredgecolor=GREY,
+                      markeredgewidth=0.4, label="sampled designs", linestyle="none")  # fmt: skip
+        if len(land.truths):
+            known = land.truths[np.isfinite(land.truths[:, 2])]
+            dots = axes.scatter(
+                known[:, 0], known[:, 1], c=known[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
+                edgecolors="white", linewidths=0.9, label=land.truth_label, zorder=3, clip_on=False,
+            )  # fmt: skip
+            filled = filled or dots
+            lost = land.truths[~np.isfinite(land.truths[:, 2])]
+            if len(lost):
+                axes.plot(lost[:, 0], lost[:, 1], "x", color=GREY, label="infeasible θ")
+        if land.region is not None:
+            a, b, c, d = land.region
+            axes.add_patch(Rectangle((a, c), b - a, d - c, fill=False, edgecolor=BLACK,
+                                     linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
+                                     label="last trust region"))  # fmt: skip
+        for i, path in enumerate(paths):
+            _path(axes, path, CYCLE[(i + 1) % len(CYCLE)])
+        if optimum is not None:
+            axes.plot([optimum[0]], [optimum[1]], "*", color=ORANGE, markersize=15, clip_on=False,
+                      markeredgecolor="white", markeredgewidth=0.9, zorder=7, linestyle="none",
+                      label="verified optimum")  # fmt: skip
+        axes.set_xlim(land.first[0], land.first[-1])
+        axes.set_ylim(land.second[0], land.second[-1])
+        axes.set_xlabel(axis_label(land.names[0], land.units[0]))
+        axes.set_ylabel(axis_label(land.names[1], land.units[1]))
+        which = "largest bandwidth ω_b*" if land.bandwidth_hz.size else "bandwidth ω_b"
+        _colour_bar(figure, filled, axis_label(which, "Hz"))
+        _legend(figure, axes)
+        return to_svg(figure, key, "Landscape of the largest bandwidth over the two parameters")
+
+
+def figure_sweep(sweep: SweepMap, *, key: str = "sweep") -> str:
+    """ω_b over (ω_S, ω_T) at one θ; what S_max and S_low forbid is hatched."""
+    with style():
+        figure, axes = _map_axes()
+        axes.grid(False)
+        shown = sweep.bandwidth_hz if sweep.bandwidth_hz.size else sweep.rows[:, 2]
+        filled, norm = _contours(axes, sweep.omega_S, sweep.omega_T, sweep.bandwidth_hz, shown)
+        if sweep.bandwidth_hz.size:
+            _shade(axes, sweep.omega_S, sweep.omega_T, np.maximum(sweep.peak, sweep.low))
+            for field, line, label in ((sweep.peak, "-", "S_max"), (sweep.low, "--", "S_low")):
+                if np.nanmin(field) < 0.0 < np.nanmax(field):
+                    axes.contour(sweep.omega_S, sweep.omega_T, field.T, levels=[0.0],
+                                 colors=BLACK, linewidths=1.1, linestyles=line)  # fmt: skip
+                    axes.plot([], [], color=BLACK, linestyle=line, linewidth=1.1, label=label)
+        inside = sweep.rows[:, 5] > 0.5
+        colours = {"c": sweep.rows[inside, 2], "cmap": COLOUR_MAP, "norm": norm}
+        dots = axes.scatter(sweep.rows[inside, 0], sweep.rows[inside, 1], s=30, zorder=3,
+                            edgecolors="white", linewidths=0.9, clip_on=False,
+                            label="synthesis, feasible", **colours)  # fmt: skip
+        axes.plot(sweep.rows[~inside, 0], sweep.rows[~inside, 1], "x", color=BLACK, markersize=5,
+                  clip_on=False, linestyle="none", label="synthesis, infeasible")  # fmt: skip
+        axes.plot([sweep.optimum[0]], [sweep.optimum[1]], "*", color=ORANGE, markersize=15,
+                  markeredgecolor="white", markeredgewidth=0.9, zorder=7, clip_on=False,
+                  linestyle="none", label="verified optimum")  # fmt: skip
+        log_axis(axes.xaxis, *_ends(sweep.omega_S, sweep.rows[:, 0]))
+        log_axis(axes.yaxis, *_ends(sweep.omega_T, sweep.rows[:, 1]))
+        axes.set_xlabel(axis_label("ω_S of the weight on S", "Hz"))
+        axes.set_ylabel(axis_label("ω_T of the weight on T", "Hz"))
+        _colour_bar(figure, filled or dots, "bandwidth ω_b (Hz)")
+        _legend(figure, axes)
+        return to_svg(figure, key, "Bandwidth over the two break frequencies at the optimum")
+
+
+def _map_axes() -> tuple["Figure", "Axes"]:
+    """A map's axes, with room for the colour bar on the right and the legend below."""
+    figure = new_figure(5.4, MAP_WIDTH)
+    return figure, place(figure, 0.75, 1.1, MAP_WIDTH - 2.05, 4.15)
+
+
+def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> tuple[Any, Any]:
+    """Filled contours of a field (len(x), len(y)), if any, and the colours' norm."""
+    from matplotlib.colors import BoundaryNorm
+    from matplotlib.ticker import MaxNLocator
+
+    known = shown[np.isfinite(shown)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if high - low < 1e-9 * max(abs(high), 1.0):
+        low, high = low - 0.5, high + 0.5
+    levels = MaxNLocator(nbins=14).tick_values(low, high)
+    norm = BoundaryNorm(levels, 256)
+    if not field.size or not np.isfinite(field).any():
+        return None, norm
+    filled = axes.contourf(x, y, field.T, levels=levels, cmap=COLOUR_MAP, norm=norm)
+    axes.contour(x, y, field.T, levels=levels, colors="white", linewidths=0.35)
+    return filled, norm
+
+
+def _shade(axes: "Axes", x: Array, y: Array, excess: Array) -> None:
+    """Veil and hatch where the field is positive."""
+    if np.nanmax(excess) <= 0.0:
+        return
+    veil = axes.contourf(x, y, excess.T, levels=[0.0, np.inf], colors=["white"], alpha=0.55,
+                         hatches=["////"])  # fmt: skip
+    veil.set_edgecolor("#777777")
+    veil.set_linewidth(0.0)
+    axes.fill([], [], facecolor="white", edgecolor="#777777", hatch="////", linewidth=0.5,
+              label="infeasible")  # fmt: skip
+
+
+def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
+    axes.plot(*path.theta.T, "-o", color=colour, linewidth=1.2, markersize=6, clip_on=False,
+              markerfacecolor="white", markeredgewidth=1.3, label=path.label, zorder=5)  # fmt: skip
+    if not path.numbered:
+        return
+    span = [np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())]
+    groups: list[tuple[Array, list[int]]] = []
+    for i, theta in enumerate(path.theta):
+        for spot, members in groups:
+            if (np.abs(theta - spot) <= 0.02 * np.array(span)).all():
+                members.append(i + 1)
+                break
+        else:
+            groups.append((theta, [i + 1]))
+    for spot, members in groups:
+        text = f"{members[0]}–{members[-1]}" if len(members) > 2 else ", ".join(map(str, members))
+        axes.annotate(text, (float(spot[0]), float(spot[1])), xytext=(9, 9),
+                      textcoords="offset points", fontsize=9, zorder=8, annotation_clip=False,
+                      bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none",
+                            "alpha": 0.85})  # fmt: skip
+
+
+def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
+    if filled is not None:
+        beside = place(figure, MAP_WIDTH - 1.15, 1.1, 0.17, 4.15)
+        bar = figure.colorbar(filled, cax=beside)
+        bar.set_label(label)
+        bar.outline.set_linewidth(0.5)
+        bar.ax.grid(False)
+
+
+def _legend(figure: "Figure", axes: "Axes") -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=3 if len(labels) > 4 else 4, frameon=False)
+
+
+def _ends(axis: Array, rows: Array) -> tuple[float, float]:
+    values = axis if axis.size else rows
+    low, high = float(values.min()), float(values.max())
+    return (low / 1.2, high * 1.2) if high <= 1.01 * low else (low, high)

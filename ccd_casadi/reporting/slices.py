@@ -1,0 +1,144 @@
+"""ω_b*(θ) along each parameter through the optimum, for one parameter or more than two."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.reporting.landscape import predicted
+from ccd_casadi.reporting.lines import Array, Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
+from ccd_casadi.reporting.truths import Truths, feasible
+from surrogates import GaussianProcess
+
+HZ = 2.0 * np.pi
+SLICE = 61
+NEARBY = 0.1  # share of the box within which a sample is shown beside a slice
+TABLE_STEP = 4
+
+
+@dataclass(frozen=True)
+class Slice:
+    """ω_b* in Hz along one parameter through the optimum; the band is 95 %. `near`: (θ_i, Hz)."""
+
+    name: str
+    unit: str
+    theta: Array
+    bandwidth_hz: Array
+    deviation_hz: Array
+    near: Array
+    optimum: float
+
+
+def slices_data(
+    problem: CoDesignProblem,
+    processes: tuple[GaussianProcess, ...],
+    truths: Truths,
+    theta: tuple[float, ...],
+) -> list[Slice]:
+    """Along every parameter through θ: prediction, deviation, and the truths nearby.
+
+    Without surrogates the feasible designs nearby stand for the truths.
+    """
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    known, values = truths.theta, truths.bandwidth_hz
+    if not processes:
+        inside = [s for s in truths.designs if feasible(problem, s)]
+        known = np.array([s.theta for s in inside]).reshape(-1, len(lower))
+        values = np.array([s.bandwidth / HZ for s in inside])
+    found = []
+    for k, name in enumerate(problem.names):
+        axis = np.linspace(lower[k], upper[k], SLICE)
+        points = np.tile(np.array(theta), (SLICE, 1))
+        points[:, k] = axis
+        empty = np.full(SLICE, np.nan)
+        bandwidth, deviation = (
+            predicted(problem, processes, points, std=True) if processes else (empty, empty)
+        )
+        away = np.abs((known - np.array(theta)) / (upper - lower))
+        away[:, k] = 0.0
+        near = (away.max(axis=1) <= NEARBY) & np.isfinite(values)
+        dots = np.column_stack([known[near, k], values[near]])
+        found.append(
+            Slice(name, problem.units[k], axis, bandwidth, deviation, dots, float(theta[k]))
+        )
+    return found
+
+
+def figure_slices(slices: list[Slice], best_hz: float, *, key: str = "slices") -> str:
+    """One small panel a parameter, the same vertical axis in all."""
+    values = [best_hz]
+    for item in slices:
+        values += [v for v in (*item.bandwidth_hz, *item.near[:, 1]) if np.isfinite(v)]
+    margin = 0.06 * (max(values) - min(values)) + 1e-3 * max(values)
+    y_range = (min(values) - margin, max(values) + margin)
+    panels: list[Panel | None] = [
+        _panel(item, y_range, legend=i == 0) for i, item in enumerate(slices)
+    ]
+    per_row = 1 if len(panels) == 1 else 4 if len(panels) % 3 else 3
+    panels += [None] * (-len(panels) % per_row)
+    rows = [panels[i : i + per_row] for i in range(0, len(panels), per_row)]
+    heights = [3.2 if len(rows) == 1 else 2.5] * len(rows)
+    title = "Largest bandwidth along each parameter through the optimum"
+    return figure_lines(rows, key=key, title=title, heights=heights)
+
+
+def _panel(item: Slice, y_range: tuple[float, float], legend: bool) -> Panel:
+    curves, bands = [], []
+    if np.isfinite(item.bandwidth_hz).any():
+        half = 1.96 * item.deviation_hz
+        low, high = item.bandwidth_hz - half, item.bandwidth_hz + half
+        bands = [Band(item.theta, low, high, "95 % band" if legend else "")]
+        curves = [Curve(item.theta, item.bandwidth_hz, "surrogate" if legend else "")]
+    if len(item.near):
+        label = "truth nearby" if legend else ""
+        curves.append(Curve(item.near[:, 0], item.near[:, 1], label, GREEN, "", "o"))
+    return Panel(
+        axis_label(item.name, item.unit),
+        "largest bandwidth ω_b* (Hz)",
+        tuple(curves),
+        bands=tuple(bands),
+        levels=(Level(item.optimum, "optimum" if legend else "", True, GREY),),
+        x_range=(float(item.theta[0]), float(item.theta[-1])),
+        y_range=y_range,
+    )
+
+
+def caption_slices(slices: list[Slice], best_hz: float, *, lifted: bool = False) -> str:
+    """Along which parameter the bandwidth changes most, and how sure the surrogate is."""
+    spans = [(float(np.nanmax(s.bandwidth_hz) - np.nanmin(s.bandwidth_hz)), s) for s in slices
+             if np.isfinite(s.bandwidth_hz).any()]  # fmt: skip
+    many = len(slices) > 1
+    words = "ω_b* along each parameter, the others at the optimum" if many else "ω_b*(θ)"
+    words += f" ({number(best_hz)} Hz there, dashed line); dots: true values"
+    words += f" within {100 * NEARBY:.0f} % of the box." if many else "."
+    if not spans:
+        return words + " The direct formulation makes no surrogate: the dots are its own designs."
+    largest, item = max(spans, key=lambda pair: pair[0])
+    widest = max(float(np.max(1.96 * s.deviation_hz)) for _, s in spans)
+    most = "changes most along" if many else "changes along"
+    words += f" It {most} {item.name}, by {number(largest, 3)} Hz over the range"
+    words += f"; the 95 % band is at most ±{number(widest, 2)} Hz"
+    if lifted:  # the other two surrogates decide where S_max and S_low bind
+        words += " (of ω_b at the maximising design; errors of the bounds on S are not in it)"
+    return words + "."
+
+
+def tables_slices(slices: list[Slice]) -> list[Table]:
+    """Every slice, thinned."""
+    return [
+        Table(
+            (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)"),
+            tuple(
+                (float(s.theta[i]), float(s.bandwidth_hz[i]), float(1.96 * s.deviation_hz[i]))
+                for i in range(0, len(s.theta), TABLE_STEP)
+            ),
+        )
+        if np.isfinite(s.bandwidth_hz).any()
+        else Table(
+            (axis_label(s.name, s.unit), "true ω_b (Hz)"),
+            tuple((float(a), float(b)) for a, b in s.near),
+        )
+        for s in slices
+    ]

@@ -1,0 +1,162 @@
+"""What all figures share: style, colours, labels, and SVG text that fits into one HTML page.
+
+Text stays text and comes out in the page's own font; ids carry the figure's key, so that several
+figures live in one document; nothing in it depends on the day it was made.
+"""
+
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import escape
+from io import StringIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, told apart by the colour-blind and by a grey printer.
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
+PURPLE, SKY, AMBER = "#CC79A7", "#56B4E9", "#E69F00"
+BLACK, GREY = "#1a1a1a", "#767676"
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, SKY, BLACK)
+COLOUR_MAP = "viridis"
+WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
+LONGEST_LABEL = 40
+
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "text.parse_math": False,  # a "$" in a user's unit is a dollar
+    "font.family": ["DejaVu Sans"],  # for the layout; the page sets its own, none is wider
+    "font.size": 10.0,
+    "axes.labelsize": 10.0,
+    "axes.titlesize": 10.0,
+    "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0,
+    "legend.fontsize": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.edgecolor": "#444444",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 5.0,
+    "hatch.linewidth": 0.5,
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "#dddddd",
+    "legend.fancybox": False,
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Our style while a figure is built and written, and the caller's again after it."""
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
+        # A letter that DejaVu lacks is only measured with it; the browser draws it.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+def new_figure(height: float, width: float = WIDTH) -> "Figure":
+    """An empty figure, size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height))
+
+
+def place(figure: "Figure", left: float, bottom: float, width: float, height: float) -> "Axes":
+    """Axes at a place given in inches: fixed margins cost a tenth of arranging them to the text."""
+    w, h = figure.get_size_inches()
+    return figure.add_axes((left / w, bottom / h, width / w, height / h))
+
+
+def to_svg(figure: "Figure", key: str, title: str) -> str:
+    """The figure as an <svg> element for inline use; `key` is unique in the page, `title` read out.
+
+    Namespaces, metadata and global style rules are dropped: HTML needs none of them.
+    """
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    FigureCanvasSVG(figure)
+    buffer = StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": key}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r"<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL)
+    text = text.replace("xlink:href=", "href=")
+    text = re.sub(r'\bid="', f'id="{key}-', text)
+    text = re.sub(r'href="#', f'href="#{key}-', text)
+    text = text.replace("url(#", f"url(#{key}-")
+    # the font is the page's: only size, weight and anchor stay
+    text = re.sub(r"font: ([^;\"]*?)'[^;\"]*", r"font: \1sans-serif", text)
+    box = re.search(r'viewBox="([^"]*)"', text)
+    assert box is not None
+    # as a share of the column, so that text has one size in all figures
+    share = 100.0 * min(1.0, float(figure.get_figwidth()) / WIDTH)
+    size = f'style="width: {share:.0f}%"'
+    head = f'<svg viewBox="{box[1]}" {size} role="img" aria-label="{escape(title)}">'
+    body = text[text.index(">") + 1 :]
+    return re.sub(r"\n\s*", "\n", head + body).strip()
+
+
+def axis_label(name: str, unit: str) -> str:
+    """`name (unit)`, on one line and not longer than an axis; no unit shows as a dash."""
+    return f"{_short(name)} ({_short(unit) or '–'})"
+
+
+def _short(text: str) -> str:
+    words = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return words if len(words) <= LONGEST_LABEL else words[: LONGEST_LABEL - 1] + "…"
+
+
+def log_axis(axis: Any, low: float, high: float) -> None:
+    """A logarithmic axis from low to high (`axes.xaxis` or `.yaxis`), its labels plain text."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    name = axis.axis_name
+    getattr(axis.axes, f"set_{name}scale")("log")
+    getattr(axis.axes, f"set_{name}lim")(low, high)
+    decades = np.log10(high / low)
+    subs = (1.0,) if decades > 2.2 else (1.0, 2.0, 5.0)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=max(3, int(min(decades, 8.0)) + 2)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    axis.set_minor_formatter(NullFormatter())
+    if decades <= 5.0:
+        axis.set_minor_locator(LogLocator(subs="auto", numticks=12))
+    else:
+        axis.set_minor_locator(NullLocator())
+
+
+def power_of_ten(value: float) -> str:
+    """Tick label of a logarithmic axis: 0.001 to 10 000 as they are, the others as powers.
+
+    >>> power_of_ten(100.0), power_of_ten(1e-7), power_of_ten(5e6)
+    ('100', '10⁻⁷', '5·10⁶')
+    """
+    if value <= 0.0:
+        return ""
+    if 0.0009 < value < 20000.0:
+        return f"{value:g}"
+    exponent = int(np.floor(np.log10(value) + 1e-9))
+    lead = value / 10.0**exponent
+    digits = str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"10{digits}" if abs(lead - 1.0) < 1e-6 else f"{lead:g}·10{digits}"
