@@ -116,7 +116,7 @@ def _model(source: PlantSource) -> ModelFunction:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         message = f"{path}: cannot be loaded: {type(error).__name__}: {error}"
         raise UserError(message) from error
     function = getattr(module, source.function, None)

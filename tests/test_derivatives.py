@@ -161,11 +161,6 @@ def test_total_derivatives_of_flexible_plants_of_both_limits() -> None:
     assert total.compared > 60
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the golden-section search leaves γ_jω's frequency 1e-8 off, which a transmission "
-    "zero of damping ζ magnifies by 1/ζ² in dγ_jω/dθ",
-)
 def test_gradient_of_the_bound_at_a_sharp_transmission_zero() -> None:
     case = flexible_case(30)
     theta = np.array(case.theta)

@@ -7,10 +7,11 @@ frequencies over the plant's ω₀, M_K absorbed in the unit of force.
 """
 
 import numpy as np
-from numba import njit
+
+from ccd_casadi.kernels.compiled import compiled
 
 
-@njit(cache=True)
+@compiled
 def first_order_weights(w):
     """(a, b, c, d) of W1, W2 and W3 as ẋ = -a x + b v, z = c x + d v, rows of a 3 x 4 array.
 
@@ -31,7 +32,7 @@ def first_order_weights(w):
     return out
 
 
-@njit(cache=True)
+@compiled
 def generalized_plant(A, B, C, w):
     """A, B1, B2, C1, C2, d1, d2 of the generalized plant; D11 = [d1 I;0;0], D12 = [0;d2 I;0].
 
@@ -63,12 +64,19 @@ def generalized_plant(A, B, C, w):
     return Ag, B1, B2, C1, C2, f[0, 3], f[1, 3]
 
 
-@njit(cache=True)
-def weight_magnitudes(w, ω):
-    """|W1(jω)|, |W2(jω)|, |W3(jω)| from their transfer functions, ω scaled."""
+@compiled
+def squared_weights(w, ω):
+    """|W1(jω)|², |W2(jω)|², |W3(jω)|² from their transfer functions, ω scaled."""
     M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
     return (
-        np.hypot(ω / M_S, ω_S) / np.hypot(ω, ω_S * A_S),
-        c_K * np.hypot(ω, ω_K) / np.hypot(ω, c_K * ω_K),
-        np.hypot(ω, ω_T / A_l) / np.hypot(A_u * ω, ω_T),
+        ((ω / M_S) ** 2 + ω_S**2) / (ω**2 + (ω_S * A_S) ** 2),
+        c_K**2 * (ω**2 + ω_K**2) / (ω**2 + (c_K * ω_K) ** 2),
+        (ω**2 + (ω_T / A_l) ** 2) / ((A_u * ω) ** 2 + ω_T**2),
     )
+
+
+@compiled
+def weight_magnitudes(w, ω):
+    """|W1(jω)|, |W2(jω)|, |W3(jω)|."""
+    W1, W2, W3 = squared_weights(w, ω)
+    return np.sqrt(W1), np.sqrt(W2), np.sqrt(W3)

@@ -8,8 +8,10 @@ Matrices go in C order; the Fortran copies are made here.
 
 import llvmlite.binding as llvm
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import get_cython_function_address
+
+from ccd_casadi.kernels.compiled import compiled
 
 _F = types.CPointer(types.float64)
 _I = types.CPointer(types.int32)
@@ -32,42 +34,45 @@ _dtrsen = _external(
 _dtrsyl = _external("dtrsyl", _C, _C, _I, _I, _I, _F, _I, _F, _I, _F, _I, _F, _I)
 # jobvl jobvr n a lda wr wi vl ldvl vr ldvr work lwork info
 _dgeev = _external("dgeev", _C, _C, _I, _F, _I, _F, _F, _F, _I, _F, _I, _F, _I, _I)
-# n ilo ihi a lda tau work lwork info
-_dgehrd = _external("dgehrd", _I, _I, _I, _F, _I, _F, _F, _I, _I)
-# n ilo ihi a lda tau work lwork info
-_dorghr = _external("dorghr", _I, _I, _I, _F, _I, _F, _F, _I, _I)
 
 
-@njit(cache=True)
+@compiled
 def _int(value):
     return np.full(1, value, np.int32)
 
 
-@njit(cache=True)
+@compiled
 def _char(value):
     return np.full(1, value, np.uint8)
 
 
-@njit(cache=True)
-def schur(A):
-    """Real Schur form A = Q T Qᵀ (dgees). Returns T, Q in Fortran order, wr, wi, info."""
-    n = A.shape[0]
-    T = np.asfortranarray(A.copy())
-    Q = np.asfortranarray(np.zeros((n, n)))
+@compiled
+def _schur(F):
+    """dgees in place: F holds Aᵀ in C order, which is A to LAPACK, and leaves as Tᵀ; with Qᵀ."""
+    n = F.shape[0]
+    V = np.empty((n, n))
     wr, wi = np.empty(n), np.empty(n)
-    lwork = max(1, 16 * n)
+    lwork = 32 * n + 4224  # what dgehrd wants for its blocks
     work = np.empty(lwork)
-    info, sdim, logical = _int(0), _int(0), np.zeros(n, np.int32)
+    info, sdim, logical = _int(0), _int(0), np.zeros(max(1, n), np.int32)
     N = _int(n)
     _dgees(
-        _char(86).ctypes, _char(78).ctypes, logical.ctypes, N.ctypes, T.ctypes, N.ctypes,
-        sdim.ctypes, wr.ctypes, wi.ctypes, Q.ctypes, N.ctypes, work.ctypes,
+        _char(86).ctypes, _char(78).ctypes, logical.ctypes, N.ctypes, F.ctypes, N.ctypes,
+        sdim.ctypes, wr.ctypes, wi.ctypes, V.ctypes, N.ctypes, work.ctypes,
         _int(lwork).ctypes, logical.ctypes, info.ctypes,
     )  # fmt: skip
-    return T, Q, wr, wi, info[0]
+    return V, wr, wi, info[0]
 
 
-@njit(cache=True)
+@compiled
+def schur(A):
+    """Real Schur form A = Q T Qᵀ (dgees). Returns T, Q, wr, wi, info."""
+    F = A.T.copy()
+    V, wr, wi, info = _schur(F)
+    return F.T.copy(), V.T.copy(), wr, wi, info
+
+
+@compiled
 def stable_subspace(H):
     """Schur form of a 2N x 2N matrix, reordered with its left-half-plane part first.
 
@@ -77,7 +82,8 @@ def stable_subspace(H):
     """
     n = H.shape[0]
     half = n // 2
-    T, Q, wr, wi, info = schur(H)
+    T = H.T.copy()  # from here on every matrix is held transposed, as LAPACK counts
+    Q, wr, wi, info = _schur(T)
     gap = np.inf
     count = 0
     select = np.zeros(n, np.int32)
@@ -98,18 +104,18 @@ def stable_subspace(H):
             work.ctypes, lwork.ctypes, iwork.ctypes, one.ctypes, flag.ctypes,
         )  # fmt: skip
         ok = flag[0] == 0 and m[0] == half
-    T11 = np.ascontiguousarray(T[:half, :half])
-    U1 = np.ascontiguousarray(Q[:half, :half])
-    U2 = np.ascontiguousarray(Q[half:, :half])
+    T11 = T[:half, :half].T.copy()
+    U1 = Q[:half, :half].T.copy()
+    U2 = Q[:half, half:].T.copy()
     return T11, U1, U2, gap, ok
 
 
-@njit(cache=True)
+@compiled
 def lyapunov_triangular(T, C, transposed):
     """Z with Tᵀ Z + Z T = C (transposed) or T Z + Z Tᵀ = C, T quasi upper triangular."""
     n = T.shape[0]
-    F = np.asfortranarray(T.copy())
-    Z = np.asfortranarray(C.copy())
+    F = T.T.copy()
+    Z = C.T.copy()
     N, scale, info = _int(n), np.ones(1), _int(0)
     first = 84 if transposed else 78
     second = 78 if transposed else 84
@@ -117,16 +123,16 @@ def lyapunov_triangular(T, C, transposed):
         _char(first).ctypes, _char(second).ctypes, _int(1).ctypes, N.ctypes, N.ctypes,
         F.ctypes, N.ctypes, F.ctypes, N.ctypes, Z.ctypes, N.ctypes, scale.ctypes, info.ctypes,
     )  # fmt: skip
-    return np.ascontiguousarray(Z) / scale[0]
+    return Z.T.copy() / scale[0]
 
 
-@njit(cache=True)
+@compiled
 def eigenvalues(A):
     """Eigenvalues of a real matrix (dgeev, balanced). Returns Re, Im, info."""
     n = A.shape[0]
-    F = np.asfortranarray(A.copy())
+    F = A.T.copy()
     wr, wi, dummy = np.empty(n), np.empty(n), np.zeros(1)
-    lwork = max(1, 16 * n)
+    lwork = 32 * n + 4224
     work = np.empty(lwork)
     N, one, info = _int(n), _int(1), _int(0)
     _dgeev(
@@ -135,28 +141,3 @@ def eigenvalues(A):
         info.ctypes,
     )  # fmt: skip
     return wr, wi, info[0]
-
-
-@njit(cache=True)
-def hessenberg(A):
-    """Hessenberg form A = Q H Qᵀ (dgehrd, dorghr). Returns H, Q in C order."""
-    n = A.shape[0]
-    F = np.asfortranarray(A.copy())
-    tau = np.zeros(max(1, n - 1))
-    lwork = max(1, 16 * n)
-    work = np.empty(lwork)
-    N, one, info, size = _int(n), _int(1), _int(0), _int(lwork)
-    _dgehrd(
-        N.ctypes, one.ctypes, N.ctypes, F.ctypes, N.ctypes, tau.ctypes, work.ctypes,
-        size.ctypes, info.ctypes,
-    )  # fmt: skip
-    Q = np.asfortranarray(F.copy())
-    _dorghr(
-        N.ctypes, one.ctypes, N.ctypes, Q.ctypes, N.ctypes, tau.ctypes, work.ctypes,
-        size.ctypes, info.ctypes,
-    )  # fmt: skip
-    H = np.ascontiguousarray(F)
-    for i in range(2, n):
-        for j in range(i - 1):
-            H[i, j] = 0.0
-    return H, np.ascontiguousarray(Q)

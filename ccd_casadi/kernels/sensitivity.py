@@ -7,33 +7,17 @@ Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
 """
 
 import numpy as np
-from numba import njit
 
-from ccd_casadi.kernels.frequency import response, response_and_slope
+from ccd_casadi.kernels.closed_loop import loop_matrices as loop_matrices
+from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
+from ccd_casadi.kernels.small import add_gram, invert, largest_eigenvalue, multiply
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 
 
-@njit(cache=True)
-def loop_matrices(A, B, C, Ak, Bk, Ck, Dk):
-    """State space of S = (I + GK)⁻¹, r to e, states [x; x_K]; D = I."""
-    n, N = A.shape[0], Ak.shape[0]
-    p = C.shape[0]
-    As = np.empty((n + N, n + N))
-    As[:n, :n] = A - B @ Dk @ C
-    As[:n, n:] = B @ Ck
-    As[n:, :n] = -Bk @ C
-    As[n:, n:] = Ak
-    Bs = np.empty((n + N, p))
-    Bs[:n, :] = B @ Dk
-    Bs[n:, :] = Bk
-    Cs = np.zeros((p, n + N))
-    Cs[:, :n] = -C
-    return As, Bs, Cs
-
-
-@njit(cache=True)
+@compiled
 def axis_frequencies(A, B, C, D, level):
     """Sorted ω > 0 where σ(C(jω-A)⁻¹B + D) = level may hold: |Re λ| <= 1e-3 |λ|, info.
 
@@ -41,13 +25,15 @@ def axis_frequencies(A, B, C, D, level):
     one a wrong answer.
     """
     n, m = B.shape
-    Ri = np.linalg.inv(level**2 * np.eye(m) - D.T @ D)
-    BR = B @ Ri
-    F = A + BR @ (D.T @ C)
+    Dt = np.ascontiguousarray(D.T)
+    Ri = np.linalg.inv(level**2 * np.eye(m) - Dt @ D)
+    BR, DC = B @ Ri, Dt @ C
+    RDC = Ri @ DC
+    F = A + B @ RDC
     H = np.empty((2 * n, 2 * n))
     H[:n, :n] = F
     H[:n, n:] = BR @ B.T
-    H[n:, :n] = -(C.T @ C) - C.T @ D @ Ri @ (D.T @ C)
+    H[n:, :n] = -(C.T @ C) - DC.T @ RDC
     H[n:, n:] = -F.T
     wr, wi, info = eigenvalues(H)
     found = np.empty(2 * n)
@@ -59,25 +45,41 @@ def axis_frequencies(A, B, C, D, level):
     return np.sort(found[:count]), info
 
 
-@njit(cache=True)
-def sensitivity_matrix(G, K, Dk, ω):
-    """S(jω) from the prepared plant and controller."""
-    p = G[2].shape[0]
-    S = response(G, ω) @ (response(K, ω) + Dk)
+@compiled
+def _gain(g, k, Dk):
+    """σ_max((I + G K)⁻¹) from the two responses at one frequency."""
+    p = g.shape[0]
+    if p == 1:
+        T = 1.0 + 0.0j
+        for i in range(k.shape[0]):
+            T += g[0, i] * (k[i, 0] + Dk[i, 0])
+        return 1.0 / abs(T)
+    k = k + Dk
+    L = multiply(g, k)
     for i in range(p):
-        S[i, i] += 1.0
-    return np.linalg.inv(S)
+        L[i, i] += 1.0
+    Z = np.zeros((p, p), np.complex128)
+    add_gram(Z, invert(L), 1.0)
+    return np.sqrt(largest_eigenvalue(Z))
 
 
-@njit(cache=True)
+@compiled
 def sensitivity_gain(G, K, Dk, ω):
     """σ_max(S(jω))."""
-    if G[2].shape[0] == 1:
-        return 1.0 / abs(1.0 + (response(G, ω) @ (response(K, ω) + Dk))[0, 0])
-    return np.linalg.svd(sensitivity_matrix(G, K, Dk, ω))[1][0]
+    return _gain(response(G, ω), response(K, ω), Dk)
 
 
-@njit(cache=True)
+@compiled
+def sensitivity_gains(G, K, Dk, ω):
+    """σ_max(S(jω)) at every ω of an array."""
+    g, k = responses(G, ω), responses(K, ω)
+    out = np.empty(ω.size)
+    for i in range(ω.size):
+        out[i] = _gain(g[i], k[i], Dk)
+    return out
+
+
+@compiled
 def sensitivity_slope(G, K, Dk, ω):
     """σ_max(S(jω)) and dσ_max/dω = Re(u* (dS/dω) v), dS/dω = -S (G'K + GK') S."""
     g, dg = response_and_slope(G, ω)
@@ -98,7 +100,7 @@ def sensitivity_slope(G, K, Dk, ω):
     return s[0], -np.vdot(u, S @ (dL @ (S @ v))).real
 
 
-@njit(cache=True)
+@compiled
 def bandwidth(G, K, Dk, As, Bs, Cs):
     """First ω at which σ_max(S) crosses 1/√2 from below; NaN where there is none, and info."""
     p = Bs.shape[1]
@@ -119,7 +121,7 @@ def bandwidth(G, K, Dk, As, Bs, Cs):
     return np.nan, info
 
 
-@njit(cache=True)
+@compiled
 def _level_root(G, K, Dk, low, high, x):
     """Root of σ_max(S) = 1/√2 in [low, high], Newton from x kept inside the bracket."""
     for _ in range(80):
@@ -138,7 +140,7 @@ def _level_root(G, K, Dk, low, high, x):
     return x
 
 
-@njit(cache=True)
+@compiled
 def _climb(G, K, Dk, start):
     """The local maximum of σ_max(S) uphill of `start`: bracket dσ/dω = 0, then close it."""
     value, slope = sensitivity_slope(G, K, Dk, start)
@@ -183,7 +185,7 @@ def _climb(G, K, Dk, start):
     return x, sensitivity_gain(G, K, Dk, x)
 
 
-@njit(cache=True)
+@compiled
 def peak(G, K, Dk, As, Bs, Cs, poles_re, poles_im):
     """‖S‖∞, its frequency (0 and inf allowed), and whether the level test confirmed it.
 
@@ -192,12 +194,16 @@ def peak(G, K, Dk, As, Bs, Cs, poles_re, poles_im):
     """
     p = Bs.shape[1]
     best, at = 1.0, np.inf
+    starts = np.empty(poles_re.size)
+    count = 0
     for i in range(poles_re.size):
         if poles_im[i] >= 0.0:
-            ω = np.hypot(poles_re[i], poles_im[i])
-            gain = sensitivity_gain(G, K, Dk, ω)
-            if gain > best:
-                best, at = gain, ω
+            starts[count] = np.hypot(poles_re[i], poles_im[i])
+            count += 1
+    gains = sensitivity_gains(G, K, Dk, starts[:count])
+    for i in range(count):
+        if gains[i] > best:
+            best, at = gains[i], starts[i]
     if at < np.inf:
         x, value = _climb(G, K, Dk, at)
         if value >= best:

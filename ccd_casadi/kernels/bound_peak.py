@@ -1,0 +1,67 @@
+"""The frequency at which the bound γ_jω is attained, to rounding.
+
+The value of a maximum is insensitive to where it is taken, its gradient is not: next to a zero of
+damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the slope's root is sought.
+"""
+
+import numpy as np
+
+from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.generalized_plant import squared_weights
+
+
+@compiled
+def _bound_slope(A, B, C, w, ω):
+    """dγ_jω²(ω)/dω of γ_jω² = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|², dσ = Re(u* dG v)."""
+    n, p = A.shape[0], C.shape[0]
+    M = (1j * ω) * np.eye(n) - A
+    right = np.linalg.solve(M, B.astype(np.complex128))
+    complex_C = C.astype(np.complex128)
+    U, s, Vh = np.linalg.svd(complex_C @ right)
+    dG = -1j * (complex_C @ np.linalg.solve(M, right))
+    u = np.ascontiguousarray(U[:, p - 1])
+    v = np.ascontiguousarray(Vh[p - 1, :].conj())
+    σ = s[p - 1]
+    dσ = np.vdot(u, dG @ v).real
+    M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
+    W1, W2, W3 = squared_weights(w, ω)
+    # |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c |W|²)/(c ω² + d)
+    d1 = 2.0 * ω * (1.0 / M_S**2 - W1) / (ω**2 + (ω_S * A_S) ** 2)
+    d2 = 2.0 * ω * (c_K**2 - W2) / (ω**2 + (c_K * ω_K) ** 2)
+    d3 = 2.0 * ω * (1.0 - A_u**2 * W3) / ((A_u * ω) ** 2 + ω_T**2)
+    R = W2 / σ**2 + W3
+    dR = d2 / σ**2 - 2.0 * W2 * dσ / σ**3 + d3
+    return (R / (W1 + R)) ** 2 * d1 + (W1 / (W1 + R)) ** 2 * dR
+
+
+@compiled
+def bound_peak(A, B, C, w, start):
+    """The maximiser next to `start`; `start` itself where the slope has no root within 1 %."""
+    a, fa = start, _bound_slope(A, B, C, w, start)
+    step = 1e-7 if fa > 0.0 else -1e-7
+    b, fb = a, fa
+    for _ in range(12):
+        b = start * (1.0 + step)
+        fb = _bound_slope(A, B, C, w, b)
+        if fa * fb <= 0.0:
+            break
+        a, fa = b, fb
+        step *= 3.0
+    if not fa * fb < 0.0:
+        return b if fb == 0.0 else start
+    x = a
+    for _ in range(80):
+        # Illinois false position
+        x = (a * fb - b * fa) / (fb - fa)
+        fx = _bound_slope(A, B, C, w, x)
+        if fx == 0.0 or abs(b - a) <= 1e-15 * abs(b):
+            break
+        if fx * fb < 0.0:
+            a, fa = b, fb
+        else:
+            fa *= 0.5
+        moved = abs(x - b)
+        b, fb = x, fx
+        if moved <= 1e-16 * abs(x):
+            break
+    return x

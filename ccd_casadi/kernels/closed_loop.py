@@ -1,0 +1,111 @@
+"""State space of the closed loop, and of what of it the reference can reach.
+
+An observer-based controller carries a copy of the weighted plant: with z = [x; W1; W2; W3] the
+difference z - x_K then obeys an equation of its own, which r does not enter. Those states drop
+out of every transfer function from r. Whether they do is read off the loop's own entries, not
+taken from the synthesis; a controller of any other form keeps its full order.
+"""
+
+import numpy as np
+
+from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.generalized_plant import first_order_weights
+
+EPS = 2.220446049250313e-16
+
+
+@compiled
+def loop_matrices(A, B, C, Ak, Bk, Ck, Dk):
+    """State space of S = (I + GK)⁻¹, r to e, states [x; x_K]; D = I."""
+    n, N = A.shape[0], Ak.shape[0]
+    p = C.shape[0]
+    As = np.empty((n + N, n + N))
+    As[:n, :n] = A - B @ Dk @ C
+    As[:n, n:] = B @ Ck
+    As[n:, :n] = -Bk @ C
+    As[n:, n:] = Ak
+    Bs = np.empty((n + N, p))
+    Bs[:n, :] = B @ Dk
+    Bs[n:, :] = Bk
+    Cs = np.zeros((p, n + N))
+    Cs[:, :n] = -C
+    return As, Bs, Cs
+
+
+@compiled
+def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w):
+    """State space of r to [W1 e; W2 u; W3 y], states [x; x_K; W1; W2; W3]."""
+    n, N, p, m = A.shape[0], Ak.shape[0], C.shape[0], B.shape[1]
+    f = first_order_weights(w)
+    i1, i2 = n + N, n + N + p
+    i3 = i2 + m
+    total = i3 + p
+    Az, Bz = np.zeros((total, total)), np.zeros((total, p))
+    Cz, Dz = np.zeros((2 * p + m, total)), np.zeros((2 * p + m, p))
+    DC = Dk @ C
+    Az[:n, :n] = A - B @ DC
+    Az[:n, n:i1] = B @ Ck
+    Az[n:i1, :n] = -Bk @ C
+    Az[n:i1, n:i1] = Ak
+    Bz[:n, :] = B @ Dk
+    Bz[n:i1, :] = Bk
+    Az[i1:i2, :n] = -f[0, 1] * C
+    Az[i2:i3, :n] = -f[1, 1] * DC
+    Az[i2:i3, n:i1] = f[1, 1] * Ck
+    Bz[i2:i3, :] = f[1, 1] * Dk
+    Az[i3:, :n] = f[2, 1] * C
+    Cz[:p, :n] = -f[0, 3] * C
+    Cz[p : p + m, :n] = -f[1, 3] * DC
+    Cz[p : p + m, n:i1] = f[1, 3] * Ck
+    Dz[p : p + m, :] = f[1, 3] * Dk
+    Cz[p + m :, :n] = f[2, 3] * C
+    for i in range(p):
+        Az[i1 + i, i1 + i] = -f[0, 0]
+        Bz[i1 + i, i] = f[0, 1]
+        Cz[i, i1 + i] = f[0, 2]
+        Dz[i, i] = f[0, 3]
+        Az[i3 + i, i3 + i] = -f[2, 0]
+        Cz[p + m + i, i3 + i] = f[2, 2]
+    for i in range(m):
+        Az[i2 + i, i2 + i] = -f[1, 0]
+        Cz[p + i, i2 + i] = f[1, 2]
+    return Az, Bz, Cz, Dz
+
+
+@compiled
+def reachable_loop(loop, n, N):
+    """The weighted loop without z - x_K where that difference is cut off from r, and whether.
+
+    n, N: states of plant and controller. With Az = [[Zz, Zk], [Kz, Kk]] in (z, x_K) the
+    difference d = z - x_K obeys
+
+        ḋ = (Zz - Kz) d + (Zz + Zk - Kz - Kk) x_K + (Bz - Bk) r.
+
+    It counts as cut off where every entry of the last two terms is rounding of the entries that
+    it is the sum of: dropping it is then a perturbation of each entry of the controller by no
+    more than the rounding with which that entry was computed.
+    """
+    Az, Bz, Cz, Dz = loop
+    if Az.shape[0] != 2 * N:
+        return loop, False
+    p, rows = Bz.shape[1], Cz.shape[0]
+    tolerance = 4.0 * N * EPS
+    for i in range(N):
+        zi, ki = (i if i < n else N + i), n + i
+        for j in range(N):
+            zj, kj = (j if j < n else N + j), n + j
+            a, b, c, d = Az[zi, zj], Az[zi, kj], Az[ki, zj], Az[ki, kj]
+            if not abs(a + b - c - d) <= tolerance * (abs(a) + abs(b) + abs(c) + abs(d)):
+                return loop, False
+        for j in range(p):
+            a, b = Bz[zi, j], Bz[ki, j]
+            if not abs(a - b) <= tolerance * (abs(a) + abs(b)):
+                return loop, False
+    Ar, Cr = np.empty((N, N)), np.empty((rows, N))
+    for j in range(N):
+        zj, kj = (j if j < n else N + j), n + j
+        for i in range(N):
+            Ar[i, j] = Az[n + i, zj] + Az[n + i, kj]
+        for i in range(rows):
+            Cr[i, j] = Cz[i, zj] + Cz[i, kj]
+    return (Ar, Bz[n : n + N].copy(), Cr, Dz), True
