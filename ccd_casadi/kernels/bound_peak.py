@@ -23,7 +23,7 @@ def _bound_slope(A, B, C, w, ω):
     v = np.ascontiguousarray(Vh[p - 1, :].conj())
     σ = s[p - 1]
     dσ = np.vdot(u, dG @ v).real
-    M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
+    M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
     W1, W2, W3 = squared_weights(w, ω)
     # |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c |W|²)/(c ω² + d)
     d1 = 2.0 * ω * (1.0 / M_S**2 - W1) / (ω**2 + (ω_S * A_S) ** 2)

@@ -119,7 +119,7 @@ def level_test(G, K, Dk, w, loop, level):
         if not stack_gain(G, K, Dk, w, ω) <= level:
             return False
     # A candidate beside the axis may stand at a narrow crossing; on it the gain is the level.
-    for i in range(n):
+    for i in range(n):  # noqa: SIM110 (numba has no all())
         if not stack_gain(G, K, Dk, w, candidates[i]) <= level * (1.0 + 1e-9):
             return False
     return True

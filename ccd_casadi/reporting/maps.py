@@ -231,7 +231,8 @@ def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
 
 def _legend(figure: "Figure", axes: "Axes") -> None:
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=3 if len(labels) > 4 else 4, frameon=False)
+    columns = 3 if len(labels) > 4 else 4
+    figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
 
 
 def _ends(axis: Array, rows: Array) -> tuple[float, float]:
