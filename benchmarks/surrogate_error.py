@@ -39,9 +39,7 @@ def main() -> None:
         unseen = truth.quantities(design("lhs", lower, upper, UNSEEN, seed=99))
         X = np.array([sample.x for sample in unseen])
         Y = np.array([sample.values[:3] for sample in unseen])
-        print(
-            f"{'syntheses':>10} {'kind':>9} {'ω_b, Hz':>9} {'‖S‖∞, %':>9} {'|S_low|, %':>10} {'fit, s':>7}"
-        )
+        print(" syntheses      kind   ω_b, Hz   ‖S‖∞, % |S_low|, %  fit, s")
         for count in COUNTS:
             samples = truth.quantities(design("sobol", lower, upper, count, seed=0))
             for gradients in (False, True):
