@@ -81,9 +81,8 @@ def stack_norm(G, K, Dk, w, grid):
         a, x, b = np.log(grid[i - 1]), np.log(grid[i]), np.log(grid[i + 1])
         fa, fx, fb = left, values[i], right
         for _ in range(REFINEMENTS):
-            new, promise = next_trial(a, fa, x, fx, b, fb, 1e-12)
-            # a peak that stays below the best one even at ten times its promise needs no more
-            if promise == 0.0 or fx + 10.0 * promise < best:
+            new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)
+            if room == 0.0 or fx + room < best:
                 break
             f = stack_gain(G, K, Dk, w, np.exp(new))
             a, fa, x, fx, b, fb = narrow(a, fa, x, fx, b, fb, new, f)

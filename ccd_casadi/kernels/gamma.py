@@ -1,8 +1,8 @@
 """γ_opt = max(γ_X, γ_jω): the root of the Riccati level, or the bound that no controller passes.
 
-In σ = 1/t the Hamiltonian is affine and f nearly straight, so that Newton's method needs fewer
-steps in σ than in t. From the second Schur form on, the inverse cubic through the last two
-values and slopes takes its place (order 2.7), and its own terms tell when it is good enough.
+In 1/t the Hamiltonian is affine and f nearly straight, so that Newton's method needs fewer
+steps in 1/t than in t. Near the root the third-order expansion of the stable subspace takes its
+place: a step of order four from one Schur form, whose own terms tell when it is good enough.
 """
 
 import numpy as np
@@ -11,9 +11,7 @@ from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.refine import narrow, next_trial
-from ccd_casadi.kernels.riccati import level_hamiltonian as level_hamiltonian
-from ccd_casadi.kernels.riccati import lqr_hamiltonian as lqr_hamiltonian
-from ccd_casadi.kernels.riccati import riccati_level as riccati_level
+from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 
 
 @compiled
@@ -67,8 +65,8 @@ def gamma_lower_bound(G, w, grid, sigma):
             a, x, b = np.log(grid[i - 1]), np.log(grid[i]), np.log(grid[i + 1])
             fa, fx, fb = values[i - 1], values[i], values[i + 1]
             for _ in range(40):
-                new, promise = next_trial(a, fa, x, fx, b, fb, 1e-13)
-                if promise == 0.0:
+                new, room = next_trial(a, fa, x, fx, b, fb, 1e-12)
+                if room == 0.0:
                     break
                 ω = np.exp(new)
                 f = lower_bound_squared(w, _least_gain(response(G, ω)), ω)
@@ -76,20 +74,6 @@ def gamma_lower_bound(G, w, grid, sigma):
             if fx > best:
                 best, at = fx, np.exp(x)
     return np.sqrt(best), at
-
-
-@compiled
-def _inverse_cubic(x0, f0, s0, x, f, s):
-    """Root of f by inverse interpolation of two values and slopes, and an estimate of its error.
-
-    The three corrections to x fall off like a series; the next one is taken as the error.
-    """
-    d = (x - x0) / (f - f0)
-    h = f0 - f
-    c1, c2 = (d - 1.0 / s) / h, (1.0 / s0 - d) / h
-    first, second, third = -f / s, c1 * f * f, -(c2 - c1) / h * f * f * f0
-    ratio = max(abs(third / second), abs(second / first)) if first * second != 0.0 else 1.0
-    return x + first + second + third, abs(third) * min(ratio, 1.0)
 
 
 @compiled
@@ -104,10 +88,9 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance):
     t_low, t_high = t_jw, np.inf
     start = guess if guess > 0.0 else 1.3 * gamma_jw
     t = max(start**2 - d1**2, t_jw)
-    tested, known = False, False
-    x0, f0, s0 = 0.0, 0.0, 0.0
+    tested = False
     for forms in range(1, 61):
-        f, slope, _, _, _, _, _, ok = riccati_level(H0, B1, C1, d1, t)
+        f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t)
         if ok and f > 0.0:
             if t <= t_jw:
                 return gamma_jw, True, forms, True
@@ -118,15 +101,13 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance):
         newton = ok and slope > 0.0
         new, error = t, np.inf
         if newton:
-            x, s = 1.0 / t, -slope * t * t
-            step = x - f / s
-            error = abs(f / s)
-            if known and f != f0:
-                better, estimate = _inverse_cubic(x0, f0, s0, x, f, s)
-                if abs(better - step) < 0.5 * abs(step - x):
+            step = f / (slope * t * t)  # Newton's, in 1/t
+            error = abs(step)
+            if error * t < 0.3:
+                better, estimate = root_nearby(B1, C1, d1, frame, step)
+                if abs(better - step) < 0.5 * abs(step):
                     step, error = better, estimate
-            x0, f0, s0, known = x, f, s, True
-            new = 1.0 / step if step > 0.0 else np.inf
+            new = t / (1.0 + step * t) if step * t > -1.0 else np.inf
         # relative in γ: dγ/γ = dt/(2 γ²) = -t² dσ/(2 γ²)
         if newton and new > t_jw and error * t * t <= 2.0 * tolerance * (t + d1**2):
             return np.sqrt(new + d1**2), False, forms, True

@@ -63,7 +63,7 @@ def gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency):
         A_, B_, C_, w_ = bound_gradient(A, B, C, w, bound_frequency)
         return A_, B_, C_, np.zeros((3, 4)), w_, True
     t = gamma_opt**2 - d1**2
-    _, _, T11, U1, U2, q, _, ok = riccati_level(H0, B1, C1, d1, t)
+    _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t)
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
     V = (B1.T @ U2 + d1 * (C1[:p] @ U1)) / t
     F = -(B2.T @ U2 + d2 * (C1[p : p + m] @ U1)) / d2**2

@@ -1,42 +1,32 @@
 """Closing a bracket around a local maximum of a gain over frequency."""
 
-import numpy as np
-
 from ccd_casadi.kernels.compiled import compiled
 
 
 @compiled
-def parabola_vertex(a, fa, x, fx, b, fb):
-    """Where the parabola through three points, a < x < b, is highest, and its value there.
-
-    x itself where the points do not bend downwards.
-    """
+def _vertex(a, fa, x, fx, b, fb):
+    """Where the parabola through three points, a < x < b, is highest; x if it bends upwards."""
     left, right = (fx - fa) / (x - a), (fb - fx) / (b - x)
     bend = (left - right) / (b - a)
-    if not bend > 0.0:
-        return x, fx
-    slope = left - bend * (x - a)  # the parabola's slope at x
-    return x + 0.5 * slope / bend, fx + 0.25 * slope * slope / bend
+    return x + 0.5 * (left / bend - (x - a)) if bend > 0.0 else x
 
 
 @compiled
 def next_trial(a, fa, x, fx, b, fb, tolerance):
-    """The next ln ω to try in a bracket a < x < b with fx its best, and the gain it promises.
+    """The next ln ω to try in a bracket a < x < b with fx its best, and the room for a gain.
 
-    The parabola's vertex, or the middle of the longer side where the vertex is no news. The
-    promise is infinite where the parabola cannot be trusted, and 0 at the end: the bracket has
-    closed, or a credible parabola promises less than `tolerance`, relative to fx.
+    The parabola's vertex; where that is x itself, a point a little way into the longer side, so
+    that the bracket closes from both. The room is the larger drop to the bracket's ends: what a
+    parabola may still promise is no measure, it can be zero by the symmetry of three points. It
+    comes back as 0 once below `tolerance`, relative to fx, or when the bracket has closed.
     """
-    vertex, top = parabola_vertex(a, fa, x, fx, b, fb)
-    if b - a < 1e-12:
+    room = max(fx - fa, fx - fb)
+    if b - a < 1e-12 or room <= tolerance * abs(fx):
         return x, 0.0
-    credible = max(fx - fa, fx - fb) < 0.1 * abs(fx)
-    promise = top - fx if credible else np.inf
-    if promise <= tolerance * abs(fx):
-        return x, 0.0
-    if not (a < vertex < b) or abs(vertex - x) < 1e-3 * (b - a):
-        vertex = 0.5 * (a + x) if x - a > b - x else 0.5 * (x + b)
-    return vertex, promise
+    vertex = _vertex(a, fa, x, fx, b, fb)
+    if not (a < vertex < b) or abs(vertex - x) < 1e-2 * (b - a):
+        vertex = x - 0.1 * (x - a) if x - a > b - x else x + 0.1 * (b - x)
+    return vertex, room
 
 
 @compiled

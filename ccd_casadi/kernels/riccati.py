@@ -54,27 +54,76 @@ def riccati_level(H0, B1, C1, d1, t):
     """f = λ_min(X⁻¹) and f' = df/dt from one ordered Schur form; ok False on the jω axis.
 
     With U1 = P c Qᵀ, q and p the singular vectors of one singular value, λ(X) = s/c,
-    s = pᵀ U2 q, and f' = -qᵀ Z q/s² where T11ᵀ Z + Z T11 = -[U2ᵀ -U1ᵀ] H'(t) [U1; U2].
+    s = pᵀ U2 q, and f' = qᵀ Z q/(s t)² where T11ᵀ Z + Z T11 = -VᵀV, V = [Sᵀ B1ᵀ][U1; U2].
     No inverse of U1, so the formula holds at γ_opt itself, where X is infinite.
+    Returns f, f', ok and (H(t), T11, U1, U2, V, Z, q, p, c), the frame at t.
     """
     N, p = B1.shape
-    T11, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
+    H = level_hamiltonian(H0, B1, C1, d1, t)
+    T11, U1, U2, _, ok = stable_subspace(H)
     if not ok:
-        return -np.inf, 0.0, T11, U1, U2, np.zeros(N), np.zeros(N), False
+        return -np.inf, 0.0, False, (H, T11, U1, U2, U1, U1, np.zeros(N), np.zeros(N), 0.0)
     P, c, Qt = np.linalg.svd(U1)
     Q = np.ascontiguousarray(Qt.T)
-    W = U2 @ Q
+    M = U2 @ Q
     f, s_best, index = np.inf, 1.0, N - 1
     for i in range(N):
         s = 0.0
         for j in range(N):
-            s += P[j, i] * W[j, i]
+            s += P[j, i] * M[j, i]
         # |s| = |λ|/√(1+λ²): an (almost) unobservable state has λ(X) = 0 of either sign.
         if abs(s) > 1e-7 and c[i] / s < f:
             f, s_best, index = c[i] / s, s, i
     q, left = Q[:, index].copy(), P[:, index].copy()
-    # V = [Sᵀ B1ᵀ][U1; U2]: then -[U2ᵀ -U1ᵀ] H' [U1; U2] = Vᵀ V/t².
     V = d1 * (C1[:p] @ U1) + np.ascontiguousarray(B1.T) @ U2
-    Z = lyapunov_triangular(T11, V.T @ V / t**2, True)
-    slope = -np.dot(q, Z @ q) / s_best**2
-    return f, slope, T11, U1, U2, q, left, True
+    Z = lyapunov_triangular(T11, -(V.T @ V), True)
+    slope = np.dot(q, Z @ q) / (s_best * t) ** 2
+    return f, slope, True, (H, T11, U1, U2, V, Z, q, left, c[index])
+
+
+@compiled
+def _singularity(U1, U2, Z, q, p):
+    """g of [[U1 - U2 Z, p], [qᵀ, 0]][v; g] = [0; 1]: zero where U1 - U2 Z is singular."""
+    N = U1.shape[0]
+    M, right = np.zeros((N + 1, N + 1)), np.zeros(N + 1)
+    M[:N, :N] = U1 - U2 @ Z
+    for i in range(N):
+        M[i, N], M[N, i] = p[i], q[i]
+    right[N] = 1.0
+    return np.linalg.solve(M, right)[N]
+
+
+@compiled
+def root_nearby(B1, C1, d1, frame, δ):
+    """Where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
+
+    In the coordinates of [[U1, -U2], [U2, U1]] the stable subspace at 1/t + δ is [I; Z(δ)] with
+
+        T11ᵀ Z + Z T11 = -δ (V + W Z)ᵀ(V + W Z) - Z G Z,   W = [Sᵀ B1ᵀ][-U2; U1].
+
+    Z is taken to δ³, one triangular Lyapunov equation a term, and the root of the smooth scalar
+    that vanishes with det(U1 - U2 Z) found by the secant method, from the estimate δ.
+    """
+    H, T11, U1, U2, V, Z1, q, p, c = frame
+    N, outputs = B1.shape
+    W = np.ascontiguousarray(B1.T) @ U1 - d1 * (C1[:outputs] @ U2)
+    G = np.ascontiguousarray(U1.T) @ (H[:N, N:].copy() @ U1 - H[:N, :N].copy() @ U2)
+    G += np.ascontiguousarray(U2.T) @ (H[N:, N:].copy() @ U1 - H[N:, :N].copy() @ U2)
+    VW = np.ascontiguousarray(V.T) @ W
+    WZ, GZ = W @ Z1, G @ Z1
+    M = VW @ Z1 + 0.5 * (Z1 @ GZ)
+    Z2 = lyapunov_triangular(T11, -(M + M.T), True)
+    M = VW @ Z2 + 0.5 * (WZ.T @ WZ) + Z2 @ GZ
+    Z3 = lyapunov_triangular(T11, -(M + M.T), True)
+    δ0, g0 = 0.0, -c
+    for _ in range(8):
+        g = _singularity(U1, U2, δ * (Z1 + δ * (Z2 + δ * Z3)), q, p)
+        if g == g0 or δ == δ0:
+            break
+        δ0, g0, δ = δ, g, δ - g * (δ - δ0) / (g - g0)
+        if abs(δ - δ0) <= 1e-8 * abs(δ):  # the step after it would be 1e-8 times as small
+            break
+    n1, n2, n3 = np.linalg.norm(Z1), np.linalg.norm(Z2), np.linalg.norm(Z3)
+    first = abs(np.dot(q, Z1 @ q))
+    ratio = abs(δ) * max(n3 / n2, n2 / n1)
+    return δ, abs(δ) ** 3 * n3 / first * ratio if ratio < 0.5 else np.inf

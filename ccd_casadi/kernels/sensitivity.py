@@ -26,7 +26,8 @@ def axis_frequencies(A, B, C, D, level):
     """
     n, m = B.shape
     Dt = np.ascontiguousarray(D.T)
-    Ri = np.linalg.inv(level**2 * np.eye(m) - Dt @ D)
+    R = level**2 * np.eye(m) - Dt @ D
+    Ri = 1.0 / R if m == 1 else np.ascontiguousarray(np.linalg.inv(R))
     BR, DC = B @ Ri, Dt @ C
     RDC = Ri @ DC
     F = A + B @ RDC
@@ -165,7 +166,7 @@ def _climb(G, K, Dk, start):
         x = (a * fb - b * fa) / (fb - fa) if fb != fa else 0.5 * (a + b)
         if not (a < x < b):
             x = 0.5 * (a + b)
-        _, fx = sensitivity_slope(G, K, Dk, x)
+        value, fx = sensitivity_slope(G, K, Dk, x)
         if fx == 0.0 or b - a <= 1e-13 * b:
             break
         if fx > 0.0:
@@ -180,9 +181,9 @@ def _climb(G, K, Dk, start):
             if side == -1:
                 fa *= 0.5
             side = -1
-        if moved <= 1e-14 * x:
+        if moved <= 1e-12 * x:
             break
-    return x, sensitivity_gain(G, K, Dk, x)
+    return x, value
 
 
 @compiled
