@@ -12,13 +12,26 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.case_checks import ANY, FRACTION, Check, shown, text, too_large
+from ccd_casadi.case_checks import (
+    ANY,
+    FRACTION,
+    POSITIVE,
+    Check,
+    choice,
+    number,
+    shown,
+    text,
+    too_large,
+)
 from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
-from ccd_casadi.models import MODELS
+from ccd_casadi.models import BUILDERS, MODELS
 from ccd_casadi.problem import CoDesignProblem, PlantSource, plant_of
+from ccd_casadi.rib_stage import NAMES
+from ccd_casadi.rib_stage.model import OUTPUTS
+from ccd_casadi.rib_stage.plant import MESHES
 from ccd_casadi.weights import Weights
 
 HZ = 2.0 * math.pi
@@ -34,8 +47,19 @@ _ORDERED_WEIGHTS = (
     ("A_u", "A_l", "W_T asks for a roll-off"),
 )
 # What the models of the package take, as far as a function's signature does not say it.
-_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2")}
-_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {("two_mass", "zeta"): FRACTION}
+_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2"), "rib_stage": NAMES}
+_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
+    ("two_mass", "zeta"): FRACTION,
+    ("rib_stage", "zeta"): FRACTION,
+    ("rib_stage", "outputs"): choice(*OUTPUTS),
+    ("rib_stage", "mesh"): choice(*MESHES),
+    ("rib_stage", "side"): POSITIVE,
+    ("rib_stage", "young"): POSITIVE,
+    ("rib_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
+    ("rib_stage", "density"): POSITIVE,
+    ("rib_stage", "least_bay"): POSITIVE,
+}
+_KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 
 
 def load_case(path: str | Path) -> Case:
@@ -139,8 +163,8 @@ def _plant(
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
         raise fail("plant", "give either model or function, and not both")
-    if model is not None and (not isinstance(model, str) or model not in MODELS):
-        hint = _closest(str(model), MODELS)
+    if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
+        hint = _closest(str(model), _KNOWN_MODELS)
         raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
@@ -156,7 +180,7 @@ def _plant(
         # Absolute, so that the resolved case means the same from the run folder.
         function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
-    takes = None if model is None else list(inspect.signature(MODELS[model]).parameters)[1:]
+    takes = None if model is None else list(inspect.signature(_KNOWN_MODELS[model]).parameters)[1:]
     for key, value in options.items():
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is no keyword; use a Python identifier")

@@ -7,7 +7,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -50,7 +50,8 @@ class Plant:
     """A model bound to its parameters: what the design loop asks of any plant.
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
-    `hardware` maps θ to (f, λ) as a casadi.Function in either case.
+    `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
+    plant modelled more closely, by name: a design is certified on them again, not optimised.
     """
 
     names: tuple[str, ...]
@@ -59,6 +60,7 @@ class Plant:
     hardware: ca.Function
     outputs: int
     inputs: int
+    references: Mapping[str, Callable[[Sequence[float]], Mechanics]] = field(default_factory=dict)
 
 
 def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:

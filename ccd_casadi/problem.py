@@ -18,7 +18,7 @@ from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
 from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.models import MODELS
+from ccd_casadi.models import BUILDERS, MODELS
 from ccd_casadi.plant import Array, ModelFunction, Plant, build_plant, mechanics
 from ccd_casadi.scaling import ScaledPlant, scale_plant
 from ccd_casadi.weights import Weights
@@ -28,7 +28,7 @@ NUMERICS = 2  # raised whenever a change of ours moves the numbers that a sample
 
 @dataclass(frozen=True)
 class PlantSource:
-    """Where the model comes from: a name of MODELS, or `file.py:function`, and its options."""
+    """Where the model comes from: a known name or `file.py:function`, and its options."""
 
     model: str | None
     file: str | None
@@ -95,12 +95,14 @@ class CoDesignProblem:
 
 
 def plant_of(problem: CoDesignProblem) -> Plant:
-    """The CasADi plant, traced once in a process."""
+    """The plant, built once in a process."""
     return _plant(problem.source, problem.names)
 
 
 @lru_cache(maxsize=8)
 def _plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+    if source.model in BUILDERS:
+        return BUILDERS[source.model](names, **dict(source.options))
     return build_plant(_model(source), names, dict(source.options))
 
 

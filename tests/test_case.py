@@ -19,7 +19,7 @@ from ccd_casadi.case import CaseError, load_case, parse_case, parse_theta, probl
 from ccd_casadi.case_sections import Case, Parameter
 from ccd_casadi.case_toml import case_to_toml
 from ccd_casadi.errors import UserError
-from ccd_casadi.models import MODELS
+from ccd_casadi.models import BUILDERS, MODELS
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 DOCUMENT = tomllib.loads(TWO_MASS.read_text("utf-8"))
@@ -389,12 +389,18 @@ def test_a_plant_function_that_fails_is_told(plant_folder: Path, function: str, 
 def test_what_is_known_of_the_models_is_what_they_take() -> None:
     """A model that reads another θ, or renames an option, would make the checks refuse it."""
     for name, theta in case_module._MODEL_THETA.items():
-        MODELS[name](dict.fromkeys(theta, 60.0))
+        if name in BUILDERS:
+            BUILDERS[name](theta)
+        else:
+            MODELS[name](dict.fromkeys(theta, 60.0))
         for gone in theta:
-            with pytest.raises(KeyError):
-                MODELS[name](dict.fromkeys(set(theta) - {gone}, 60.0))
+            rest = tuple(sorted(set(theta) - {gone}))
+            with pytest.raises((KeyError, UserError)):
+                BUILDERS[name](rest) if name in BUILDERS else MODELS[name](
+                    dict.fromkeys(rest, 60.0)
+                )
     for name, option in case_module._MODEL_OPTIONS:
-        assert option in inspect.signature(MODELS[str(name)]).parameters
+        assert option in inspect.signature({**MODELS, **BUILDERS}[str(name)]).parameters
 
 
 @pytest.mark.parametrize(

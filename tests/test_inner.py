@@ -31,7 +31,9 @@ def check_result(result: InnerResult, inner: InnerProblem) -> None:
     assert inner.omega_S[0] <= best.omega_S <= inner.omega_S[1]
     assert inner.omega_T[0] <= best.omega_T <= inner.omega_T[1]
     assert result.syntheses == len(result.rows)
-    assert result.bandwidth == max(r.bandwidth for r in result.rows if inner.feasible(r))
+    # a swept design is synthesised again for its derivatives, from another guess of γ_opt
+    best_row = max(r.bandwidth for r in result.rows if inner.feasible(r))
+    assert result.bandwidth == pytest.approx(best_row, rel=1e-9, abs=0.0)
     assert result.active == active_constraints(inner, best)
     assert result.active  # ω_b grows with ω_S: something must bind
 

@@ -1,6 +1,13 @@
-"""The plants of the case studies, each a model function as the case file names it."""
+"""The plants of the case studies as the case file names them.
+
+A model function speaks CasADi; a plant builder takes the names of θ and evaluates by numbers.
+"""
+
+from collections.abc import Callable
 
 from ccd_casadi.models.two_mass import two_mass as two_mass
-from ccd_casadi.plant import ModelFunction
+from ccd_casadi.plant import ModelFunction, Plant
+from ccd_casadi.rib_stage.plant import rib_stage as rib_stage
 
 MODELS: dict[str, ModelFunction] = {"two_mass": two_mass}
+BUILDERS: dict[str, Callable[..., Plant]] = {"rib_stage": rib_stage}

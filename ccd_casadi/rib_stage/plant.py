@@ -1,0 +1,112 @@
+"""Case study 2 as the case file names it: the options of `rib_stage`, and the plant they make."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plant import Mechanics, Plant
+from ccd_casadi.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
+from ccd_casadi.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.rib_stage.model import RibStage
+from ccd_casadi.rib_stage.solver import StageError
+from ccd_casadi.rib_stage.truncation import TWENTY
+
+MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
+Points = Sequence[Sequence[float]]
+
+
+def rib_stage(
+    names: Sequence[str],
+    zeta: float = 0.01,
+    outputs: str = "corners",
+    mesh: str = "shipped",
+    side: float = 0.3,
+    young: float = 68.9e9,
+    poisson: float = 0.33,
+    density: float = 2700.0,
+    least_bay: float = 8e-3,
+    actuators: Points = (),
+    sensors: Points = (),
+    point_masses: Points = (),
+) -> Plant:
+    """The rib-reinforced stage, θ in m named as in `geometry.NAMES`, in any order.
+
+    `actuators` and `sensors` are points [x, y] of the lower face in m (none: the corners),
+    `point_masses` are [x, y, mass] in m and kg. Hardware cost: mass in kg; λ: the bays.
+    References: the same stage on a finer mesh, and with 20 flexible modes.
+    """
+    if sorted(names) != sorted(NAMES):
+        raise StageError(f"rib_stage has the parameters {', '.join(NAMES)}; give all of them")
+    if mesh not in MESHES:
+        raise StageError(f"mesh is {mesh!r}; choose one of {', '.join(MESHES)}")
+    geometry = Geometry(
+        side=side,
+        material=Material(young, poisson, density),
+        point_masses=tuple(PointMass(*_numbers(p, 3, "point_masses")) for p in point_masses),
+        least_bay=least_bay,
+    )
+    stage = RibStage(
+        geometry=geometry,
+        order=MESHES[mesh],
+        actuators=_points(actuators, "actuators"),
+        sensors=_points(sensors, "sensors"),
+        outputs=outputs,
+        damping_ratio=zeta,
+    )
+    return plant_of_stage(stage, names)
+
+
+def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
+    """Any RibStage as the plant that the design loop asks for."""
+    place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
+    back = [NAMES.index(name) for name in names]
+
+    def evaluator(variant: RibStage) -> "_Evaluator":
+        return _Evaluator(variant, tuple(place), tuple(back))
+
+    theta = ca.SX.sym("theta", len(NAMES))
+    mass, constraints = stage.hardware([theta[i] for i in place])
+    count = {"rigid": 3, "modal4": 4}.get(stage.outputs)
+    references = {"20 flexible modes": replace(stage, modes=TWENTY)}
+    if stage.order != FINE:
+        references["finer mesh"] = replace(stage, order=FINE)
+    return Plant(
+        names=tuple(names),
+        constraint_names=tuple(constraints),
+        evaluate=evaluator(stage),
+        hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
+        outputs=count or len(stage.sensor_points),
+        inputs=count or len(stage.actuator_points),
+        references={name: evaluator(variant) for name, variant in references.items()},
+    )
+
+
+class _Evaluator:
+    """θ in the case's order -> Mechanics, derivatives in that order too."""
+
+    def __init__(self, stage: RibStage, place: tuple[int, ...], back: tuple[int, ...]) -> None:
+        self.stage, self.place, self.back = stage, place, back
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        found = self.stage.mechanics([float(theta[i]) for i in self.place])
+        if self.back == tuple(range(len(NAMES))):
+            return found
+        M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
+        return replace(found, derivatives=(M, D, K, B, C))
+
+
+def _points(points: Points, key: str) -> tuple[Point, ...] | None:
+    found = tuple(_numbers(point, 2, key) for point in points)
+    return tuple((p[0], p[1]) for p in found) or None
+
+
+def _numbers(values: Sequence[float], count: int, key: str) -> tuple[float, ...]:
+    try:
+        found = tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        found = ()
+    if len(found) != count or not np.isfinite(found).all():
+        raise StageError(f"{key} holds {values!r}; give {count} numbers a point")
+    return found
