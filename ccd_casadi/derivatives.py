@@ -58,7 +58,7 @@ def sensitivities(
     count = plant.dA.shape[0]
     try:
         row, _, _, _, gradient, fixed, gaps = design_with_gradients(
-            *arguments, omega_low / w0, guess, *slopes
+            *arguments, omega_low / w0, guess, *slopes, plant.channels
         )
     except np.linalg.LinAlgError:
         row, gradient = failed_row(), np.full((4, count + 8), np.nan)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eig
 
+from ccd_casadi.channels import Channel, find_channels
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.modal import ModalPlant
 from ccd_casadi.plant import Array, PlantError
@@ -26,12 +27,30 @@ class StateSpace:
 
 
 @dataclass(frozen=True)
+class ScaledChannel:
+    """One block of a block-diagonal plant: Uᵀ G V = C(s - A)⁻¹B, its grid and least gain there.
+
+    `states` are those of the whole plant; U = `outputs` (p, k), V = `inputs` (m, k).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    grid: Array
+    gain: Array
+    states: np.ndarray
+    outputs: Array
+    inputs: Array
+
+
+@dataclass(frozen=True)
 class ScaledPlant:
     """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
 
     `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
     the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
-    with ω₀ and the coordinates frozen.
+    with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
+    plant (see `channels`), empty where it is not.
     """
 
     A: Array
@@ -45,6 +64,7 @@ class ScaledPlant:
     dA: Array
     dB: Array
     dC: Array
+    channels: tuple[ScaledChannel, ...] = ()
 
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""
@@ -97,9 +117,32 @@ def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
         dA[i, n:, n:] = -lower(dD)
         dB[i, n:] = left[:, None] * drive * (modal.dB[i] - modal.dM[i] @ modal.B)
         dC[i, :, :n] = modal.dC[i] * right / s
+    grid, gain = _gains(A, B, C)
+    channels = _scaled_channels(find_channels(modal.K, modal.D, modal.B, modal.C), A, B, C)
+    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
+
+
+def _scaled_channels(
+    channels: tuple[Channel, ...], A: Array, B: Array, C: Array
+) -> tuple[ScaledChannel, ...]:
+    if len(channels) < 2:
+        return ()
+    found = []
+    for channel in channels:
+        states = np.concatenate([channel.modes, channel.modes + len(A) // 2])
+        a = np.ascontiguousarray(A[np.ix_(states, states)])
+        b = np.ascontiguousarray(B[states] @ channel.inputs)
+        c = np.ascontiguousarray(channel.outputs.T @ C[:, states])
+        found.append(
+            ScaledChannel(a, b, c, *_gains(a, b, c), states, channel.outputs, channel.inputs)
+        )
+    return tuple(found)
+
+
+def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
+    """The frequency grid, and the least singular value of the plant on it."""
     grid = _frequency_grid(A, B, C)
-    gain = np.array([plant_gain(A, B, C, omega) for omega in grid])
-    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC)
+    return grid, np.array([plant_gain(A, B, C, omega) for omega in grid])
 
 
 def _frequency_grid(A: Array, B: Array, C: Array) -> Array:

@@ -90,7 +90,7 @@ def synthesise(
     w0 = plant.omega_0
     arguments = (plant.A, plant.B, plant.C, weights.scaled(w0), plant.grid, plant.gain)
     try:
-        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess)
+        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, plant.channels)
     except np.linalg.LinAlgError:
         row, Ak, Bk, Ck = failed_row(), *(np.full((1, 1), np.nan) for _ in range(3))
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
@@ -110,7 +110,7 @@ def sweep(
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     w = weights.scaled(w0)
-    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0)
+    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels)
     try:
         rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
     except np.linalg.LinAlgError:  # one bad point must not take the others along

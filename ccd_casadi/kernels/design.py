@@ -168,16 +168,54 @@ def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
 # compiled kernels together: 2 % slower in Python, and half the time to compile.
 
 
-def design(A, B, C, w, grid, sigma, backoff, omega_low, guess):
-    """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K."""
-    row, Ak, Bk, Ck = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=()):
+    """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K.
+
+    With `channels` the synthesis is done on these blocks; the certificate is the whole loop's.
+    """
+    if channels:
+        row, Ak, Bk, Ck = _synthesise_channels(A, B, C, w, channels, backoff, guess)
+    else:
+        row, Ak, Bk, Ck = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
     if row[_CODE] == 0.0:
         Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
         assess(A, B, C, Ak, Bk, Ck, Dk, w, backoff * row[_GAMMA_OPT], omega_low, row)
     return row, Ak, Bk, Ck
 
 
-def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low):
+def _synthesise_channels(A, B, C, w, channels, backoff, guess):
+    """As `_synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together."""
+    found = [_synthesise(c.A, c.B, c.C, w, c.grid, c.gain, backoff, guess) for c in channels]
+    rows = np.array([item[0] for item in found])
+    failed = np.flatnonzero(rows[:, Figure.CODE])
+    if failed.size:
+        return found[failed[0]]
+    top = int(rows[:, _GAMMA_OPT].argmax())
+    row = rows[top].copy()
+    row[Figure.GAMMA_LOWER_BOUND] = rows[:, Figure.GAMMA_LOWER_BOUND].max()
+    row[Figure.SCHUR_FORMS] = rows[:, Figure.SCHUR_FORMS].sum()
+    Ag, B1, B2, _, C2, _, _ = generalized_plant(A, B, C, w)
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
+    F = np.zeros((m, n + 2 * p + m))
+    for i, c in enumerate(channels):
+        gain = found[i][3]
+        if i != top:
+            gp = generalized_plant(c.A, c.B, c.C, w)
+            H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], c.C.shape[0], c.B.shape[1])
+            gain, ok = central_controller(*gp, H0, backoff * row[_GAMMA_OPT])[2:]
+            if not ok:
+                row[Figure.CODE] = Code.RICCATI_FAILED.value
+        # filters turn with the signals that they see
+        turns = (np.eye(n)[:, c.states], c.outputs, c.inputs, c.outputs)
+        first, column = 0, 0
+        for turn in turns:
+            high, wide = turn.shape
+            F[:, first : first + high] += c.inputs @ gain[:, column : column + wide] @ turn.T
+            first, column = first + high, column + wide
+    return row, Ag + B2 @ F - B1 @ C2, B1, F
+
+
+def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=()):
     """Rows (n_S, n_T, figures) over the frequencies of W1 and W3, each warm-started.
 
     Boustrophedon order: γ_opt is guessed from the certified neighbours already done.
@@ -193,7 +231,7 @@ def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low):
             i = step if side == 1 else omega_S.size - 1 - step
             weights[2] = omega_S[i]
             guess = _guess(found, x, y, i, j, side, step)
-            row = design(A, B, C, weights, grid, sigma, backoff, omega_low, guess)[0]
+            row = design(A, B, C, weights, grid, sigma, backoff, omega_low, guess, channels)[0]
             rows[i, j] = row
             found[i, j] = log(row[_GAMMA_OPT]) if row[_CODE] == 0.0 else nan
     return rows

@@ -180,14 +180,16 @@ def figure_gradients(A, B, C, w, gp, H0, f, backoff, gamma_opt, limited, bound_f
     return A_, B_, C_, w_, slopes, gains, gaps, fixed_A, fixed_B, fixed_C, ok
 
 
-def design_with_gradients(A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC):
+def design_with_gradients(
+    A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC, channels=()
+):
     """A design, and the gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt).
 
     Returns the row, A_K, B_K, C_K, G (4, n_θ + 8): derivatives to θ then to the scaled weight
     vector; fixed (n_θ): the paper's dω_b/dθ with K held; gaps (3) of σ_max at the frequencies.
     The gradients are NaN where the design is not certified.
     """
-    row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, backoff, omega_low, guess)
+    row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels)
     count = dA.shape[0]
     out, fixed, gaps = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
     if row[Figure.CODE] != Code.CERTIFIED:
@@ -204,6 +206,10 @@ def design_with_gradients(A, B, C, w, grid, sigma, backoff, omega_low, guess, dA
         points,
     )  # fmt: skip
     if not ok:
+        if channels:  # rounding put the blocks' γ_opt below the whole plant's: begin from that
+            return design_with_gradients(
+                A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC
+            )
         return row, Ak, Bk, Ck, out, fixed, gaps
     out[:, :count] = _contract(A_, dA) + _contract(B_, dB) + _contract(C_, dC)
     out[:, count:] = w_
