@@ -41,7 +41,7 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
     b, c = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     live = (b > CERTAIN * b.max()) & (c > CERTAIN * c.max())
     coupling = np.abs(K) + np.abs(D)
-    groups = _components(np.greater(coupling, 0.0))
+    groups = _components(coupling > 0.0)
     kept = [group for group in groups if live[group].any()]
     residues = []
     for group in kept:
@@ -58,8 +58,8 @@ def find_channels(K: Array, D: Array, B: Array, C: Array) -> tuple[Channel, ...]
     if s[-1] <= EXACT * s[0]:
         return whole
     turned = [np.abs(U.T @ residue @ Vt.T) for residue in residues]
-    joined = np.array([t > EXACT * max(t.max(), 1e-300) for t in turned]).any(axis=0)
-    blocks = _components(joined | joined.T)
+    share = np.max([t / max(t.max(), 1e-300) for t in turned], axis=0)
+    blocks = _components(np.maximum(share, share.T) > EXACT)
     if len(blocks) < 2:
         return whole
     found = []

@@ -171,7 +171,9 @@ def _sequential(
 ) -> Method:
     began = perf_counter()
     resonance = HZ * case.baseline.first_resonance_hz
-    hardware: HardwareDesign = design_hardware(problem, resonance, starts=starts, seed=seed)
+    hardware: HardwareDesign = design_hardware(
+        problem, resonance, starts=starts, seed=seed, workers=workers
+    )
     with SampleStore(folder / f"samples_{name}.sqlite") as store:
         truth = Truth(problem, store, workers)
         sample = truth.bandwidths(np.array(hardware.theta))[0]

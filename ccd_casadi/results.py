@@ -85,6 +85,17 @@ def result_dict(
             "bandwidth_hz": verified.unsuspended.bandwidth / HZ,
             "sensitivity_peak": verified.unsuspended.sensitivity_peak,
         },
+        "references": {
+            check.name: {
+                "certified": check.certified,
+                "reason": check.outcome.value,
+                "stable": check.figures.certificate.stable,
+                "bandwidth_hz": check.figures.bandwidth / HZ,
+                "sensitivity_peak": check.figures.sensitivity_peak,
+                "gamma": check.figures.gamma,
+            }
+            for check in verified.references
+        },
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         "syntheses": syntheses,
         "seconds": seconds,

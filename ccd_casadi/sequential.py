@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import minimize
 
+from ccd_casadi.callback import VectorCallback
 from ccd_casadi.modal import modal_plant
-from ccd_casadi.plant import Array, constraint_values, mechanics
+from ccd_casadi.outer import NonlinearProgram, OuterFailure, solve_program
+from ccd_casadi.parallel import Workers
+from ccd_casadi.plant import Array, constraint_values, hardware_cost, mechanics
 from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from surrogates import design
 
@@ -39,62 +41,81 @@ def first_resonance(problem: CoDesignProblem, theta: Array) -> tuple[float, Arra
     return omega, slope / (2.0 * omega)
 
 
+class FirstResonance(VectorCallback):
+    """ln(ω_1/ω_ref) of θ with its Jacobian; repeated points cost nothing."""
+
+    def __init__(self, problem: CoDesignProblem, reference: float) -> None:
+        ca.Callback.__init__(self)
+        self.problem, self.reference = problem, reference
+        self._known: dict[bytes, tuple[float, Array]] = {}
+        self.set_up("first_resonance", len(problem.names), 1)
+
+    def at(self, theta: Array) -> tuple[float, Array]:
+        """ω_1 in rad/s and its gradient."""
+        key = theta.tobytes()
+        if key not in self._known:
+            self._known[key] = first_resonance(self.problem, theta)
+        return self._known[key]
+
+    def values(self, x: Array) -> Array:
+        """(1,) ln(ω_1/ω_ref)."""
+        return np.array([np.log(self.at(x)[0] / self.reference)])
+
+    def jacobian_at(self, x: Array) -> Array:
+        """(1, n_θ) derivatives."""
+        omega, slope = self.at(x)
+        return slope[None, :] / omega
+
+
 def design_hardware(
-    problem: CoDesignProblem, resonance: float, *, starts: int = 8, seed: int = 0
+    problem: CoDesignProblem,
+    resonance: float,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    workers: Workers | None = None,
 ) -> HardwareDesign:
-    """The least hardware cost with ω_1 >= `resonance` (rad/s), by SLSQP.
+    """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
 
     From the case's start and `starts` more: with none, the local solution next to the start,
     which need not be the least one (for the two masses it is the paper's equal-mass design).
     """
     lower, upper = box(problem)
-    width = upper - lower
-    plant = plant_of(problem)
-    symbol = ca.SX.sym("theta", len(problem.names))
-    f, lam = plant.hardware(symbol)
-    cost = ca.Function("cost", [symbol], [f, ca.jacobian(f, symbol)])
-    extra = ca.Function("extra", [symbol], [lam, ca.jacobian(lam, symbol)])
-
-    def at(z: Array) -> Array:
-        return lower + width * np.clip(z, 0.0, 1.0)
-
-    constraints = [
-        {
-            "type": "ineq",
-            "fun": lambda z: first_resonance(problem, at(z))[0] / resonance - 1.0,
-            "jac": lambda z: first_resonance(problem, at(z))[1] * width / resonance,
-        }
-    ]
-    if plant.constraint_names:
-        constraints.append(
-            {
-                "type": "ineq",
-                "fun": lambda z: -np.array(extra(at(z))[0]).ravel(),
-                "jac": lambda z: -np.array(extra(at(z))[1]) * width,
-            }
-        )
-    scale = abs(float(cost(np.array(problem.start))[0])) or 1.0
     points = np.array([problem.start])
     if starts > 0:
         points = np.vstack([points, design("sobol", lower, upper, starts, seed)])
-    found = []
-    for point in points:
-        result = minimize(
-            lambda z: float(cost(at(z))[0]) / scale,
-            (point - lower) / width,
-            jac=lambda z: np.array(cost(at(z))[1]).ravel() * width / scale,
-            bounds=[(0.0, 1.0)] * len(lower),
-            constraints=constraints,
-            method="SLSQP",
-            options={"ftol": 1e-12, "maxiter": 200},
-        )
-        theta = at(result.x)
-        omega = first_resonance(problem, theta)[0]
-        allowed = bool((constraint_values(plant, theta) <= 1e-9).all())
-        met = bool(omega >= resonance * (1.0 - 1e-6)) and allowed
-        value = float(cost(theta)[0])
-        found.append(HardwareDesign(tuple(float(v) for v in theta), value, omega, met))
+    tasks = [(problem, resonance, tuple(float(v) for v in point)) for point in points]
+    pool = Workers(1) if workers is None else workers
+    found = sorted(pool.map_unordered(_from_start, tasks), key=lambda item: item.theta)
     meeting = [item for item in found if item.met]
     if meeting:
         return min(meeting, key=lambda item: item.hardware_cost)
     return max(found, key=lambda item: item.first_resonance)
+
+
+def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> HardwareDesign:
+    problem, resonance, start = task
+    lower, upper = box(problem)
+    plant = plant_of(problem)
+    theta = ca.MX.sym("theta", len(lower))
+    cost, lam = plant.hardware(theta)
+    callback = FirstResonance(problem, resonance)
+    program = NonlinearProgram(
+        x=theta,
+        f=cost / (abs(hardware_cost(plant, start)) or 1.0),
+        g=ca.vertcat(-callback(theta), lam),
+        lower=lower,
+        upper=upper,
+        variables=problem.names,
+        constraints=("first_resonance", *plant.constraint_names),
+        exact_hessian=False,
+    )
+    try:
+        point = solve_program(program, np.array([start]), warm=True).best.x
+    except OuterFailure:
+        point = np.array(start)
+    omega = callback.at(point)[0]
+    allowed = bool((constraint_values(plant, point) <= 1e-9).all())
+    met = bool(omega >= resonance * (1.0 - 1e-6)) and allowed
+    value = hardware_cost(plant, point)
+    return HardwareDesign(tuple(float(v) for v in point), value, omega, met)

@@ -7,19 +7,18 @@ certified the values are NaN, which makes IPOPT shorten its step. Hessians are n
 use a quasi-Newton method (`ipopt.hessian_approximation = "limited-memory"`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.callback import VectorCallback
 from ccd_casadi.derivatives import Sensitivities
-from ccd_casadi.interrupts import pending
 from ccd_casadi.plant import Array
 from ccd_casadi.problem import CoDesignProblem, true_design
 
 
-class TrueQuantities(ca.Callback):
+class TrueQuantities(VectorCallback):
     """A casadi.Callback; keep a reference to it as long as anything built on it is in use."""
 
     def __init__(
@@ -32,8 +31,7 @@ class TrueQuantities(ca.Callback):
         self.problem = problem
         self.record = record
         self.designs: dict[bytes, Sensitivities] = {}
-        self._jacobian: ca.Callback | None = None
-        self.construct("true_quantities", {})
+        self.set_up("true_quantities", len(problem.names) + 2, 4)
 
     def at(self, x: Array) -> Sensitivities:
         """The design at x = (θ, ln ω_S, ln ω_T); repeated points cost nothing."""
@@ -60,51 +58,3 @@ class TrueQuantities(ca.Callback):
         """(4, n_θ + 2) derivatives."""
         design = self.at(x)
         return np.hstack([design.to_theta, design.to_break_frequencies])
-
-    def get_n_in(self) -> int:
-        return 1
-
-    def get_n_out(self) -> int:
-        return 1
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(len(self.problem.names) + 2, 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(4, 1)
-
-    def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        if pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
-            return [np.full(4, np.nan)]
-        return [self.values(np.array(arguments[0]))]
-
-    def has_jacobian(self) -> bool:
-        return True
-
-    def get_jacobian(
-        self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
-    ) -> ca.Function:
-        parent = self
-
-        class Jacobian(ca.Callback):
-            def __init__(self) -> None:
-                ca.Callback.__init__(self)
-                self.construct(name, options)
-
-            def get_n_in(self) -> int:
-                return 2
-
-            def get_n_out(self) -> int:
-                return 1
-
-            def get_sparsity_in(self, i: int) -> ca.Sparsity:
-                return parent.get_sparsity_in(0) if i == 0 else ca.Sparsity(4, 1)
-
-            def get_sparsity_out(self, i: int) -> ca.Sparsity:
-                return ca.Sparsity.dense(4, len(parent.problem.names) + 2)
-
-            def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-                return [parent.jacobian_at(np.array(arguments[0]))]
-
-        self._jacobian = Jacobian()
-        return self._jacobian

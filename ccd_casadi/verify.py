@@ -12,12 +12,12 @@ from ccd_casadi.modal import Suspension
 from ccd_casadi.outer import active_bounds, lifted_bounds, lifted_program
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.references import UNBOUNDED, ReferenceCheck, check_references
 from ccd_casadi.sampling import Truth
 from ccd_casadi.synthesis import Design, DesignFigures, synthesise
 from ccd_casadi.true_function import TrueQuantities
 
 POLISH_ROUNDS = 3
-UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
 
 
@@ -26,7 +26,8 @@ class VerifiedDesign:
     """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
 
     `inner_gap`: by how much (relative) the global inner problem at θ beats the design's ω_b.
-    `unsuspended`: the same controller on the plant with its rigid-body modes free.
+    `unsuspended`: the same controller on the plant with its rigid-body modes free;
+    `references`: on closer models of the plant.
     """
 
     x: Array
@@ -39,6 +40,7 @@ class VerifiedDesign:
     inner_gap: float
     feasible: bool
     unsuspended: DesignFigures
+    references: tuple[ReferenceCheck, ...] = ()
 
 
 def verify(truth: Truth, x: Array) -> VerifiedDesign:
@@ -89,6 +91,7 @@ def verify(truth: Truth, x: Array) -> VerifiedDesign:
         inner_gap=float(gap),
         feasible=acceptable(problem, x, design),
         unsuspended=unsuspended,
+        references=check_references(problem, theta, final),
     )
 
 

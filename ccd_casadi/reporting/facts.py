@@ -91,6 +91,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
             f"{proof} ({poles}); {norm}",
         ),
         *_without_suspension(r),
+        *_references(r),
         *_optimality(r),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]
@@ -113,6 +114,23 @@ def _without_suspension(r: Mapping[str, Any]) -> list[Fact]:
             f"{number(free['sensitivity_peak'], 5)}",
         )
     ]
+
+
+def _references(r: Mapping[str, Any]) -> list[Fact]:
+    """The same controller on closer models of the plant."""
+    facts = []
+    for name, found in r.get("references", {}).items():
+        value = "NOT robust to it"
+        remark = f"same controller, same bound on the norm: {found['reason']}"
+        if found["bandwidth_hz"] is not None:
+            change = 100.0 * (found["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
+            value = f"{number(found['bandwidth_hz'], 5)} Hz ({change:+.2f} %)"
+            remark += (
+                f"; peak of S {number(found['sensitivity_peak'], 5)}, norm "
+                f"{number(found['gamma'], 6)}"
+            )
+        facts.append((f"On the plant with {name}", value, remark))
+    return facts
 
 
 def _optimality(r: Mapping[str, Any]) -> list[Fact]:

@@ -51,6 +51,8 @@ class RibStage:
                 raise StageError("an actuator or a sensor is off the stage; move it inside")
             if self.outputs == "modal4" and len(points) != 4:
                 raise StageError("modal4 needs four actuators and four sensors")
+            if self.outputs != "corners":
+                orthonormal_directions(points, 3)
 
     @property
     def actuator_points(self) -> tuple[Point, ...]:

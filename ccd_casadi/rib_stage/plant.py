@@ -11,9 +11,10 @@ from ccd_casadi.rib_stage.geometry import NAMES, Geometry, Material, Point, Poin
 from ccd_casadi.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.rib_stage.model import RibStage
 from ccd_casadi.rib_stage.solver import StageError
-from ccd_casadi.rib_stage.truncation import TWENTY
+from ccd_casadi.rib_stage.truncation import TWENTY, ModeCount
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
+MODES = {10: ModeCount(), 20: TWENTY}
 Points = Sequence[Sequence[float]]
 
 
@@ -22,6 +23,7 @@ def rib_stage(
     zeta: float = 0.01,
     outputs: str = "corners",
     mesh: str = "shipped",
+    modes: int = 10,
     side: float = 0.3,
     young: float = 68.9e9,
     poisson: float = 0.33,
@@ -35,12 +37,15 @@ def rib_stage(
 
     `actuators` and `sensors` are points [x, y] of the lower face in m (none: the corners),
     `point_masses` are [x, y, mass] in m and kg. Hardware cost: mass in kg; λ: the bays.
-    References: the same stage on a finer mesh, and with 20 flexible modes.
+    `modes` flexible ones are kept, 10 or 20. References: the same stage on a finer mesh and
+    with 20 flexible modes, so far as it is not that itself.
     """
     if sorted(names) != sorted(NAMES):
         raise StageError(f"rib_stage has the parameters {', '.join(NAMES)}; give all of them")
     if mesh not in MESHES:
         raise StageError(f"mesh is {mesh!r}; choose one of {', '.join(MESHES)}")
+    if modes not in MODES:
+        raise StageError(f"modes is {modes!r}; choose 10 or 20")
     geometry = Geometry(
         side=side,
         material=Material(young, poisson, density),
@@ -53,6 +58,7 @@ def rib_stage(
         actuators=_points(actuators, "actuators"),
         sensors=_points(sensors, "sensors"),
         outputs=outputs,
+        modes=MODES[modes],
         damping_ratio=zeta,
     )
     return plant_of_stage(stage, names)
@@ -69,9 +75,11 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     theta = ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[i] for i in place])
     count = {"rigid": 3, "modal4": 4}.get(stage.outputs)
-    references = {"20 flexible modes": replace(stage, modes=TWENTY)}
+    references = {}
+    if stage.modes != TWENTY:
+        references["20 flexible modes"] = replace(stage, modes=TWENTY)
     if stage.order != FINE:
-        references["finer mesh"] = replace(stage, order=FINE)
+        references["a finer mesh"] = replace(stage, order=FINE)
     return Plant(
         names=tuple(names),
         constraint_names=tuple(constraints),
