@@ -10,6 +10,7 @@ from ccd_casadi.case import HZ
 from ccd_casadi.case_toml import case_to_toml
 from ccd_casadi.compare import Comparison, Method
 from ccd_casadi.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.report import stage_sections
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import Loop, figure_gains, loop_data, table_gains
 from ccd_casadi.reporting.maps import figure_landscape
@@ -36,6 +37,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.published_figures import published_sections
 from ccd_casadi.reporting.truths import read_truths
+from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.steepest_descent import Descent
 from ccd_casadi.synthesis import synthesise
 
@@ -55,6 +57,14 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
     if best is not None:
         sections.append(
             Section("Sensitivity, baseline against co-design", _loops(comparison, best))
+        )
+        sections += stage_sections(
+            problem,
+            {
+                LABELS[name]: tuple(comparison.method(name).figures["theta"].values())
+                for name in ("sequential", best)
+                if comparison.method(name).figures.get("theta")
+            },
         )
     for name, descent in histories(comparison).items():
         body = figure_html(
@@ -80,7 +90,7 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
     )
     path = folder / "report.html"
     temporary = folder / "report.html.part"
-    text = page(f"Comparison: {comparison.case.path.name}", sections, head)
+    text = with_turntables(page(f"Comparison: {comparison.case.path.name}", sections, head))
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
     return path

@@ -1,6 +1,7 @@
 """The run report: one self-contained `report.html` about a finished run."""
 
 import os
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ import numpy as np
 
 from ccd_casadi.case import Case
 from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.history import (
@@ -25,6 +26,7 @@ from ccd_casadi.reporting.landscape import (
     landscape_data,
     tables_landscape,
 )
+from ccd_casadi.reporting.limits import limit_sentences, table_limits
 from ccd_casadi.reporting.loops import caption_gains, figure_gains, loop_data, table_gains
 from ccd_casadi.reporting.maps import ThetaPath, figure_landscape, figure_sweep
 from ccd_casadi.reporting.page import (
@@ -45,7 +47,10 @@ from ccd_casadi.reporting.slices import (
     slices_data,
     tables_slices,
 )
+from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_figure
 from ccd_casadi.reporting.truths import Truths, read_truths
+from ccd_casadi.reporting.turntable import with_turntables
+from ccd_casadi.rib_stage.plant import stage_of
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.solve import Solution
@@ -89,11 +94,12 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
         sections = [
             _design(problem, solution),
             _theta(problem, solution, solution.verified, truths),
+            *stage_sections(problem, {"start": problem.start, "optimum": solution.verified.theta}),
             *_loop(problem, solution, solution.verified),
             _history(case, problem, solution, solution.verified),
             _sweep(problem, solution, solution.verified, truths),
         ]
-    return page(title, [*sections, _provenance(case, solution)], head)
+    return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
 
 
 def _reason(solution: "Solution") -> str:
@@ -140,6 +146,22 @@ def _theta(
     return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables_slices(slices)))
 
 
+def stage_sections(
+    problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
+) -> list[Section]:
+    """Drawing and mode shapes of a rib stage, the last of `thetas` in motion; else nothing."""
+    found = {name: stage_of(plant_of(problem), theta) for name, theta in thetas.items()}
+    stages = {name: item for name, item in found.items() if item is not None}
+    if not stages:
+        return []
+    stage, theta = list(stages.values())[-1]
+    drawn = dimensions_figure(stage.geometry, {name: own for name, (_, own) in stages.items()})
+    return [
+        Section("The stage, before and after", drawn),
+        Section(f"Mode shapes: {list(stages)[-1]}", mode_shape_figure(stage, theta)),
+    ]
+
+
 def _loop(
     problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
 ) -> list[Section]:
@@ -156,9 +178,11 @@ def _loop(
     gains = figure_html(
         figure_gains([loop], S_max=S_max), caption_gains(loop, S_max=S_max), table_gains(loop)
     )
+    limits = "\n".join(paragraph(words) for words in limit_sentences(loop))
     bode = figure_html(figure_bode(loop), caption_bode(loop), table_bode(loop))
     return [
         Section("Closed loop: S, KS and T against their bounds", gains),
+        Section("What limits the bandwidth", limits + table_html(table_limits(loop))),
         Section("Plant and controller", bode),
     ]
 

@@ -69,8 +69,8 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
     back = [NAMES.index(name) for name in names]
 
-    def evaluator(variant: RibStage) -> "_Evaluator":
-        return _Evaluator(variant, tuple(place), tuple(back))
+    def evaluator(variant: RibStage) -> "StageEvaluator":
+        return StageEvaluator(variant, tuple(place), tuple(back))
 
     theta = ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[i] for i in place])
@@ -91,7 +91,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     )
 
 
-class _Evaluator:
+class StageEvaluator:
     """θ in the case's order -> Mechanics, derivatives in that order too."""
 
     def __init__(self, stage: RibStage, place: tuple[int, ...], back: tuple[int, ...]) -> None:
@@ -103,6 +103,14 @@ class _Evaluator:
             return found
         M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
         return replace(found, derivatives=(M, D, K, B, C))
+
+
+def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[float, ...]] | None:
+    """The stage behind a plant and θ in the stage's own order; None for another plant."""
+    found = plant.evaluate
+    if not isinstance(found, StageEvaluator):
+        return None
+    return found.stage, tuple(float(theta[i]) for i in found.place)
 
 
 def _points(points: Points, key: str) -> tuple[Point, ...] | None:

@@ -104,7 +104,7 @@ def flexible_modes(pencil: Pencil, rigid: Array, count: int) -> tuple[Array, Arr
     # a fixed start: the same θ gives the same digits
     start = inverse(np.random.default_rng(0).standard_normal(pencil.size))
     M = operator(pencil.mass)
-    ncv = min(pencil.size, 18)
+    ncv = min(pencil.size, max(18, 2 * count + 1))
     try:
         mu, V = eigsh(
             M,

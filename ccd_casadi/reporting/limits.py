@@ -1,0 +1,68 @@
+"""What limits the bandwidth at a design: S, effort or T, and the resonance and zero next to it.
+
+A mixed-sensitivity design at γ has |W_S S|² + |W_KS KS|² + |W_T T|² of about γ² wherever it is
+pressed; the largest of the three shares at a frequency is what holds it there.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.reporting.loops import Loop
+from ccd_casadi.reporting.page import Table, number
+
+PARTS = ("error W_S S", "control effort W_KS KS", "response W_T T")
+
+
+def shares(loop: Loop, hz: float) -> np.ndarray:
+    """(3,) |W_S S|, |W_KS KS|, |W_T T| over γ at a frequency in Hz."""
+    i = int(np.abs(np.log(loop.hz / hz)).argmin())
+    return np.asarray(loop.gains[:, i] / loop.bounds[:, i])
+
+
+def table_limits(loop: Loop) -> Table:
+    """Shares of γ where it matters: below, at and above the bandwidth, and at the peaks of S."""
+    places = [
+        ("half the bandwidth", 0.5 * loop.bandwidth_hz),
+        ("bandwidth ω_b", loop.bandwidth_hz),
+        ("twice the bandwidth", 2.0 * loop.bandwidth_hz),
+        *(("peak of S", hz) for hz, gain in loop.peaks if gain > 1.05),
+    ]
+    rows = []
+    for name, hz in sorted(places, key=lambda place: place[1]):
+        found = shares(loop, hz)
+        rows.append((name, hz, *(float(v) for v in found), PARTS[int(found.argmax())]))
+    return Table(("where", "Hz", "W_S S / γ", "W_KS KS / γ", "W_T T / γ", "largest"), tuple(rows))
+
+
+def limit_sentences(loop: Loop) -> list[str]:
+    """What holds ω_b, and what stands where S is largest."""
+    found = shares(loop, loop.bandwidth_hz)
+    order = np.argsort(found)[::-1]
+    words = [
+        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz the {PARTS[order[0]]} takes "
+        f"{100 * found[order[0]]:.0f} % of γ, the {PARTS[order[1]]} {100 * found[order[1]]:.0f} %."
+    ]
+    tops = [peak for peak in loop.peaks if peak[1] > 1.05]
+    if tops:
+        hz, gain = max(tops, key=lambda peak: peak[1])
+        near = [
+            f"the nearest {kind} of the plant at {number(value, 4)} Hz"
+            for kind, value in (
+                ("resonance", _nearest(loop.resonances_hz, hz)),
+                ("transmission zero", _nearest(loop.antiresonances_hz, hz)),
+            )
+            if np.isfinite(value)
+        ]
+        words.append(f"S is largest, {number(gain, 4)}, at {number(hz, 4)} Hz; " + ", ".join(near))
+        words[-1] = words[-1].rstrip("; ") + "."
+    below = [f for f in loop.resonances_hz if f < loop.bandwidth_hz]
+    close = [f for f in loop.resonances_hz if loop.bandwidth_hz <= f < 2.0 * loop.bandwidth_hz]
+    if below or close:
+        listed = ", ".join(number(f, 4) for f in (*below, *close))
+        words.append(f"Controlled resonances, below twice the bandwidth: {listed} Hz.")
+    return words
+
+
+def _nearest(values: Sequence[float], hz: float) -> float:
+    return min(values, key=lambda v: abs(np.log(v / hz)), default=np.nan)
