@@ -7,6 +7,7 @@ import numpy as np
 
 from ccd_casadi.problem import CoDesignProblem
 from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.units import shown_unit
 
 HZ = 2.0 * np.pi
 Fact = tuple[str, str, str]
@@ -36,10 +37,11 @@ def conclusion(result: Mapping[str, Any]) -> str:
 def theta_words(result: Mapping[str, Any]) -> str:
     """`m1 = 55 kg, m2 = 55 kg`."""
     units = result.get("units", {})
-    return ", ".join(
-        f"{name} = {number(value)} {units.get(name, '')}".strip()
-        for name, value in result["theta"].items()
-    )
+    words = []
+    for name, value in result["theta"].items():
+        unit, factor = shown_unit(units.get(name, ""), value)
+        words.append(f"{name} = {number(factor * value)} {unit}".strip())
+    return ", ".join(words)
 
 
 def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
@@ -49,8 +51,9 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         value, low, high = result["theta"][name], problem.lower[i], problem.upper[i]
         share = (value - low) / (high - low)
         place = "at lower" if share <= 1e-6 else "at upper" if share >= 1 - 1e-6 else "inside"
-        unit = problem.units[i] or "–"
-        rows.append((name, unit, float(value), float(low), float(high), problem.start[i], place))
+        unit, factor = shown_unit(problem.units[i], high)
+        numbers = (factor * float(v) for v in (value, low, high, problem.start[i]))
+        rows.append((name, unit or "–", *numbers, place))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
     return Table(head, tuple(rows))
 
@@ -184,8 +187,9 @@ def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> 
         elif end in ("lower", "upper") and variable in problem.names:
             i = problem.names.index(variable)
             value = (problem.lower if end == "lower" else problem.upper)[i]
-            width, unit = problem.upper[i] - problem.lower[i], problem.units[i]
-            words = f"{variable} is at its {end} bound, {number(value)} {unit}".rstrip()
+            unit, factor = shown_unit(problem.units[i], problem.upper[i])
+            width = factor * (problem.upper[i] - problem.lower[i])
+            words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
             step = 0.01 * width
             side = f"moving the bound outwards by {number(step, 3)} {unit}".rstrip()
             gain = _gain(multiplier, 0.01, side)

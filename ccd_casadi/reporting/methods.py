@@ -11,6 +11,7 @@ from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import CYCLE, axis_label
+from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.steepest_descent import Descent
 
 LABELS = {
@@ -89,15 +90,16 @@ def figure_histories(problem: CoDesignProblem, descent: Descent, *, key: str) ->
     """θ, J, hardware cost and bandwidth over the iterations of a descent (figures 9 and 10)."""
     items = descent.iterates
     steps = np.arange(len(items), dtype=float)
-    theta = np.array([item.theta for item in items])
+    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
+    theta = np.array([item.theta for item in items]) * [factor for _, factor in shown]
     J = np.array([item.objective for item in items])
     bandwidth = np.array([item.bandwidth for item in items]) / HZ
     cost = (J - problem.w2 * HZ * bandwidth) / problem.w1 if problem.w1 > 0.0 else None
     parameters = tuple(
         Curve(steps, theta[:, k], axis_label(name, unit), CYCLE[k % len(CYCLE)], marker=".")
-        for k, (name, unit) in enumerate(zip(problem.names, problem.units, strict=True))
+        for k, (name, unit) in enumerate(zip(problem.names, (u for u, _ in shown), strict=True))
     )
-    units = {unit for unit in problem.units if unit}
+    units = {unit for unit, _ in shown if unit}
     y = f"parameters ({units.pop()})" if len(units) == 1 else "parameters (own units)"
     x = "iteration (–)"
     lower = [

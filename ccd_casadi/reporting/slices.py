@@ -10,6 +10,7 @@ from ccd_casadi.reporting.lines import Array, Band, Curve, Level, Panel, figure_
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
 from ccd_casadi.reporting.truths import Truths, feasible
+from ccd_casadi.reporting.units import shown_unit
 from surrogates import GaussianProcess
 
 HZ = 2.0 * np.pi
@@ -59,10 +60,10 @@ def slices_data(
         away = np.abs((known - np.array(theta)) / (upper - lower))
         away[:, k] = 0.0
         near = (away.max(axis=1) <= NEARBY) & np.isfinite(values)
-        dots = np.column_stack([known[near, k], values[near]])
-        found.append(
-            Slice(name, problem.units[k], axis, bandwidth, deviation, dots, float(theta[k]))
-        )
+        unit, factor = shown_unit(problem.units[k], upper[k])
+        dots = np.column_stack([factor * known[near, k], values[near]])
+        at = factor * float(theta[k])
+        found.append(Slice(name, unit, factor * axis, bandwidth, deviation, dots, at))
     return found
 
 
