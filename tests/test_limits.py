@@ -1,0 +1,43 @@
+"""What limits the bandwidth: shares of γ that a certificate bounds, and the figures named."""
+
+import numpy as np
+import pytest
+from helpers import HZ, problem, two_mass
+
+from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
+from ccd_casadi.reporting.loops import Loop, loop_data
+from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.synthesis import synthesise
+
+
+@pytest.fixture(scope="module")
+def loop() -> Loop:
+    plant, weights = two_mass(60.0, 60.0), problem().weights.at(HZ * 800.0, HZ * 40.0)
+    design = synthesise(plant, weights, omega_low=HZ)
+    return loop_data(
+        plant, design.controller, weights, gamma=design.figures.gamma,
+        bandwidth_hz=design.figures.bandwidth / HZ, omega_low=HZ,
+    )  # fmt: skip
+
+
+def test_no_share_exceeds_the_certified_norm(loop: Loop) -> None:
+    found = np.array([shares(loop, hz) for hz in loop.hz])
+    assert found.max() <= 1.0
+    assert np.sqrt((found**2).sum(axis=1)).max() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_words_name_the_zero_that_limits_case_a(loop: Loop) -> None:
+    words = " ".join(limit_sentences(loop))
+    assert "At ω_b = 55.66 Hz the error W_S S takes" in words
+    assert "transmission zero of the plant at 147.9 Hz" in words
+    table = table_limits(loop)
+    places = [row[0] for row in table.rows]
+    assert places[:2] == ["half the bandwidth", "bandwidth ω_b"]
+    assert places.count("peak of S") >= 1
+    assert all(0.0 < value < 1.0 for row in table.rows for value in row[2:5])
+
+
+def test_lengths_of_a_stage_are_shown_in_mm() -> None:
+    assert shown_unit("m", 95e-3) == ("mm", 1e3)
+    assert shown_unit("m", 2.0) == ("m", 1.0)
+    assert shown_unit("kg", 1e-3) == ("kg", 1.0)
