@@ -176,6 +176,24 @@ def test_gradient_of_the_bound_at_a_sharp_transmission_zero() -> None:
     assert elasticities(design, theta)[3, 1] == pytest.approx(found[0], rel=ACCURACY)
 
 
+# Elasticities of an ill-conditioned plant's figures to c_K and ω_K in arithmetic of 130 digits: the
+# Hamiltonian's sign function, γ_opt by the secant method, central differences of 1e-25.
+LONG_ARITHMETIC = (
+    (-4.55206272e-06, 2.87513905e-02),
+    (-1.02576399e-06, 1.80182880e-02),
+    (4.53598763e-06, -2.86510525e-02),
+    (4.53743118e-06, -2.86599285e-02),
+)
+
+
+def test_gradients_to_the_force_weight_where_differences_drown_in_rounding() -> None:
+    case = flexible_case(7)
+    design = sensitivities(case.plant, case.weights, omega_low=OMEGA_LOW)
+    found = elasticities(design, np.array(case.theta))
+    columns = [2 + WEIGHTS.index("c_K"), 2 + WEIGHTS.index("omega_K")]
+    np.testing.assert_allclose(found[:, columns], LONG_ARITHMETIC, rtol=ACCURACY, atol=1e-8)
+
+
 @pytest.mark.slow
 def test_total_derivatives_of_fifty_flexible_plants() -> None:
     results = [flexible_errors(seed) for seed in range(50)]

@@ -22,7 +22,7 @@ from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.pullback import bound_gradient, filter_jacobian, to_plant_and_weights
+from ccd_casadi.kernels.pullback import bound_gradient, gain_to_weights, to_plant, to_weights
 from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian, riccati_level
 
 
@@ -39,52 +39,43 @@ def _column(M, v):
 
 
 @compiled
-def _riccati_terms(XL, L, V, F, C1, d1, d2, p, m):
-    """Gradients of tr(L E) to A, B1, B2, C1, d1, d2, and to t, E the Riccati's differential."""
-    A_ = 2.0 * XL
-    B1_ = 2.0 * XL @ V.T
-    B2_ = 2.0 * XL @ F.T
-    C1_ = 2.0 * C1 @ L
-    LV, LF = L @ V.T, L @ F.T
-    C1_[:p, :] += 2.0 * d1 * LV.T
-    C1_[p : p + m, :] += 2.0 * d2 * LF.T
-    d1_ = 2.0 * np.sum(C1[:p] * LV.T)
-    d2_ = 2.0 * np.sum(C1[p : p + m] * LF.T) + 2.0 * d2 * np.sum(F * LF.T)
-    t_ = -np.sum(V * LV.T)
-    return A_, B1_, B2_, C1_, d1_, d2_, t_
+def _riccati_terms(T11, U1, U2, L, gp, t):
+    """Gradients of tr(Λ E) to A, B2, C1 and γ², E the Riccati's differential in the basis of U.
+
+    E is the stationary value of 2 pᵀẋ + zᵀz - γ² wᵀw over u and the disturbance w, so that only
+    what stands in ẋ and z counts. The gradients to A and C1 are p xᵀ and z xᵀ summed over Λ; with
+    each comes the sum with ẋ for x.
+    """
+    _, B1, B2, C1, _, d1, d2 = gp
+    p, m = B1.shape[1], B2.shape[1]
+    V = (np.ascontiguousarray(B1.T) @ U2 + d1 * (C1[:p] @ U1)) / t
+    F = -(np.ascontiguousarray(B2.T) @ U2 + d2 * (C1[p : p + m] @ U1)) / d2**2
+    Z = C1 @ U1
+    Z[:p] += d1 * V
+    Z[p : p + m] += d2 * F
+    states, rates = np.ascontiguousarray(U1.T), np.ascontiguousarray((U1 @ T11).T)
+    costate, output = 2.0 * (U2 @ L), 2.0 * (Z @ L)
+    A_, A_rate, B2_ = costate @ states, costate @ rates, costate @ np.ascontiguousarray(F.T)
+    return A_, A_rate, B2_, output @ states, output @ rates, -np.sum(V * (V @ L))
 
 
 @compiled
 def gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency):
-    """Gradients of γ_opt to A, B, C, the filter table and directly to w; and ok."""
-    _, B1, B2, C1, _, d1, d2 = gp
-    m, p = B.shape[1], C.shape[0]
+    """Gradients of γ_opt to A, B, C and w; and ok."""
+    _, B1, _, C1, _, d1, _ = gp
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
     if limited:
         A_, B_, C_, w_ = bound_gradient(A, B, C, w, bound_frequency)
-        return A_, B_, C_, np.zeros((3, 4)), w_, True
+        return A_, B_, C_, w_, True
     t = gamma_opt**2 - d1**2
     _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t)
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
-    V = (B1.T @ U2 + d1 * (C1[:p] @ U1)) / t
-    F = -(B2.T @ U2 + d2 * (C1[p : p + m] @ U1)) / d2**2
-    # in the basis of U: X L -> U2 Λ U1ᵀ, L -> U1 Λ U1ᵀ, V -> V_u U1⁻¹
-    UL = U1 @ Lq
-    A_ = 2.0 * (U2 @ Lq) @ U1.T
-    B1_ = 2.0 * (U2 @ Lq) @ V.T
-    B2_ = 2.0 * (U2 @ Lq) @ F.T
-    C1_ = 2.0 * C1 @ (UL @ U1.T)
-    C1_[:p, :] += 2.0 * d1 * (UL @ V.T).T
-    C1_[p : p + m, :] += 2.0 * d2 * (UL @ F.T).T
-    d1_ = 2.0 * np.sum(C1[:p] * (UL @ V.T).T)
-    d2_ = 2.0 * np.sum(C1[p : p + m] * (UL @ F.T).T) + 2.0 * d2 * np.sum(F * (F @ Lq))
-    # t moves so that f stays zero: dt = <…>/tr(V Λ Vᵀ), and dt = 2 γ dγ - 2 d1 dd1
-    scale = 1.0 / (np.sum(V * (V @ Lq)) * 2.0 * gamma_opt)
-    d1_ = d1_ * scale + d1 / gamma_opt
-    C2_ = np.zeros((p, B1.shape[0]))
-    a, b, c, F_ = to_plant_and_weights(
-        A_ * scale, B1_ * scale, B2_ * scale, C1_ * scale, C2_, d1_, d2_ * scale, f, C, m
-    )  # fmt: skip
-    return a, b, c, F_, np.zeros(8), ok
+    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lq, gp, t)
+    A_, B_, C_ = to_plant(Ar, B2r, C1r, np.zeros((p, B1.shape[0])), f, C, m)
+    w_ = to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
+    # γ moves so that f stays zero
+    scale = -1.0 / (level * 2.0 * gamma_opt)
+    return scale * A_, scale * B_, scale * C_, scale * w_, ok
 
 
 @compiled
@@ -114,7 +105,7 @@ def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
     lK, rK = aG @ CK, KB @ b
     # dG/dω = -j C M⁻² B, dK/dω likewise
     slope = -(-1j * (np.sum(lG * rG) + np.sum(lK * rK))).real
-    return a, b, Kb, aG, lG, rG, lK, rK, slope, s[0], gap
+    return a, Kb, aG, lG, rG, lK, rK, slope, s[0], gap
 
 
 @compiled
@@ -132,12 +123,7 @@ def figure_gradients(A, B, C, w, gp, H0, f, backoff, gamma_opt, limited, bound_f
     w_ = np.zeros((k + 1, 8))
     fixed_A, fixed_B, fixed_C = np.zeros((k, n, n)), np.zeros((k, n, m)), np.zeros((k, p, n))
     slopes, gains, gaps = np.zeros(k), np.zeros(k), np.zeros(k)
-    J = filter_jacobian(w)
-    ga, gb, gc, gF, gw, ok = gamma_gradient(
-        A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency
-    )
-    for j in range(8):
-        gw[j] += np.sum(gF * J[:, :, j])
+    ga, gb, gc, gw, ok = gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency)
     A_[k], B_[k], C_[k], w_[k] = ga, gb, gc, gw
     gamma = backoff * gamma_opt
     t = gamma**2 - d1**2
@@ -147,36 +133,35 @@ def figure_gradients(A, B, C, w, gp, H0, f, backoff, gamma_opt, limited, bound_f
     X = U2 @ inverse
     X = 0.5 * (X + X.T)
     F = -(B2.T @ X + d2 * C1[p : p + m]) / d2**2
-    V = (B1.T @ X + d1 * C1[:p]) / t
     Ak = Ag + B2 @ F - B1 @ C2
+    K_states = slice(n + p, n + p + m)  # of W2
     for i in range(k):
-        a, b, Kb, aG, lG, rG, lK, rK, slopes[i], gains[i], gaps[i] = _gain_cotangents(
+        a, Kb, aG, lG, rG, lK, rK, slopes[i], gains[i], gaps[i] = _gain_cotangents(
             A, B, C, Ak, B1, F, points[i]
         )
         fixed_A[i] = -np.outer(lG, rG).real
         fixed_B[i] = -np.outer(lG, Kb).real
         fixed_C[i] = -np.outer(a, rG).real
-        F_ = -np.outer(aG + _row(lK, B2), rK).real
+        h = aG + _row(lK, B2)
+        XrK = _column(X, rK)
+        F_ = -np.outer(h, rK).real
         X_ = -(B2 @ F_) / d2**2
         X_ = 0.5 * (X_ + X_.T)
         Lh = lyapunov_triangular(T11, -(inverse @ X_) @ inverse.T, False)
-        L = U1 @ Lh @ U1.T
-        Ar, B1r, B2r, C1r, d1r, d2r, tr = _riccati_terms(X @ L, L, V, F, C1, d1, d2, p, m)
+        Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
+        rate = 1j * points[i] * rK
         Ar -= np.outer(lK, rK).real
-        B1r -= np.outer(lK, b - _column(C2, rK)).real
-        B2r -= np.outer(lK, _column(F, rK)).real + X @ F_.T / d2**2
+        Ar_rate -= np.outer(lK, rate).real
+        B2r += (np.outer(XrK, h) / d2**2 - np.outer(lK, _column(F, rK))).real
         C2r = np.outer(_row(lK, B1), rK).real
-        C1r[p : p + m, :] -= F_ / d2
-        # d(d2) through F: -C12/d2² - 2F/d2
-        d2r -= np.sum(F_ * (C1[p : p + m] / d2**2 + 2.0 * F / d2))
-        d1r -= 2.0 * d1 * tr
-        pa, pb, pc, F3 = to_plant_and_weights(Ar, B1r, B2r, C1r, C2r, d1r, d2r, f, C, m)
-        through = 2.0 * gamma * backoff * tr
+        pa, pb, pc = to_plant(Ar, B2r, C1r, C2r, f, C, m)
+        pw = to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
+        pw += gain_to_weights(h, rK[K_states], XrK[K_states], rate[K_states], f, w)
+        through = 2.0 * gamma * backoff * level
         A_[i] = fixed_A[i] + pa + through * ga
         B_[i] = fixed_B[i] + pb + through * gb
         C_[i] = fixed_C[i] + pc + through * gc
-        for j in range(8):
-            w_[i, j] = np.sum(F3 * J[:, :, j]) + through * gw[j]
+        w_[i] = pw + through * gw
     return A_, B_, C_, w_, slopes, gains, gaps, fixed_A, fixed_B, fixed_C, ok
 
 

@@ -7,57 +7,68 @@ from ccd_casadi.kernels.generalized_plant import weight_magnitudes
 
 
 @compiled
-def to_plant_and_weights(A_, B1_, B2_, C1_, C2_, d1_, d2_, f, C, m):
-    """Pull gradients of the generalized plant back to A, B, C and the 3 x 4 filter table."""
+def to_plant(A_, B2_, C1_, C2_, f, C, m):
+    """Pull gradients of the generalized plant back to A, B and C."""
     p, n = C.shape
     i1, i2, i3 = n, n + p, n + p + m
-    A = A_[:n, :n].copy()
-    B = B2_[:n, :].copy()
     C_ = -C2_[:, :n].copy()
     C_ -= f[0, 3] * C1_[:p, :n]
     C_ += f[2, 3] * C1_[p + m :, :n]
     C_ -= f[0, 1] * A_[i1:i2, :n]
     C_ += f[2, 1] * A_[i3:, :n]
-    F_ = np.zeros((3, 4))
-    F_[0, 3] = d1_ - np.sum(C1_[:p, :n] * C)
-    F_[2, 3] = np.sum(C1_[p + m :, :n] * C)
-    F_[0, 1] = -np.sum(A_[i1:i2, :n] * C)
-    F_[2, 1] = np.sum(A_[i3:, :n] * C)
-    F_[1, 3] = d2_
-    for i in range(p):
-        F_[0, 0] -= A_[i1 + i, i1 + i]
-        F_[0, 1] += B1_[i1 + i, i]
-        F_[0, 2] += C1_[i, i1 + i]
-        F_[2, 0] -= A_[i3 + i, i3 + i]
-        F_[2, 2] += C1_[p + m + i, i3 + i]
-    for i in range(m):
-        F_[1, 0] -= A_[i2 + i, i2 + i]
-        F_[1, 1] += B2_[i2 + i, i]
-        F_[1, 2] += C1_[p + i, i2 + i]
-    return A, B, C_, F_
+    return A_[:n, :n].copy(), B2_[:n, :].copy(), C_
 
 
 @compiled
-def filter_jacobian(w):
-    """d(filter table)/dw, (3, 4, 8), by the complex step: exact to rounding."""
-    J = np.zeros((3, 4, 8))
-    h = 1e-30
-    for k in range(8):
-        z = w.astype(np.complex128)
-        z[k] += 1j * h * w[k]
-        M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = z
-        a = np.array([ω_S * A_S, c_K * ω_K, ω_T / A_u])
-        d = np.array([1.0 / M_S, c_K, 1.0 / A_u])
-        r1, r2 = ω_S * (1.0 - A_S / M_S), c_K * ω_K * (1.0 - c_K)
-        r = np.array([r1, r2, ω_T * (1 / A_l - 1 / A_u) / A_u])
-        for i in range(3):
-            sign = np.sign(r[i].real)
-            root = np.sqrt(r[i] * sign)
-            J[i, 0, k] = a[i].imag / (h * w[k])
-            J[i, 1, k] = root.imag / (h * w[k])
-            J[i, 2, k] = sign * root.imag / (h * w[k])
-            J[i, 3, k] = d[i].imag / (h * w[k])
-    return J
+def _trace(M, row, column, count):
+    """The trace of a block of M."""
+    total = 0.0
+    for i in range(count):
+        total += M[row + i, column + i]
+    return total
+
+
+@compiled
+def to_weights(A_, A_rate, C1_, C1_rate, f, w, n, p, m):
+    """Pull gradients p xᵀ, p ẋᵀ, z xᵀ, z ẋᵀ of costate and output back to the weight vector.
+
+    In ẋ = -a x + b v, z = c x + d v a filter with W(0) = 1 and W(∞) = d = 10⁴ has gradients to
+    a, b, c and d of up to 10⁸ times their sum, which rounding then leaves nothing of. In units of
+    x where b = a the same is ẋ = a (v - x), z = W(0) x + W(∞)(v - x), and v - x is ẋ/a, which
+    the stable subspace gives without a difference.
+    """
+    i1, i2, i3 = n, n + p, n + p + m
+    rate_S, rate_K = _trace(A_rate, i1, i1, p), _trace(A_rate, i2, i2, m)
+    rate_T = _trace(A_rate, i3, i3, p)
+    direct_S = f[0, 3] / f[0, 1] * _trace(C1_rate, 0, i1, p)
+    direct_K = f[1, 3] / f[1, 1] * _trace(C1_rate, p, i2, m)
+    direct_T = f[2, 3] / f[2, 1] * _trace(C1_rate, p + m, i3, p)
+    # A_S moves the pole and W1(0) at once, and far above the pole these two would cancel
+    leak = -f[0, 0] * (_trace(A_, i1, i1, p) + f[0, 3] / f[0, 1] * _trace(C1_, 0, i1, p))
+    static_T = f[2, 0] / (w[5] * f[2, 1]) * _trace(C1_, p + m, i3, p)
+    logarithmic = np.array(
+        [
+            -direct_S, leak, rate_S, rate_K + direct_K,
+            rate_K, -static_T, -rate_T - direct_T, rate_T,
+        ]
+    )  # fmt: skip
+    return logarithmic / w
+
+
+@compiled
+def gain_to_weights(h, x, costate, rate, f, w):
+    """Gradient of -Re(h dF x) to the weight vector through d2² F = -B2ᵀX - D12ᵀC1, X held.
+
+    h is a row, x the states of W2, `costate` their entries of X times the whole state, `rate`
+    ẋ. As in `to_weights`, c x + d F stands as W(0) x + W(∞) ẋ/a.
+    """
+    a, b, d = f[1, 0], f[1, 1], f[1, 3]
+    through_pole = np.sum(h * costate).real * b / d**2
+    through_direct = np.sum(h * (2.0 * rate + a / d * x)).real / b
+    w_ = np.zeros(8)
+    w_[3] = (through_pole + through_direct) / w[3]
+    w_[4] = through_pole / w[4]
+    return w_
 
 
 @compiled
