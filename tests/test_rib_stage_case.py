@@ -123,7 +123,11 @@ def test_the_references_judge_the_same_controller(problem: CoDesignProblem) -> N
     (itself,) = check_references(problem, theta, design, same)
     assert itself.certified
     assert itself.outcome is Outcome.CERTIFIED
-    assert itself.figures.gamma == pytest.approx(design.figures.gamma, rel=1e-9)
+    # the norm of an all but flat loop, each time on a grid around poles found anew
+    assert itself.figures.gamma == pytest.approx(design.figures.gamma, rel=1e-5)
+    assert itself.figures.sensitivity_peak == pytest.approx(
+        design.figures.sensitivity_peak, rel=1e-8
+    )
 
 
 def test_the_least_mass_at_a_first_resonance(problem: CoDesignProblem) -> None:
