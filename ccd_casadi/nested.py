@@ -79,6 +79,8 @@ def solve_nested(
             )
         elif not improved:
             radius *= 0.5
+        elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
+            radius = min(1.0, 2.0 * radius)
     best = _best(problem, samples)
     x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
     final = true_design(problem, best.theta, best.omega_S, best.omega_T)
