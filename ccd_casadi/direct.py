@@ -33,7 +33,9 @@ def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:
     lower, upper = lifted_bounds(problem)
     middle = 0.5 * (lower + upper)
     first = np.array([*problem.start, *middle[-2:]])
-    points = np.vstack([first, design("sobol", lower, upper, max(starts - 1, 1), seed)])
+    points = first[None, :]
+    if starts > 1:
+        points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
     certified = [x for x in points if quantities.at(x).figures.certified]
     try:
         solution = solve_program(program, np.array(certified))
