@@ -1,6 +1,6 @@
 """Smooth surrogates of expensive functions, for use inside CasADi.
 
-Sample (`design`), fit (`fit`), judge (`loo_errors`, `cross_validate`, `diagnose`),
+Sample (`design`), fit (`fit`; a kind, or `kind="auto"`), judge (`assess`, `extrapolation`),
 export (`to_casadi`) and keep (`save`, `load`):
 
 >>> import numpy as np
@@ -15,35 +15,69 @@ The package knows nothing of what the function means. scikit-learn is imported w
 something is fitted and not before.
 """
 
+from surrogates import casadi_members as _casadi_members  # registers their expressions
+from surrogates.assessment import Assessment, assess
 from surrogates.casadi_export import to_casadi
 from surrogates.designs import DesignKind, corners, design, grid, latin_hypercube, sobol
 from surrogates.diagnostics import Diagnosis, Roughness, diagnose
-from surrogates.fitting import fit, fit_outputs
+from surrogates.extrapolation import Extrapolation, extrapolation
+from surrogates.fitting import Kind, fit
 from surrogates.gaussian_process import GaussianProcess, condition, loo_errors
 from surrogates.interface import Surrogate, SurrogateFitError
 from surrogates.kernels import Hyperparameters, Kernel
+from surrogates.network import Network, fit_network
+from surrogates.outputs import fit_outputs
+from surrogates.polynomial import Polynomial, fit_polynomial
+from surrogates.radial_basis import Basis, RadialBasis, fit_radial_basis
+from surrogates.samples import Samples, checked
+from surrogates.selection import Candidate, Choice, choose
 from surrogates.serialise import SurrogateFileError, load, save
+from surrogates.sparse_process import SparseProcess, fit_sparse
+from surrogates.transform import Exponential, Transform
 from surrogates.validation import Errors, cross_validate, errors
 
+del _casadi_members
+
 __all__ = [
+    "Assessment",
+    "Basis",
+    "Candidate",
+    "Choice",
     "DesignKind",
     "Diagnosis",
     "Errors",
+    "Exponential",
+    "Extrapolation",
     "GaussianProcess",
     "Hyperparameters",
     "Kernel",
+    "Kind",
+    "Network",
+    "Polynomial",
+    "RadialBasis",
     "Roughness",
+    "Samples",
+    "SparseProcess",
     "Surrogate",
     "SurrogateFileError",
     "SurrogateFitError",
+    "Transform",
+    "assess",
+    "checked",
+    "choose",
     "condition",
     "corners",
     "cross_validate",
     "design",
     "diagnose",
     "errors",
+    "extrapolation",
     "fit",
+    "fit_network",
     "fit_outputs",
+    "fit_polynomial",
+    "fit_radial_basis",
+    "fit_sparse",
     "grid",
     "latin_hypercube",
     "load",

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
-from surrogates.interface import Surrogate
+from surrogates.interface import Array, Surrogate
 from surrogates.kernels import ROOT5, Kernel
 
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
@@ -37,7 +37,8 @@ def to_casadi(
     optimisation that does not use it.
 
     Raises:
-        ValueError: no surrogates, or surrogates of different numbers of inputs.
+        ValueError: no surrogates, surrogates of different numbers of inputs, or the
+            deviation of one that has none.
         TypeError: no expression is registered for the kind of surrogate.
     """
     members = list(surrogate) if isinstance(surrogate, Sequence) else [surrogate]
@@ -65,9 +66,7 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     lengths = p.length_scales
     n, d = process.X.shape
     unit = (x - ca.DM(process.lower)) / ca.DM(process.upper - process.lower)
-    # Columns are samples: CasADi stores by column, and this repeats x contiguously.
-    z = ca.repmat(unit / lengths, 1, n) - ca.DM((process.X / lengths).T)
-    s = ca.sum1(z * z).T
+    z, s = squared_distances(unit, process.X, lengths)
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
     weights = process.weights.reshape(-1, n)
     total = ca.dot(ca.DM(weights[0]), phi[0])
@@ -86,7 +85,14 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     half = p.signal_variance * solve_triangular(factor, np.eye(len(factor)), lower=True)
     variance = p.signal_variance - ca.sumsqr(ca.mtimes(ca.DM(half), k))
     floor = VARIANCE_FLOOR * p.signal_variance
-    return mean, process.output_scale * ca.sqrt(ca.fmax(variance, floor))
+    return mean, process.band * process.output_scale * ca.sqrt(ca.fmax(variance, floor))
+
+
+def squared_distances(unit: ca.MX, X: Array, lengths: Array) -> tuple[ca.MX, ca.MX]:
+    """Return z (d, n) = (x̂ - X_i) / lengths and s (n, 1) = ‖z‖² at the symbol x̂ (d)."""
+    # Columns are samples: CasADi stores by column, and this repeats x contiguously.
+    z = ca.repmat(unit / lengths, 1, len(X)) - ca.DM((X / lengths).T)
+    return z, ca.sum1(z * z).T
 
 
 def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:

@@ -4,7 +4,7 @@ Source: Rasmussen & Williams, Gaussian Processes for Machine Learning (2006),
 algorithm 2.1 (prediction), section 9.4 (derivatives), eq. 5.12 (leave one out).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, overload
 
@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
-from surrogates.interface import Array, SurrogateFitError, box
+from surrogates.interface import Array, box, freeze, points_in
 from surrogates.kernels import Hyperparameters, Kernel, covariance
 from surrogates.likelihood import factorise, symmetric_inverse
+from surrogates.samples import Samples, checked
 from surrogates.validation import Errors, errors
 
 # Rounding leaves the predictive variance at noise-free samples anywhere within a
 # few eps of zero, of either sign; below this share of σ² it is taken as the floor.
 VARIANCE_FLOOR = 1e-20
+TWO_SIDED_95 = 1.959963984540054
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,9 @@ class GaussianProcess:
     targets: scaled values (n,), or values then gradients by component (n (1 + d),).
     weights: α = K⁻¹ targets. jitter: what the factorisation needed on its diagonal.
     loo: closed-form leave-one-out errors, hyperparameters and scales kept.
+    sample_noise: variances (n,) in scaled units of samples that differ in their noise,
+    on top of the one in the hyperparameters; empty (0,) where they do not.
+    band: the factor on the predicted deviation that `bands.calibrated` found, 1 without it.
     """
 
     kernel: Kernel
@@ -48,6 +53,8 @@ class GaussianProcess:
     weights: Array
     jitter: float
     loo: Errors
+    sample_noise: Array = field(default_factory=lambda: np.empty(0))
+    band: float = 1.0
 
     def __post_init__(self) -> None:
         d = box(self.lower, self.upper)[0].size
@@ -58,8 +65,19 @@ class GaussianProcess:
             raise ValueError(f"{self.targets.shape} targets fit neither values nor gradients")
         if self.weights.shape != self.targets.shape:
             raise ValueError("there must be one weight to each target")
-        for array in (self.lower, self.upper, self.X, self.targets, self.weights):
-            array.flags.writeable = False  # shared with whoever holds the surrogate
+        if self.sample_noise.shape not in ((0,), (n,)):
+            raise ValueError("there must be one noise to each sample, or none")
+        freeze(self.lower, self.upper, self.X, self.targets, self.weights, self.sample_noise)
+
+    @property
+    def has_std(self) -> bool:
+        """A process knows its deviation."""
+        return True
+
+    @cached_property
+    def left_out(self) -> Array:
+        """Leave-one-out residuals (n,), output units."""
+        return loo_errors(self)[0]
 
     @property
     def has_gradients(self) -> bool:
@@ -72,7 +90,12 @@ class GaussianProcess:
         # Recomputed rather than stored, O(n²) numbers that follow from O(n). Another
         # machine may round differently and need a little more jitter than was found.
         return factorise(
-            self.kernel, self.X, self.hyperparameters, self.has_gradients, self.jitter
+            self.kernel,
+            self.X,
+            self.hyperparameters,
+            self.has_gradients,
+            self.jitter,
+            self.sample_noise,
         )[0]
 
     @property
@@ -98,15 +121,13 @@ class GaussianProcess:
     def predict(self, X: ArrayLike, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Return the mean (m,) at X (m, d), and the standard deviation (m,) if asked.
 
-        mean = k̂ᵀ α, var = σ² - ‖L⁻¹ k̂‖², in output units; the deviation is that of
+        mean = k̂ᵀ α, var = band² (σ² - ‖L⁻¹ k̂‖²), in output units; the deviation is that of
         the function itself, measurement noise not added.
 
         Raises:
             ValueError: X does not have the inputs of the box.
         """
-        points = np.atleast_2d(np.asarray(X, dtype=float))
-        if points.ndim != 2 or points.shape[1] != self.lower.size:
-            raise ValueError(f"expected points (m, {self.lower.size}), got {points.shape}")
+        points = points_in(self, X)
         p = self.hyperparameters
         k = p.signal_variance * covariance(
             self.kernel,
@@ -121,7 +142,7 @@ class GaussianProcess:
         v = solve_triangular(self.factor, k.T, lower=True)
         variance = p.signal_variance - np.einsum("ab,ab->b", v, v)
         floor = VARIANCE_FLOOR * p.signal_variance
-        return mean, self.output_scale * np.sqrt(np.maximum(variance, floor))
+        return mean, self.band * self.output_scale * np.sqrt(np.maximum(variance, floor))
 
 
 def condition(
@@ -133,24 +154,35 @@ def condition(
     upper: ArrayLike,
     kernel: Kernel | str = Kernel.MATERN52,
     dY: ArrayLike | None = None,
+    noise: ArrayLike | None = None,
 ) -> GaussianProcess:
     """Condition a process of given (scaled) hyperparameters on samples.
 
-    X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X.
+    X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X. `noise` (n,) are
+    standard deviations of Y where the samples differ in it, output units; their
+    variances add to that of the hyperparameters.
 
     Raises:
         SurrogateFitError: wrong shapes, values that are not finite, or a covariance
             that is singular beyond a small jitter.
     """
-    low, high, points, values, slopes = checked(X, Y, lower, upper, dY)
-    mean, scale = output_scaling(values)
-    unit, targets = scaled(low, high, points, values, slopes)
-    family = Kernel(kernel)
-    L, jitter = factorise(family, unit, hyperparameters, slopes is not None)
+    samples = checked(X, Y, lower, upper, dY, noise)
+    own = np.empty(0) if noise is None else samples.noise_variances
+    return conditioned(hyperparameters, samples, Kernel(kernel), own)
+
+
+def conditioned(
+    hyperparameters: Hyperparameters, samples: Samples, kernel: Kernel, sample_noise: Array
+) -> GaussianProcess:
+    """As `condition`, of samples that are checked already."""
+    mean, scale = samples.scaling
+    unit, targets = samples.unit, samples.targets
+    gradients = samples.dY is not None
+    L, jitter = factorise(kernel, unit, hyperparameters, gradients, 0.0, sample_noise)
     process = GaussianProcess(
-        kernel=family,
-        lower=low,
-        upper=high,
+        kernel=kernel,
+        lower=samples.lower,
+        upper=samples.upper,
         output_mean=mean,
         output_scale=scale,
         hyperparameters=hyperparameters,
@@ -159,9 +191,12 @@ def condition(
         weights=cho_solve((L, True), targets),
         jitter=jitter,
         loo=Errors(0.0, 0.0, 0.0),
+        sample_noise=sample_noise,
     )
+    # A copy starts with nothing cached; a factor of a thousand samples would carry 8 MB
+    # along wherever the process is kept.
     residuals, _ = loo_errors(process)
-    return replace(process, loo=errors(residuals, values))
+    return replace(process, loo=errors(residuals, samples.Y))
 
 
 def loo_errors(process: GaussianProcess) -> tuple[Array, Array]:
@@ -171,7 +206,7 @@ def loo_errors(process: GaussianProcess) -> tuple[Array, Array]:
     residual = ((K⁻¹)_{B_i B_i})⁻¹ α_{B_i} and covariance = ((K⁻¹)_{B_i B_i})⁻¹, of
     which the first component is the value. Exact for fixed hyperparameters and
     output scaling; the noise is part of the deviation. Source: R & W eq. 5.12,
-    blockwise.
+    blockwise. The deviations are those of the process before `band`.
     """
     n = len(process.X)
     c = process.targets.size // n
@@ -182,40 +217,3 @@ def loo_errors(process: GaussianProcess) -> tuple[Array, Array]:
     # Positive in exact arithmetic; a nearly singular K may round it below zero.
     variance = np.maximum(selected[:, 0], VARIANCE_FLOOR)
     return process.output_scale * residuals, process.output_scale * np.sqrt(variance)
-
-
-def checked(
-    X: ArrayLike, Y: ArrayLike, lower: ArrayLike, upper: ArrayLike, dY: ArrayLike | None
-) -> tuple[Array, Array, Array, Array, Array | None]:
-    """Return bounds, samples (n, d), values (n,) and gradients (n, d) as float arrays."""
-    try:
-        low, high = box(lower, upper)
-    except ValueError as error:
-        raise SurrogateFitError(str(error)) from error
-    points, values = np.asarray(X, dtype=float), np.asarray(Y, dtype=float)
-    slopes = None if dY is None else np.asarray(dY, dtype=float)
-    if points.ndim != 2 or points.shape[1] != low.size or len(points) < 2:
-        raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
-    if values.shape != (len(points),):
-        raise SurrogateFitError(f"expected Y ({len(points)},), got {values.shape}")
-    if slopes is not None and slopes.shape != points.shape:
-        raise SurrogateFitError(f"expected dY {points.shape}, got {slopes.shape}")
-    if not all(np.isfinite(a).all() for a in (points, values, slopes) if a is not None):
-        raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
-    return low, high, points, values, slopes
-
-
-def output_scaling(values: Array) -> tuple[float, float]:
-    """Return the mean and standard deviation of the values, the latter 1 if they agree."""
-    return float(values.mean()), float(values.std()) or 1.0
-
-
-def scaled(
-    low: Array, high: Array, points: Array, values: Array, slopes: Array | None
-) -> tuple[Array, Array]:
-    """Return samples in the unit box and targets in units of the sample deviation."""
-    mean, scale = output_scaling(values)
-    targets = (values - mean) / scale
-    if slopes is not None:
-        targets = np.concatenate([targets, (slopes * (high - low) / scale).T.ravel()])
-    return (points - low) / (high - low), targets

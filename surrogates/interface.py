@@ -1,14 +1,17 @@
 """What every surrogate of this package offers, and nothing more.
 
-A new member (polynomial, radial basis functions, network) is a frozen dataclass
-with the attributes below, one `casadi_export.expression` registration and one
-entry in `serialise.KINDS`; no other module has to know about it.
+A new member is a frozen dataclass with the attributes below, one
+`casadi_export.expression` registration, one entry in `serialise.KINDS` and one in
+`fitting`; no other module has to know about it.
 """
 
-from typing import Literal, Protocol, overload
+from typing import TYPE_CHECKING, Literal, Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from surrogates.validation import Errors
 
 Array = NDArray[np.float64]
 
@@ -27,6 +30,18 @@ class Surrogate(Protocol):
     @property
     def upper(self) -> Array:
         """Upper bounds (d,) of the sampled box, in input units."""
+
+    @property
+    def has_std(self) -> bool:
+        """Whether it knows a standard deviation of its own prediction."""
+
+    @property
+    def left_out(self) -> Array:
+        """Residuals (n,) of the samples, each predicted without it, in output units."""
+
+    @property
+    def loo(self) -> "Errors":
+        """The errors that `left_out` amounts to."""
 
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
@@ -47,3 +62,26 @@ def box(lower: ArrayLike, upper: ArrayLike) -> tuple[Array, Array]:
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ValueError("bounds must be finite with lower < upper in every input")
     return low, high
+
+
+def points_in(surrogate: Surrogate, X: ArrayLike) -> Array:
+    """Return X as points (m, d) of the surrogate's inputs; a single point (d,) is one row.
+
+    Raises:
+        ValueError: X does not have the inputs of the box.
+    """
+    points = np.atleast_2d(np.asarray(X, dtype=float))
+    if points.ndim != 2 or points.shape[1] != surrogate.lower.size:
+        raise ValueError(f"expected points (m, {surrogate.lower.size}), got {points.shape}")
+    return points
+
+
+def freeze(*arrays: Array) -> None:
+    """Make arrays that whoever holds the surrogate shares read-only."""
+    for array in arrays:
+        array.flags.writeable = False
+
+
+def no_deviation(kind: str) -> ValueError:
+    """Return the error of asking a surrogate for the deviation it does not have."""
+    return ValueError(f"a {kind} has no standard deviation: ask for its value only (std=False)")

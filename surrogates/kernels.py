@@ -16,6 +16,7 @@ import numpy as np
 from surrogates.interface import Array
 
 ROOT5 = 5.0**0.5
+NO_NOISE: Array = np.empty(0)
 
 
 class Kernel(StrEnum):
@@ -116,12 +117,18 @@ def blocks(
 
 
 def observed_covariance(
-    kernel: Kernel, X: Array, parameters: Hyperparameters, gradients: bool, jitter: float
+    kernel: Kernel,
+    X: Array,
+    parameters: Hyperparameters,
+    gradients: bool,
+    jitter: float,
+    sample_noise: Array = NO_NOISE,
 ) -> Array:
     """Return K = σ² C + jitter diag(σ² C) + noise of the observations at X (n, d).
 
-    The jitter is relative to the prior variance of each observation, so that it
-    treats values and gradients, whatever their units, alike.
+    `sample_noise` (n,), or (0,) for none, are variances that add to the common noise.
+    The jitter is relative to the prior variance of each observation, so that it treats
+    values and gradients, whatever their units, alike.
     """
     lengths = parameters.length_scales
     K = covariance(kernel, X, X, lengths, gradients_of_a=gradients, gradients_of_b=gradients)
@@ -130,5 +137,7 @@ def observed_covariance(
     diagonal = np.einsum("ii->i", K)
     diagonal *= 1.0 + jitter
     diagonal[:n] += parameters.noise_variance
+    if sample_noise.size:
+        diagonal[:n] += sample_noise
     diagonal[n:] += parameters.gradient_noise_variance
     return K

@@ -10,6 +10,7 @@ from scipy.linalg.lapack import dpotri
 
 from surrogates.interface import Array, SurrogateFitError
 from surrogates.kernels import (
+    NO_NOISE,
     Hyperparameters,
     Kernel,
     blocks,
@@ -18,16 +19,23 @@ from surrogates.kernels import (
     separations,
 )
 
-# Scaled units. Length scales beyond these are not told apart by samples of a unit
-# box; a signal far above the sample variance is what smooth functions ask for.
-LENGTH_BOUNDS = (1e-2, 1e2)
+# Scaled units. Samples of a unit box do not tell shorter length scales apart, nor longer
+# ones from that of an input without influence (a bound of 100 costs a tenth in error on
+# the OTL circuit function); a signal far above the sample variance is what smooth
+# functions ask for.
+LENGTH_BOUNDS = (1e-2, 1e3)
 SIGNAL_BOUNDS = (1e-3, 1e6)
 NOISE_BOUNDS = (1e-12, 1e0)
 JITTERS = (0.0, *(10.0**k for k in range(-15, -5)))
 
 
 def factorise(
-    kernel: Kernel, X: Array, parameters: Hyperparameters, gradients: bool, least: float = 0.0
+    kernel: Kernel,
+    X: Array,
+    parameters: Hyperparameters,
+    gradients: bool,
+    least: float = 0.0,
+    sample_noise: Array = NO_NOISE,
 ) -> tuple[Array, float]:
     """Return the lower Cholesky factor of K and the relative jitter, >= least, it needed.
 
@@ -36,7 +44,7 @@ def factorise(
             repeated samples with no noise, or parameters that are not finite).
     """
     for jitter in (j for j in JITTERS if j >= least):
-        K = observed_covariance(kernel, X, parameters, gradients, jitter)
+        K = observed_covariance(kernel, X, parameters, gradients, jitter, sample_noise)
         try:
             return cholesky(K, lower=True, overwrite_a=True), jitter
         except (LinAlgError, ValueError):
@@ -45,7 +53,12 @@ def factorise(
 
 
 def log_likelihood(
-    kernel: Kernel, X: Array, targets: Array, parameters: Hyperparameters, jitter: float = 0.0
+    kernel: Kernel,
+    X: Array,
+    targets: Array,
+    parameters: Hyperparameters,
+    jitter: float = 0.0,
+    sample_noise: Array = NO_NOISE,
 ) -> tuple[float, Array]:
     """Return log p(targets | X) and its gradient in the logarithms of the parameters.
 
@@ -60,7 +73,8 @@ def log_likelihood(
     n, d = X.shape
     gradients = targets.size > n
     lengths = parameters.length_scales
-    L = cholesky(observed_covariance(kernel, X, parameters, gradients, jitter), lower=True)
+    K = observed_covariance(kernel, X, parameters, gradients, jitter, sample_noise)
+    L = cholesky(K, lower=True)
     alpha = cho_solve((L, True), targets)
     value = (
         -0.5 * targets @ alpha - np.log(np.diag(L)).sum() - 0.5 * targets.size * np.log(2.0 * np.pi)

@@ -1,16 +1,17 @@
 """Surrogates as JSON files: readable, exact to the bit, and no code inside.
 
-    {"schema": "surrogates/1", "surrogates": [{"kind": ..., ...}], "extra": {...}}
+    {"schema": "surrogates/2", "surrogates": [{"kind": ..., ...}], "extra": {...}}
 
 Python writes the shortest decimal that reads back as the same double, so arrays as
-nested lists lose nothing. The Cholesky factor is not stored but recomputed.
+nested lists lose nothing. The Cholesky factor is not stored but recomputed. Schema 1,
+of processes without noise of their own samples, is read as well.
 """
 
 import json
 import os
 import typing
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,22 @@ import numpy as np
 
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate
+from surrogates.network import Network
+from surrogates.polynomial import Polynomial
+from surrogates.radial_basis import RadialBasis
+from surrogates.sparse_process import SparseProcess
+from surrogates.transform import Exponential
 
-SCHEMA = "surrogates/1"
-KINDS: dict[str, type[Any]] = {"gaussian_process": GaussianProcess}
+SCHEMA = "surrogates/2"
+READABLE = (SCHEMA, "surrogates/1")
+KINDS: dict[str, type[Any]] = {
+    "gaussian_process": GaussianProcess,
+    "sparse_process": SparseProcess,
+    "polynomial": Polynomial,
+    "radial_basis": RadialBasis,
+    "network": Network,
+    "exponential": Exponential,
+}
 
 
 class SurrogateFileError(ValueError):
@@ -46,7 +60,7 @@ def save(
     text = json.dumps(
         {
             "schema": SCHEMA,
-            "surrogates": [{"kind": _kind(member), **_encode(member)} for member in members],
+            "surrogates": [_record(member) for member in members],
             "extra": extra or {},
         },
         allow_nan=False,
@@ -77,13 +91,10 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
     except ValueError as error:  # covers JSON, UTF-8 and the refused constants
         raise SurrogateFileError(f"{path}: not a complete JSON file ({error})") from error
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema != SCHEMA:
+    if schema not in READABLE:
         raise SurrogateFileError(f"{path}: expected schema {SCHEMA!r}, found {schema!r}")
     try:
-        members = []
-        for record in document["surrogates"]:
-            body = dict(record)
-            members.append(_decode(KINDS[body.pop("kind")], body))
+        members = [_member(record) for record in document["surrogates"]]
         extra = document["extra"]
         if not isinstance(extra, dict):
             raise TypeError("extra is not an object")
@@ -92,28 +103,50 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
     return tuple(members), extra
 
 
-def _kind(surrogate: Surrogate) -> str:
+def _record(surrogate: Surrogate) -> dict[str, Any]:
     for name, cls in KINDS.items():
         if type(surrogate) is cls:
-            return name
+            return {"kind": name, **_fields(surrogate)}
     raise TypeError(f"cannot save a {type(surrogate).__name__}; known kinds: {sorted(KINDS)}")
 
 
+def _fields(value: Any) -> dict[str, Any]:
+    return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
+
+
 def _encode(value: Any) -> Any:
+    if type(value) in KINDS.values():
+        return _record(value)
     if is_dataclass(value):
-        return {f.name: _encode(getattr(value, f.name)) for f in fields(value)}
+        return _fields(value)
     if isinstance(value, np.ndarray):
         return value.tolist()
+    if isinstance(value, tuple):
+        return [_encode(item) for item in value]
     return value.value if isinstance(value, Enum) else value
 
 
+def _member(record: Any) -> Any:
+    body = dict(record)
+    return _decode(KINDS[body.pop("kind")], body)
+
+
 def _decode(cls: Any, value: Any) -> Any:
+    if cls is Surrogate:
+        return _member(value)
     if is_dataclass(cls):
         hints = typing.get_type_hints(cls)
         names = {f.name for f in fields(cls)}
-        if names != set(value):
+        optional = {
+            f.name
+            for f in fields(cls)
+            if not (f.default is MISSING and f.default_factory is MISSING)
+        }
+        if not names - optional <= set(value) <= names:
             raise ValueError(f"fields differ by {sorted(names ^ set(value))}")
-        return typing.cast(Any, cls)(**{k: _decode(hints[k], value[k]) for k in names})
+        return typing.cast(Any, cls)(**{k: _decode(hints[k], value[k]) for k in sorted(value)})
+    if typing.get_origin(cls) is tuple:
+        return tuple(_decode(typing.get_args(cls)[0], item) for item in value)
     if typing.get_origin(cls) is np.ndarray:
         array = np.array(value, dtype=float)
         if not np.isfinite(array).all():  # null and 1e999 come in as nan and inf

@@ -1,12 +1,13 @@
 """How wrong a surrogate is on samples it has not seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from surrogates.interface import Array, Surrogate
+from surrogates.samples import Samples
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,18 @@ def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
     return Errors(float(np.sqrt(wrong / e.size)), float(np.abs(e).max()), q2)
 
 
+def folds_of(n: int, folds: int, seed: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Yield the rows held out and the rest, fold by fold, of a seeded permutation.
+
+    Raises:
+        ValueError: folds outside 2 ... n.
+    """
+    if not 2 <= folds <= n:
+        raise ValueError(f"folds must lie between 2 and the {n} samples, got {folds}")
+    for held in np.array_split(np.random.default_rng(seed).permutation(n), folds):
+        yield held, np.setdiff1d(np.arange(n), held)
+
+
 def cross_validate(
     fitter: Callable[..., Surrogate],
     X: ArrayLike,
@@ -56,13 +69,32 @@ def cross_validate(
     """
     points, values = np.asarray(X, dtype=float), np.asarray(Y, dtype=float)
     slopes = None if dY is None else np.asarray(dY, dtype=float)
-    if not 2 <= folds <= len(points):
-        raise ValueError(f"folds must lie between 2 and the {len(points)} samples, got {folds}")
     residuals: Array = np.empty(len(points))
-    for held in np.array_split(np.random.default_rng(seed).permutation(len(points)), folds):
-        rest = np.setdiff1d(np.arange(len(points)), held)
+    for held, rest in folds_of(len(points), folds, seed):
         more = {} if slopes is None else {"dY": slopes[rest]}
-        residuals[held] = values[held] - fitter(points[rest], values[rest], **more).predict(
-            points[held]
-        )
+        fitted = fitter(points[rest], values[rest], **more)
+        residuals[held] = values[held] - fitted.predict(points[held])
     return errors(residuals, values)
+
+
+def held_out(
+    fitter: Callable[[Samples], Surrogate], samples: Samples, folds: int, seed: int
+) -> tuple[Array, Array | None]:
+    """Return residuals (n,) of k-fold cross-validation and, if it has them, deviations (n,).
+
+    The noise of a sample, where it is known, is part of its deviation.
+
+    Raises:
+        ValueError: folds outside 2 ... n.
+    """
+    residuals, deviations = np.empty(samples.Y.size), np.full(samples.Y.size, np.nan)
+    for held, rest in folds_of(samples.Y.size, folds, seed):
+        fitted, X = fitter(samples.rows(rest)), samples.X[held]
+        if fitted.has_std:
+            mean, std = fitted.predict(X, return_std=True)
+            noise = 0.0 if samples.noise is None else samples.noise[held]
+            deviations[held] = np.hypot(std, noise)
+        else:
+            mean = fitted.predict(X)
+        residuals[held] = samples.Y[held] - mean
+    return residuals, None if np.isnan(deviations).any() else deviations

@@ -100,7 +100,7 @@ def damage(document: dict, where: str, value: object) -> dict:
 @pytest.mark.parametrize(
     ("where", "value", "message"),
     [
-        ("schema", "surrogates/2", "expected schema"),
+        ("schema", "surrogates/3", "expected schema"),
         ("schema", None, "found None"),
         ("surrogates", {"kind": "x"}, "damaged"),
         ("surrogates", 3, "damaged"),

@@ -23,6 +23,7 @@ from surrogates import (
     fit_outputs,
     loo_errors,
 )
+from surrogates.bands import calibrated
 from surrogates.kernels import covariance, observed_covariance, radial
 from surrogates.likelihood import log_likelihood
 
@@ -351,3 +352,44 @@ def test_prediction_refuses_points_of_other_inputs() -> None:
     gp = fit(X4, Y4, lower=[0.0], upper=[1.0], starts=1)
     with pytest.raises(ValueError, match="expected points"):
         gp.predict(np.ones((3, 2)))
+
+
+@pytest.mark.parametrize("with_gradients", [False, True])
+def test_fitted_mean_is_the_best_linear_unbiased_one(with_gradients: bool) -> None:
+    X = design("lhs", **BOX, n=14, seed=2)
+    Y, dY = smooth(X)
+    gp = fit(X, Y, **BOX, dY=dY if with_gradients else None, starts=1)
+    K = observed_covariance(gp.kernel, gp.X, gp.hyperparameters, with_gradients, gp.jitter)
+    ones = (np.arange(len(K)) < 14).astype(float)
+    # Generalised least squares of what is left about the mean: nothing.
+    left = ones @ np.linalg.solve(K, gp.targets) / (ones @ np.linalg.solve(K, ones))
+    assert abs(left) < 1e-6
+    residuals, _ = loo_errors(gp)
+    assert gp.loo.rms == pytest.approx(np.sqrt(np.mean(residuals**2)))
+
+
+def test_bands_are_stretched_and_never_narrowed() -> None:
+    X = design("sobol", **BOX, n=60, seed=3)
+    Y = smooth(X)[0]
+    fitted = fit(X, Y, **BOX, starts=1)
+    p = fitted.hyperparameters
+    # A hundredth of the variance: too sure of itself by ten, with the same mean.
+    sure = Hyperparameters(p.length_scales, p.signal_variance / 100, p.noise_variance / 100)
+    raw = condition(sure, X, Y, **BOX)
+    assert raw.band == 1.0
+    mended = calibrated(raw)
+    unseen = design("lhs", **BOX, n=500, seed=4)
+    mean, std = mended.predict(unseen, return_std=True)
+    assert np.mean(np.abs(mean - smooth(unseen)[0]) <= 1.96 * std) > 0.85
+    np.testing.assert_allclose(std, mended.band * raw.predict(unseen, return_std=True)[1])
+    vague = Hyperparameters(p.length_scales, 1e4 * p.signal_variance, 1e4 * p.noise_variance)
+    assert calibrated(condition(vague, X, Y, **BOX)).band == 1.0
+    assert calibrated(condition(sure, X[:10], Y[:10], **BOX)).band == 1.0  # too few to tell
+
+
+def test_many_close_samples_without_noise_are_fitted() -> None:
+    # The likelihood's optimum was singular here, which ended in a LinAlgError.
+    X = design("lhs", [0, 0], [1, 1], 700, seed=1)
+    Y = np.sin(2 * X[:, 0] + X[:, 1]) + (X[:, 0] + 2 * X[:, 1]) ** 2 / 2
+    gp = fit(X, Y, lower=[0, 0], upper=[1, 1], noise=0.0, starts=1)
+    assert gp.loo.rms < 1e-4

@@ -1,0 +1,230 @@
+"""Hyperparameters of a process by maximum marginal likelihood.
+
+Values alone go through scikit-learn's regressor; values with gradients, which it
+does not know, through `likelihood.log_likelihood` and L-BFGS-B.
+"""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from surrogates.bands import calibrated, centred
+from surrogates.gaussian_process import GaussianProcess, conditioned
+from surrogates.interface import Array, SurrogateFitError
+from surrogates.kernels import Hyperparameters, Kernel
+from surrogates.likelihood import (
+    LENGTH_BOUNDS,
+    NOISE_BOUNDS,
+    SIGNAL_BOUNDS,
+    log_likelihood,
+)
+from surrogates.samples import Samples
+
+# The likelihood costs O(N³) a look. Several starts are tried on at most START_ORDER
+# observations, the best polished on at most POLISH_ORDER: hyperparameters hardly
+# move beyond that, while all samples are kept in the process itself.
+START_ORDER = 200
+POLISH_ORDER = 600
+# Relative jitter during the search, so that no trial point is lost to rounding.
+SEARCH_JITTER = 1e-13
+# Scaled variances added in the search, until the covariance at its end is definite.
+NUGGETS = (0.0, 1e-10, 1e-8, 1e-6)
+# Observations that an exact process holds: 200 MB and some ten seconds to factorise.
+EXACT_LIMIT = 5000
+
+
+def fit_process(
+    samples: Samples,
+    kernel: Kernel = Kernel.MATERN52,
+    gradient_noise: float | None = None,
+    seed: int = 0,
+    starts: int = 5,
+) -> GaussianProcess:
+    """Return the process that maximises log p(Y, dY | X) (R & W eq. 5.8).
+
+    Over length scales, signal and, where it is not given, noise variance, from
+    `starts` seeded starts; then `centred` and its bands `calibrated`. `gradient_noise` is
+    the deviation of dY (upper - lower), in output units, estimated if None.
+
+    Raises:
+        SurrogateFitError: more observations than an exact process holds, contradictory
+            samples with no noise.
+    """
+    if samples.observations > EXACT_LIMIT:
+        raise SurrogateFitError(
+            f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
+            "Gaussian process holds: use kind='sparse_process' or 'auto', or fewer samples"
+        )
+    parameters = estimate(samples, kernel, gradient_noise, seed, starts)
+    process = conditioned(parameters, samples, kernel, uneven_noise(samples))
+    return calibrated(centred(process))
+
+
+def estimate(
+    samples: Samples,
+    kernel: Kernel,
+    gradient_noise: float | None = None,
+    seed: int = 0,
+    starts: int = 5,
+) -> Hyperparameters:
+    """Return the hyperparameters of `fit_process`, of at most 600 of the observations."""
+    noise, own = None, uneven_noise(samples)
+    if samples.noise is not None:
+        noise = 0.0 if own.size else float(samples.noise_variances[0])
+    rng = np.random.default_rng(seed)
+    if samples.dY is None:
+        return _by_scikit_learn(kernel, samples.unit, samples.targets, noise, own, rng, starts)
+    slope_noise = None
+    if gradient_noise is not None:
+        slope_noise = (gradient_noise / samples.scaling[1]) ** 2
+    return _by_joint_likelihood(
+        kernel, samples.unit, samples.targets, [noise, slope_noise], own, rng, starts
+    )
+
+
+def uneven_noise(samples: Samples) -> Array:
+    """Return noise variances (n,) where the samples differ in them, (0,) where they do not."""
+    # Equal but for rounding, as noise / Y of a relative noise is, counts as equal.
+    if samples.noise is None or np.ptp(samples.noise) <= 1e-9 * samples.noise.max():
+        return np.empty(0)
+    return samples.noise_variances
+
+
+def _by_scikit_learn(
+    kernel: Kernel,
+    X: Array,
+    y: Array,
+    noise: float | None,
+    own: Array,
+    rng: np.random.Generator,
+    starts: int,
+) -> Hyperparameters:
+    """Maximise the marginal likelihood of values with scikit-learn's regressor."""
+    # Imported here: it takes longer than the rest of the package together, and
+    # nobody who only reloads and evaluates a surrogate needs it.
+    from scipy.linalg import LinAlgError
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+
+    lengths = np.full(X.shape[1], 0.5)
+    shape = (
+        RBF(lengths, LENGTH_BOUNDS)
+        if kernel is Kernel.RBF
+        else Matern(lengths, LENGTH_BOUNDS, nu=2.5)
+    )
+    covariance = ConstantKernel(1.0, SIGNAL_BOUNDS) * shape
+    if noise is None:
+        covariance = covariance + WhiteKernel(1e-6, NOISE_BOUNDS)
+    known = own if own.size else np.full(len(X), noise or 0.0)
+    floor = np.maximum(known, NOISE_BOUNDS[0])
+    order = rng.permutation(len(X))
+
+    def search(initial: Any, rows: NDArray[np.intp]) -> tuple[float, Any]:
+        for more in NUGGETS:
+            regressor = GaussianProcessRegressor(initial, alpha=np.maximum(floor[rows], more))
+            try:
+                with warnings.catch_warnings():
+                    # Parameters at a bound are ordinary (an input without influence,
+                    # noise-free samples), and so is a line search ended by rounding.
+                    warnings.simplefilter("ignore", ConvergenceWarning)
+                    regressor.fit(X[rows], y[rows])
+                return float(regressor.log_marginal_likelihood_value_), regressor.kernel_
+            except LinAlgError:
+                # The optimum itself is singular: many samples close together, no noise.
+                continue
+        raise SurrogateFitError("the covariance of the samples is not positive definite")
+
+    # A first look at few samples from many starts, then one polish on more of them. The
+    # second start is a nearly linear function of many inputs, the others are drawn.
+    first = covariance.theta
+    shift = np.log(np.full(first.size, 10.0))
+    drawn = [first + rng.uniform(-1.5, 4.0, first.size) for _ in range(starts - 2)]
+    trials = [first, first + shift, *drawn][:starts]
+    found = [search(covariance.clone_with_theta(theta), order[:START_ORDER]) for theta in trials]
+    covariance = max(found, key=lambda pair: pair[0])[1]
+    if len(X) > START_ORDER:
+        covariance = search(covariance, order[:POLISH_ORDER])[1]
+    theta = np.exp(covariance.theta)
+    d = X.shape[1]
+    return Hyperparameters(
+        length_scales=theta[1 : 1 + d],
+        signal_variance=float(theta[0]),
+        noise_variance=noise if noise is not None else float(theta[1 + d]),
+    )
+
+
+def _by_joint_likelihood(
+    kernel: Kernel,
+    X: Array,
+    targets: Array,
+    fixed: list[float | None],
+    own: Array,
+    rng: np.random.Generator,
+    starts: int,
+) -> Hyperparameters:
+    """Maximise the joint likelihood of values and gradients with L-BFGS-B."""
+    from scipy.linalg import LinAlgError
+    from scipy.optimize import minimize
+
+    n, d = X.shape
+    bounds = np.log([LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS])
+    for noise in fixed:
+        known = NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2
+        bounds = np.vstack([bounds, np.log(known)])
+    order = rng.permutation(n)
+    by_component = targets.reshape(1 + d, n)
+
+    def search(theta0: Array, limit: int, iterations: int) -> tuple[float, Array]:
+        rows = order[: max(limit // (1 + d), 2)]
+        samples, observed = X[rows], by_component[:, rows].ravel()
+        own_here = own[rows] if own.size else own
+
+        def negative(theta: Array) -> tuple[float, Array]:
+            try:
+                value, slope = log_likelihood(
+                    kernel, samples, observed, _parameters(theta, d), SEARCH_JITTER, own_here
+                )
+            except LinAlgError:
+                # A wall: large and flat, so that the line search backs off.
+                return 1e10, np.zeros_like(theta)
+            return -value, -slope
+
+        found = minimize(
+            negative,
+            theta0,
+            jac=True,
+            bounds=bounds,
+            method="L-BFGS-B",
+            options={"maxiter": iterations},
+        )
+        return float(found.fun), found.x
+
+    first = np.log([0.5] * d + [1.0, 1e-6, 1e-6])
+    spread = np.log([4.0] * d + [10.0, 100.0, 100.0])
+    trials = [first + spread * rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 1)]
+    found = [
+        search(np.clip(t, bounds[:, 0], bounds[:, 1]), START_ORDER, 100) for t in [first, *trials]
+    ]
+    theta = min(found, key=lambda pair: pair[0])[1]
+    if n * (1 + d) > START_ORDER:
+        theta = search(theta, POLISH_ORDER, 60)[1]
+    best = _parameters(theta, d)
+    return Hyperparameters(
+        length_scales=best.length_scales,
+        signal_variance=best.signal_variance,
+        noise_variance=best.noise_variance if fixed[0] is None else fixed[0],
+        gradient_noise_variance=best.gradient_noise_variance if fixed[1] is None else fixed[1],
+    )
+
+
+def _parameters(theta: Array, d: int) -> Hyperparameters:
+    natural = np.exp(theta)
+    return Hyperparameters(
+        length_scales=natural[:d],
+        signal_variance=float(natural[d]),
+        noise_variance=float(natural[d + 1]),
+        gradient_noise_variance=float(natural[d + 2]),
+    )

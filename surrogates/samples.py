@@ -1,0 +1,139 @@
+"""The samples of one output, checked once and scaled the same way for every surrogate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from surrogates.interface import Array, SurrogateFitError, box
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of one output in a box.
+
+    lower, upper (d,), X (n, d): input units. Y (n,), noise (n,) or None where it is
+    unknown: output units, the noise as standard deviations. dY (n, d) = ∂Y/∂X or None.
+    """
+
+    lower: Array
+    upper: Array
+    X: Array
+    Y: Array
+    dY: Array | None = None
+    noise: Array | None = None
+
+    @property
+    def unit(self) -> Array:
+        """The samples (n, d) in the unit box."""
+        return (self.X - self.lower) / (self.upper - self.lower)
+
+    @property
+    def observations(self) -> int:
+        """The number of values and derivatives among the samples."""
+        return self.Y.size + (0 if self.dY is None else self.dY.size)
+
+    @property
+    def scaling(self) -> tuple[float, float]:
+        """Mean and standard deviation of the values, the latter 1 if they agree."""
+        return float(self.Y.mean()), float(self.Y.std()) or 1.0
+
+    @property
+    def targets(self) -> Array:
+        """Scaled values (n,), followed component by component by scaled gradients if any."""
+        mean, scale = self.scaling
+        targets = (self.Y - mean) / scale
+        if self.dY is not None:
+            slopes = self.dY * (self.upper - self.lower) / scale
+            targets = np.concatenate([targets, slopes.T.ravel()])
+        return targets
+
+    @property
+    def noise_variances(self) -> Array:
+        """Noise variances (n,) in units of the sample variance; 0 where unknown."""
+        if self.noise is None:
+            return np.zeros(self.Y.size)
+        return (self.noise / self.scaling[1]) ** 2
+
+    @property
+    def least_squares_weights(self) -> Array:
+        """Weights (n,) ~ 1 / noise, largest 1, for fits that weigh residuals."""
+        if self.noise is None or self.noise.max() == 0.0:
+            return np.ones(self.Y.size)
+        # A sample without noise would weigh infinitely much beside one with it.
+        known = np.maximum(self.noise, 1e-3 * self.noise.max())
+        return known.min() / known
+
+    def rows(self, rows: NDArray[np.intp]) -> "Samples":
+        """Return the samples of these row numbers, in the same box."""
+        return Samples(
+            self.lower,
+            self.upper,
+            self.X[rows],
+            self.Y[rows],
+            None if self.dY is None else self.dY[rows],
+            None if self.noise is None else self.noise[rows],
+        )
+
+
+def checked(
+    X: ArrayLike,
+    Y: ArrayLike,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
+    dY: ArrayLike | None = None,
+    noise: ArrayLike | None = None,
+) -> Samples:
+    """Return the samples as float arrays; bounds left out are the range of X.
+
+    X (n, d), Y (n,), dY (n, d) or None, noise a deviation, one to each sample (n,), or
+    None.
+
+    Raises:
+        SurrogateFitError: wrong shapes, values that are not finite, negative noise, or
+            no range of X to scale an input by.
+    """
+    points, values = np.array(X, dtype=float), np.array(Y, dtype=float)
+    if points.ndim != 2 or len(points) < 2:
+        raise SurrogateFitError(f"expected X (n >= 2, d), got {points.shape}")
+    low, high = _bounds(points, lower, upper)
+    if points.shape[1] != low.size:
+        raise SurrogateFitError(f"expected X (n >= 2, {low.size}), got {points.shape}")
+    if values.shape != (len(points),):
+        more = "; fit_outputs takes several outputs" if values.ndim == 2 else ""
+        raise SurrogateFitError(f"expected Y ({len(points)},), got {values.shape}{more}")
+    slopes = None if dY is None else np.array(dY, dtype=float)
+    if slopes is not None and slopes.shape != points.shape:
+        raise SurrogateFitError(f"expected dY {points.shape}, got {slopes.shape}")
+    deviations = None if noise is None else np.array(noise, dtype=float)
+    if deviations is not None:
+        if deviations.shape not in ((), values.shape):
+            raise SurrogateFitError(
+                f"expected one noise or one to each of the {len(points)} samples, "
+                f"got {deviations.shape}"
+            )
+        deviations = np.broadcast_to(deviations, values.shape).copy()
+        if not (deviations >= 0.0).all():
+            raise SurrogateFitError("noise must not be negative")
+    if not all(np.isfinite(a).all() for a in (points, values, slopes, deviations) if a is not None):
+        raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
+    return Samples(low, high, points, values, slopes, deviations)
+
+
+def _bounds(points: Array, lower: ArrayLike | None, upper: ArrayLike | None) -> tuple[Array, Array]:
+    if lower is None or upper is None:
+        if not np.isfinite(points).all():
+            raise SurrogateFitError("samples must be finite; drop the failed evaluations first")
+        still = np.flatnonzero(np.ptp(points, axis=0) == 0.0)
+        if still.size:
+            raise SurrogateFitError(
+                f"input {still[0]} does not vary among the samples: give lower and upper, "
+                "or leave it out"
+            )
+    try:
+        return box(
+            points.min(axis=0) if lower is None else lower,
+            points.max(axis=0) if upper is None else upper,
+        )
+    except ValueError as error:
+        raise SurrogateFitError(str(error)) from error
