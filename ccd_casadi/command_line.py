@@ -60,6 +60,14 @@ def parser(
     return result
 
 
+def add_scheduler(arguments: argparse.ArgumentParser) -> None:
+    """Add --scheduler, for commands that sample."""
+    arguments.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="sample on the Dask cluster at tcp://host:port; --workers then has no effect",
+    )  # fmt: skip
+
+
 def run(
     main: Callable[[argparse.Namespace], ExitCode],
     arguments: argparse.ArgumentParser,

@@ -12,11 +12,12 @@ import numpy as np
 from ccd_casadi.case import HZ, load_case, problem_of
 from ccd_casadi.case_sections import Case
 from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.cluster import pool
+from ccd_casadi.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.conclusions import conclusions
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.inner import active_constraints
-from ccd_casadi.parallel import Workers
+from ccd_casadi.parallel import Pool
 from ccd_casadi.plant import hardware_cost
 from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.progress import Progress
@@ -58,7 +59,7 @@ class Comparison:
 
 
 def compare(
-    case: Case, problem: CoDesignProblem, folder: Path, workers: Workers, *, seed: int, quiet: bool
+    case: Case, problem: CoDesignProblem, folder: Path, workers: Pool, *, seed: int, quiet: bool
 ) -> Comparison:
     """Run every method, each with a store and a count of its own."""
     began = perf_counter()
@@ -77,7 +78,7 @@ def _formulation(
     case: Case,
     problem: CoDesignProblem,
     folder: Path,
-    workers: Workers,
+    workers: Pool,
     name: str,
     seed: int,
     quiet: bool,
@@ -96,7 +97,7 @@ def _formulation(
 
 
 def _descents(
-    case: Case, problem: CoDesignProblem, workers: Workers, seed: int, quiet: bool
+    case: Case, problem: CoDesignProblem, workers: Pool, seed: int, quiet: bool
 ) -> list[Descent]:
     """Both gradients from every start with every first step."""
     base = case.baseline
@@ -164,7 +165,7 @@ def _sequential(
     case: Case,
     problem: CoDesignProblem,
     folder: Path,
-    workers: Workers,
+    workers: Pool,
     name: str,
     starts: int,
     seed: int,
@@ -279,7 +280,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     plant_of(problem)
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)
-    with Workers(options.workers, PATIENCE) as workers:
+    with pool(options.scheduler, options.workers, PATIENCE) as workers:
         comparison = compare(case, problem, folder, workers, seed=options.seed, quiet=options.quiet)
     (folder / "case.toml").write_text(case_to_toml(case))
     answer = comparison_dict(comparison, options.seed)
@@ -299,7 +300,9 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    return run(command, parser("ccd_casadi.compare", "Every method on one case."), argv)
+    arguments = parser("ccd_casadi.compare", "Every method on one case.")
+    add_scheduler(arguments)
+    return run(command, arguments, argv)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
 from reprlib import Repr
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -29,12 +29,41 @@ _SHORT.maxother = _SHORT.maxstring = 60
 
 
 class WorkerLost(RuntimeError):
-    """A worker process died twice on the same task (killed, or out of memory)."""
+    """Workers died again and again on one task (killed, or out of memory), or never came back."""
 
 
 def usable_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Pool(Protocol):
+    """What spreads tasks over processes: `Workers` here, `cluster.Cluster` over Dask.
+
+    A context manager; leaving it ends or abandons what is in flight.
+    """
+
+    @property
+    def count(self) -> int:
+        """How many tasks run at a time."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+    def map_unordered(
+        self, function: Callable[[T], R], tasks: Sequence[T]
+    ) -> Generator[R, None, None]:
+        """Every task's result exactly once, as they complete; one map at a time.
+
+        Raises WorkerLost where a task's workers die again and again, and whatever `function`
+        raises (with the worker's traceback as a note).
+        """
 
 
 class Workers:
@@ -222,11 +251,11 @@ def _serve(pipe: connection.Connection) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
+            pipe.send_bytes(answered(pipe.recv_bytes()))
 
 
-def _answer(message: bytes) -> bytes:
-    """The pickled (True, result), or (False, exception)."""
+def answered(message: bytes) -> bytes:
+    """The pickled (True, result) or (False, exception) of a pickled (function, task)."""
     try:
         function, task = pickle.loads(message)
         return pickle.dumps((True, function(task)))

@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.callback import VectorCallback
 from ccd_casadi.modal import modal_plant
 from ccd_casadi.outer import NonlinearProgram, OuterFailure, solve_program
-from ccd_casadi.parallel import Workers
+from ccd_casadi.parallel import Pool, Workers
 from ccd_casadi.plant import Array, constraint_values, hardware_cost, mechanics
 from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from surrogates import design
@@ -73,7 +73,7 @@ def design_hardware(
     *,
     starts: int = 8,
     seed: int = 0,
-    workers: Workers | None = None,
+    workers: Pool | None = None,
 ) -> HardwareDesign:
     """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
 
@@ -85,7 +85,7 @@ def design_hardware(
     if starts > 0:
         points = np.vstack([points, design("sobol", lower, upper, starts, seed)])
     tasks = [(problem, resonance, tuple(float(v) for v in point)) for point in points]
-    pool = Workers(1) if workers is None else workers
+    pool: Pool = Workers(1) if workers is None else workers
     found = sorted(pool.map_unordered(_from_start, tasks), key=lambda item: item.theta)
     meeting = [item for item in found if item.met]
     if meeting:
