@@ -8,6 +8,7 @@ and λ with no new synthesis.
 import numpy as np
 
 from ccd_casadi.iterates import FormulationResult, Iterate
+from ccd_casadi.known import Surrogates
 from ccd_casadi.outer import (
     OuterFailure,
     OuterSolution,
@@ -37,24 +38,31 @@ def solve_lifted(
     tolerance: float,
     max_refinements: int,
     seed: int,
+    given: Surrogates | None = None,
 ) -> FormulationResult:
-    """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis."""
+    """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
+
+    With `given` surrogates the rounds start from those and what they were fitted to.
+    """
     problem = truth.problem
     lower, upper = lifted_bounds(problem)
-    X = design("sobol", lower, upper, points, seed)
-    samples = [s for s in truth.quantities(X) if s.certified]
+    if given is None:
+        X = design("sobol", lower, upper, points, seed)
+        samples = [s for s in truth.quantities(X) if s.certified]
+    else:
+        samples = list(given.samples)
     if len(samples) < len(lower) + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
         return FormulationResult(None, None, (), (), None, False, message)
     iterates: list[Iterate] = []
-    processes: tuple[GaussianProcess, ...] = ()
+    processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
     solution: OuterSolution | None = None
-    agreed, fitted = False, 0
+    agreed, fitted = False, 0 if given is None else len(samples)
     incumbent: QuantitySample | None = None
     for round_number in range(max_refinements + 1):
         if len(samples) >= REFIT * fitted:
             processes, fitted = fit_quantities(problem, samples, seed), len(samples)
-        else:
+        elif len(samples) > len(processes[0].X):
             processes = update_quantities(problem, samples, processes)
         program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
         spread = design("sobol", lower, upper, starts, seed + round_number)

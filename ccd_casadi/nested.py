@@ -8,6 +8,7 @@ where the surrogate promised too much, until prediction and truth agree there.
 import numpy as np
 
 from ccd_casadi.iterates import FormulationResult, Iterate
+from ccd_casadi.known import Surrogates
 from ccd_casadi.outer import OuterFailure, OuterSolution, nested_program, solve_program
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, box, plant_of, true_design
@@ -26,12 +27,19 @@ def solve_nested(
     tolerance: float,
     max_refinements: int,
     seed: int,
+    given: Surrogates | None = None,
 ) -> FormulationResult:
-    """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins."""
+    """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
+
+    With a `given` surrogate the design is what that was fitted to.
+    """
     problem = truth.problem
     lower, upper = box(problem)
-    thetas = np.vstack([design(kind, lower, upper, points, seed), np.array(problem.start)])
-    thetas = _allowed(problem, np.unique(thetas, axis=0))
+    if given is None:
+        thetas = np.vstack([design(kind, lower, upper, points, seed), np.array(problem.start)])
+        thetas = _allowed(problem, np.unique(thetas, axis=0))
+    else:
+        thetas = given.thetas
     samples = truth.bandwidths(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")

@@ -12,14 +12,14 @@ import numpy as np
 
 from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.envelope import bandwidth_gradient
-from ccd_casadi.parallel import Workers
+from ccd_casadi.parallel import Pool
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of, true_design, true_inner
 from ccd_casadi.progress import Progress
 from ccd_casadi.samples import Sample, SampleStore, problem_hash, sample_key
 from ccd_casadi.synthesis import DesignFigures
 
-CHUNK = 8  # single designs a unit
+CHUNK = 8  # single designs a unit at most
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Truth:
     """
 
     def __init__(
-        self, problem: CoDesignProblem, store: SampleStore, workers: Workers, *, quiet: bool = True
+        self, problem: CoDesignProblem, store: SampleStore, workers: Pool, *, quiet: bool = True
     ) -> None:
         self.problem = problem
         self.store = store
@@ -123,7 +123,8 @@ class Truth:
         keys = [self._design_key(x) for x in points]
         known = {key: s for key, s in self.store.get(keys).items() if s.gradients is not None}
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
-        chunks = [todo[i : i + CHUNK] for i in range(0, len(todo), CHUNK)]
+        size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
+        chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
         with Progress(len(todo), label, quiet=self.quiet) as progress:
             tasks = [(self.problem, chunk) for chunk in chunks]
             for samples, _ in self.workers.map_unordered(design_unit, tasks):
@@ -134,7 +135,7 @@ class Truth:
         for x, key in zip(points, keys, strict=True):
             sample = known[key]
             self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
-        return [_quantity_sample(x, known[k], count) for x, k in zip(points, keys, strict=True)]
+        return [quantity_sample(x, known[k], count) for x, k in zip(points, keys, strict=True)]
 
     def design(self, x: Array) -> Sensitivities:
         """One true design at x, recorded."""
@@ -276,7 +277,8 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
     )
 
 
-def _quantity_sample(x: tuple[float, ...], sample: Sample, count: int) -> QuantitySample:
+def quantity_sample(x: tuple[float, ...], sample: Sample, count: int) -> QuantitySample:
+    """A row with derivatives as values at x; `count` hardware parameters."""
     assert sample.gradients is not None
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.array(

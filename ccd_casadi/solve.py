@@ -1,6 +1,7 @@
 """`python -m ccd_casadi.solve CASE.toml`: sample, fit, IPOPT, verify; writes the run folder."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +14,14 @@ import numpy as np
 from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.case_sections import Case
 from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.cluster import pool
+from ccd_casadi.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.direct import solve_direct
 from ccd_casadi.iterates import FormulationResult
+from ccd_casadi.known import Surrogates, named_surrogate
 from ccd_casadi.lifted import solve_lifted
 from ccd_casadi.nested import solve_nested
 from ccd_casadi.outer import unmet_constraint
-from ccd_casadi.parallel import Workers
 from ccd_casadi.problem import box, plant_of
 from ccd_casadi.results import (
     controller_dict,
@@ -55,16 +57,30 @@ class Solution:
         return _CODES[self.result["status"]]
 
 
-def solve(case: Case, truth: Truth, formulation: str, seed: int) -> Solution:
+def solve(
+    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None = None
+) -> Solution:
     """Run one formulation, verify and polish its design on the truth."""
     began = perf_counter()
     forbidden = unmet_constraint(truth.problem, case.outer.starts, seed)
     if forbidden:
         outcome = FormulationResult(None, None, (), (), None, False, forbidden)
     else:
-        outcome = _formulate(case, truth, formulation, seed)
+        outcome = _formulate(case, truth, formulation, seed, given)
         if outcome.x is None:
-            outcome = _rescue(truth, outcome, seed)
+            outcome = rescue(truth, outcome, seed)
+    return conclude(truth, formulation, outcome, case.outer.tolerance, seed, began)
+
+
+def conclude(
+    truth: Truth,
+    formulation: str,
+    outcome: FormulationResult,
+    tolerance: float,
+    seed: int,
+    began: float,
+) -> Solution:
+    """Verify and polish what a formulation found, if anything."""
     if outcome.x is None:
         result = infeasible_dict(
             formulation,
@@ -80,7 +96,7 @@ def solve(case: Case, truth: Truth, formulation: str, seed: int) -> Solution:
         formulation,
         outcome,
         verified,
-        tolerance=case.outer.tolerance,
+        tolerance=tolerance,
         syntheses=truth.syntheses,
         seconds=perf_counter() - began,
         seed=seed,
@@ -88,7 +104,9 @@ def solve(case: Case, truth: Truth, formulation: str, seed: int) -> Solution:
     return Solution(result, outcome, verified)
 
 
-def _formulate(case: Case, truth: Truth, formulation: str, seed: int) -> FormulationResult:
+def _formulate(
+    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None
+) -> FormulationResult:
     outer, sampling = case.outer, case.sampling
     if formulation == "nested":
         return solve_nested(
@@ -99,6 +117,7 @@ def _formulate(case: Case, truth: Truth, formulation: str, seed: int) -> Formula
             tolerance=outer.tolerance,
             max_refinements=outer.max_refinements,
             seed=seed,
+            given=given,
         )
     if formulation == "lifted":
         # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
@@ -111,11 +130,12 @@ def _formulate(case: Case, truth: Truth, formulation: str, seed: int) -> Formula
             tolerance=outer.tolerance,
             max_refinements=outer.max_refinements,
             seed=seed,
+            given=given,
         )
     return solve_direct(truth, starts=outer.direct_starts, seed=seed)
 
 
-def _rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationResult:
+def rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationResult:
     """Ask the true inner problem at a few θ: is the case infeasible, or did a formulation fail?"""
     lower, upper = box(truth.problem)
     points = design("sobol", lower, upper, 8, seed)
@@ -133,10 +153,15 @@ def _rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationR
 
 
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
-    """Write case.toml, result.json, controller.json and surrogate.json; clear an earlier run's."""
+    """Write what a run folder holds besides samples and report; clear an earlier run's."""
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
-    (folder / "case.toml").write_text(case_to_toml(case), encoding="utf-8")
+    text = case_to_toml(case)
+    draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
+    draft.write_text(text, encoding="utf-8")
+    os.replace(draft, folder / "case.toml")
+    formulation = solution.result["formulation"]
+    write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:
         write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
     if solution.outcome.surrogates:
@@ -144,7 +169,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
             solution.outcome.surrogates,
             folder / "surrogate.json",
             {
-                "formulation": solution.result["formulation"],
+                "formulation": formulation,
                 "outputs": ["bandwidth"]
                 if len(solution.outcome.surrogates) == 1
                 else ["bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low"],
@@ -187,10 +212,16 @@ def command(options: argparse.Namespace) -> ExitCode:
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
+    given = None
+    if options.surrogate is not None:
+        given = named_surrogate(folder, options.surrogate, options.formulation, problem)
     store = folder / "samples.sqlite"
-    with SampleStore(store) as samples, Workers(options.workers, PATIENCE) as workers:
+    with (
+        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        SampleStore(store) as samples,
+    ):
         truth = Truth(problem, samples, workers, quiet=options.quiet)
-        solution = solve(case, truth, options.formulation, options.seed)
+        solution = solve(case, truth, options.formulation, options.seed, given)
         write_run(folder, case, solution)
     from ccd_casadi.report import write_report  # matplotlib is slow to import
 
@@ -214,6 +245,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         action="store_true",
         help="go on from the samples in the run folder (every run does; kept for scripts)",
     )
+    arguments.add_argument(
+        "--surrogate",
+        metavar="NAME",
+        help="start from a version of the run folder's surrogates (0002), not by sampling",
+    )
+    add_scheduler(arguments)
     return run(command, arguments, argv)
 
 
