@@ -588,6 +588,7 @@ def keys(folder: Path) -> list[str]:
         return [row[0] for row in database.execute("select key from samples")]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_soon_and_it_resumes(tmp_path: Path) -> None:
     folder = started_from(tmp_path / "run")
     process = launched(folder)
