@@ -36,8 +36,10 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.published_figures import published_sections
+from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.truths import read_truths
 from ccd_casadi.reporting.turntable import with_turntables
+from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.steepest_descent import Descent
 from ccd_casadi.synthesis import synthesise
 
@@ -119,8 +121,11 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
     """All methods in one table, the paper's figures below them."""
+    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
+    factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
+    names = [axis_label(n, unit) for n, (unit, _) in zip(problem.names, shown, strict=True)]
     head = (
-        "method", *problem.names, "cost f", "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "s",
+        "method", *names, "cost f", "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "s",
         "certified",
     )  # fmt: skip
     rows: list[tuple[Any, ...]] = []
@@ -132,10 +137,10 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
         rows.append(
             (
                 LABELS[name],
-                *(number(figures["theta"][key], 5) for key in problem.names),
+                *(number(factors[key] * figures["theta"][key], 4) for key in problem.names),
                 number(figures["hardware_cost"], 5),
                 number(figures["bandwidth_hz"], 5),
-                number(figures["objective"], 7),
+                number(figures["objective"], 6),
                 number(figures["first_resonance_hz"], 5),
                 number(figures["sensitivity_peak"], 5),
                 str(figures["syntheses"]),
@@ -150,7 +155,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
             rows.append(
                 (
                     label,
-                    *(number(theta[k], 5) if k in theta else "–" for k in problem.names),
+                    *(number(factors[k] * theta[k], 4) if k in theta else "–" for k in factors),
                     number(item["hardware_cost"], 5),
                     number(item["bandwidth_hz"], 4),
                     number(item["objective"], 5),
