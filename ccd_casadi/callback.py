@@ -1,6 +1,6 @@
 """A numeric function of one vector, with its Jacobian, as a casadi.Function for any nlpsol."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -13,23 +13,22 @@ from ccd_casadi.plant import Array
 class VectorCallback(ca.Callback):
     """x (n,) -> values (m,) and ∂values (m, n); keep a reference to it while it is in use.
 
-    Subclasses give `values` and `jacobian_at`, and call `set_up` at the end of their __init__.
-    Hessians are not available: use a quasi-Newton method.
+    NaN values make IPOPT shorten its step. Hessians are not available: use a quasi-Newton method.
     """
 
-    def set_up(self, name: str, inputs: int, outputs: int) -> None:
-        """Make it a casadi function of these sizes."""
+    def __init__(
+        self,
+        name: str,
+        inputs: int,
+        outputs: int,
+        values: Callable[[Array], Array],
+        jacobian: Callable[[Array], Array],
+    ) -> None:
+        ca.Callback.__init__(self)
         self._sizes = inputs, outputs
-        self._jacobian: ca.Callback | None = None
+        self._values, self._jacobian = values, jacobian
+        self._derivative: ca.Callback | None = None
         self.construct(name, {})
-
-    def values(self, x: Array) -> Array:
-        """(m,) values; NaN makes IPOPT shorten its step."""
-        raise NotImplementedError
-
-    def jacobian_at(self, x: Array) -> Array:
-        """(m, n) derivatives."""
-        raise NotImplementedError
 
     def get_n_in(self) -> int:
         return 1
@@ -46,7 +45,7 @@ class VectorCallback(ca.Callback):
     def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
         if pending():  # NaN ends IPOPT quickly; the interrupt is raised when it has returned
             return [np.full(self._sizes[1], np.nan)]
-        return [self.values(np.array(arguments[0]).ravel())]
+        return [self._values(np.array(arguments[0]).ravel())]
 
     def has_jacobian(self) -> bool:
         return True
@@ -54,15 +53,20 @@ class VectorCallback(ca.Callback):
     def get_jacobian(
         self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
     ) -> ca.Function:
-        self._jacobian = _Jacobian(self, name, options)
-        return self._jacobian
+        self._derivative = _Jacobian(name, self._sizes, self._jacobian, options)
+        return self._derivative
 
 
 class _Jacobian(ca.Callback):
-    def __init__(self, parent: VectorCallback, name: str, options: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        name: str,
+        sizes: tuple[int, int],
+        values: Callable[[Array], Array],
+        options: Mapping[str, Any],
+    ) -> None:
         ca.Callback.__init__(self)
-        self._parent = parent
-        self._sizes = parent._sizes
+        self._sizes, self._values = sizes, values
         self.construct(name, options)
 
     def get_n_in(self) -> int:
@@ -80,4 +84,4 @@ class _Jacobian(ca.Callback):
         return ca.Sparsity.dense(outputs, inputs)
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Array]:
-        return [self._parent.jacobian_at(np.array(arguments[0]).ravel())]
+        return [self._values(np.array(arguments[0]).ravel())]

@@ -19,6 +19,7 @@ from ccd_casadi.case_checks import (
     Check,
     choice,
     number,
+    rows,
     shown,
     text,
     too_large,
@@ -58,6 +59,9 @@ _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
     ("rib_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
     ("rib_stage", "density"): POSITIVE,
     ("rib_stage", "least_bay"): POSITIVE,
+    ("rib_stage", "actuators"): rows(2),
+    ("rib_stage", "sensors"): rows(2),
+    ("rib_stage", "point_masses"): rows(3),
 }
 _KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 

@@ -68,6 +68,21 @@ def steps(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers between 0 and 1"
 
 
+def rows(width: int) -> Check:
+    """A list of rows of `width` finite numbers."""
+
+    def check(value: Any) -> str | None:
+        good = isinstance(value, list | tuple) and all(
+            isinstance(row, list | tuple)
+            and len(row) == width
+            and all(ANY(item) is None for item in row)
+            for row in value
+        )
+        return None if good else f"is {shown(value)}; give a list of rows of {width} numbers"
+
+    return check
+
+
 def too_large(value: Any) -> bool:
     """TOML's integers have 64 bits; Python's parser takes any, and neither float nor repr do."""
     return isinstance(value, int) and abs(value) >= 2**63

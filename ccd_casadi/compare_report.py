@@ -4,15 +4,13 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ccd_casadi.case import HZ
 from ccd_casadi.case_toml import case_to_toml
 from ccd_casadi.compare import Comparison, Method
-from ccd_casadi.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.problem import CoDesignProblem
 from ccd_casadi.report import stage_sections
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
-from ccd_casadi.reporting.loops import Loop, figure_gains, loop_data, table_gains
+from ccd_casadi.reporting.loops import Loop, figure_gains, synthesised_loop, table_gains
 from ccd_casadi.reporting.maps import figure_landscape
 from ccd_casadi.reporting.methods import (
     LABELS,
@@ -41,7 +39,6 @@ from ccd_casadi.reporting.truths import read_truths
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.steepest_descent import Descent
-from ccd_casadi.synthesis import synthesise
 
 
 def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Path:
@@ -222,20 +219,5 @@ def _loops(comparison: Comparison, best: str) -> str:
 def _loop(problem: CoDesignProblem, method: Method) -> Loop:
     figures = method.figures
     theta = tuple(figures["theta"][name] for name in problem.names)
-    plant = scaled_plant(problem, theta)
-    weights = problem.weights.at(HZ * figures["omega_S_hz"], HZ * figures["omega_T_hz"])
-    made = synthesise(
-        plant,
-        weights,
-        omega_low=problem.inner.omega_low,
-        gamma_backoff=problem.inner.gamma_backoff,
-    )
-    return loop_data(
-        plant,
-        made.controller,
-        weights,
-        gamma=float(np.nan_to_num(made.figures.certificate.norm_bound)),
-        bandwidth_hz=made.figures.bandwidth / HZ,
-        omega_low=problem.inner.omega_low,
-        label=LABELS[method.name],
-    )
+    omega = HZ * figures["omega_S_hz"], HZ * figures["omega_T_hz"]
+    return synthesised_loop(problem, theta, *omega, LABELS[method.name])

@@ -1,7 +1,8 @@
 """A pool of worker processes, one BLAS thread each, that ends promptly and leaves no orphans.
 
 Each worker has a pipe of its own: nothing is shared, so a worker may be killed at any moment and
-its death concerns the one task that it held.
+its death concerns the one task that it held. What goes through a pipe is pickled, which is how
+Python's processes speak: it comes from processes that this one started, and is never stored.
 """
 
 import multiprocessing

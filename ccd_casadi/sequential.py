@@ -45,10 +45,9 @@ class FirstResonance(VectorCallback):
     """ln(ω_1/ω_ref) of θ with its Jacobian; repeated points cost nothing."""
 
     def __init__(self, problem: CoDesignProblem, reference: float) -> None:
-        ca.Callback.__init__(self)
         self.problem, self.reference = problem, reference
         self._known: dict[bytes, tuple[float, Array]] = {}
-        self.set_up("first_resonance", len(problem.names), 1)
+        super().__init__("first_resonance", len(problem.names), 1, self.values, self.jacobian_at)
 
     def at(self, theta: Array) -> tuple[float, Array]:
         """ω_1 in rad/s and its gradient."""

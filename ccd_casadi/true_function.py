@@ -9,7 +9,6 @@ use a quasi-Newton method (`ipopt.hessian_approximation = "limited-memory"`).
 
 from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.callback import VectorCallback
@@ -27,11 +26,11 @@ class TrueQuantities(VectorCallback):
         record: Callable[[Array, Sensitivities], None] | None = None,
     ) -> None:
         """`record` is told every true synthesis (x, design)."""
-        ca.Callback.__init__(self)
         self.problem = problem
         self.record = record
         self.designs: dict[bytes, Sensitivities] = {}
-        self.set_up("true_quantities", len(problem.names) + 2, 4)
+        count = len(problem.names) + 2
+        super().__init__("true_quantities", count, 4, self.values, self.jacobian_at)
 
     def at(self, x: Array) -> Sensitivities:
         """The design at x = (θ, ln ω_S, ln ω_T); repeated points cost nothing."""

@@ -9,6 +9,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import NoReturn
 
+from surrogates.copies import copy_run
 from surrogates.interface import SurrogateFitError
 from surrogates.retraining import Settings, retrain
 from surrogates.serialise import SurrogateFileError
@@ -42,6 +43,9 @@ def parser() -> argparse.ArgumentParser:
     result = _Parser(prog="python -m surrogates.retrain", description=__doc__)
     default = Settings()
     result.add_argument("run", metavar="RUN_DIR", type=Path, help="the run folder")
+    result.add_argument(
+        "--out", metavar="DIR", type=Path, help="retrain a copy there (default: RUN_DIR itself)"
+    )
     result.add_argument(
         "--budget",
         metavar="N",
@@ -78,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    return result  # fmt: skip
+    return result
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,10 +91,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         options = parser().parse_args(argv)
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
-    folder, quiet = options.run, options.quiet
+    run, quiet = options.run, options.quiet
+    folder = run if options.out is None else options.out
     settings = Settings(options.budget, options.batch, options.explore, options.seed)
     try:
-        opened = opener_of(folder)(
+        opener = opener_of(run)
+        if folder != run:
+            copy_run(run, folder)
+        opened = opener(
             folder, tolerance=options.tolerance, workers=options.workers, seed=options.seed,
             quiet=quiet,
         )  # fmt: skip

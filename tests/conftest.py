@@ -1,7 +1,12 @@
 """One BLAS thread: the matrices are small, and figures then repeat to the last digit."""
 
 import os
+import shutil
 import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
 
 # A shell's background job, or a CI runner, may have Ctrl-C ignored, and children inherit that.
 # The tests of interrupts are about how commands behave where it is not.
@@ -10,3 +15,17 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+
+@pytest.fixture(scope="session")
+def camel_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Any]:
+    """A retraining job that ran to its end; its folder is not to be changed."""
+    from camel import finished  # NumPy is imported when the environment above is set
+
+    return finished(tmp_path_factory.mktemp("camel"))
+
+
+@pytest.fixture
+def camel_copy(camel_run: tuple[Path, Any, Any], tmp_path: Path) -> Path:
+    """That job's folder, to be changed."""
+    return Path(shutil.copytree(camel_run[0], tmp_path / "run"))

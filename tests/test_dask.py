@@ -3,7 +3,6 @@
 What freezes, kills or outwaits processes depends on how the machine schedules them: marked slow.
 """
 
-import importlib.util
 import os
 import random
 import re
@@ -34,10 +33,6 @@ from ccd_casadi.samples import SampleStore
 from ccd_casadi.sampling import Truth
 
 HERE = Path(__file__).parent
-needs_dask = pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None,
-    reason="Dask is not installed; requirements-test.lock names it",
-)
 
 
 # ---- tasks, imported by the workers --------------------------------------------------------------
@@ -231,7 +226,6 @@ def both_workers(cluster: Cluster) -> None:
 # ---- results -------------------------------------------------------------------------------------
 
 
-@needs_dask
 def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> None:
     found = []
     for name, pool in (("serial", Workers(1)), ("dask", Cluster(shared.address))):
@@ -245,7 +239,6 @@ def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> 
     assert len(found[0][3]["samples"]) > 50
 
 
-@needs_dask
 def test_every_task_gives_its_result_once(shared: Processes) -> None:
     with Cluster(shared.address) as cluster:
         both_workers(cluster)
@@ -258,7 +251,6 @@ def test_every_task_gives_its_result_once(shared: Processes) -> None:
     assert {threads for _, _, threads in places} == {1}, "one BLAS thread each"
 
 
-@needs_dask
 def test_an_exception_reaches_the_caller(shared: Processes) -> None:
     with Cluster(shared.address) as cluster:
         with pytest.raises(TaskFailure, match="at three") as caught:
@@ -272,7 +264,6 @@ def test_an_exception_reaches_the_caller(shared: Processes) -> None:
         assert sorted(cluster.map_unordered(square, [1, 2])) == [1, 4]
 
 
-@needs_dask
 def test_a_worker_with_other_numerics_is_refused(
     shared: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,7 +272,6 @@ def test_a_worker_with_other_numerics_is_refused(
         list(cluster.map_unordered(square, range(5)))
 
 
-@needs_dask
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
 def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,7 +295,6 @@ def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyP
 # ---- losses --------------------------------------------------------------------------------------
 
 
-@needs_dask
 @pytest.mark.slow
 def test_a_straggler_is_overtaken_and_its_late_answer_ignored(
     shared: Processes, tmp_path: Path
@@ -317,7 +306,6 @@ def test_a_straggler_is_overtaken_and_its_late_answer_ignored(
     assert (tmp_path / "first").exists(), "both copies have answered"
 
 
-@needs_dask
 @pytest.mark.slow
 def test_a_frozen_worker_is_overtaken(shared: Processes, tmp_path: Path) -> None:
     try:
@@ -331,7 +319,6 @@ def test_a_frozen_worker_is_overtaken(shared: Processes, tmp_path: Path) -> None
             os.kill(pid, signal.SIGCONT)
 
 
-@needs_dask
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", [3, 30])
 def test_killed_workers_lose_no_sample_and_double_none(
@@ -374,7 +361,6 @@ def test_killed_workers_lose_no_sample_and_double_none(
     assert table(path) == serial(tmp_path / "serial.sqlite", np.vstack(batches))
 
 
-@needs_dask
 @pytest.mark.slow
 def test_a_restarted_scheduler_loses_nothing(shared: Processes, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
@@ -389,7 +375,6 @@ def test_a_restarted_scheduler_loses_nothing(shared: Processes, tmp_path: Path) 
     assert sorted(found) == list(range(20))
 
 
-@needs_dask
 @pytest.mark.slow
 def test_a_cluster_that_stays_away_is_told(shared: Processes, tmp_path: Path) -> None:
     tasks = [(i, str(tmp_path / "never")) for i in range(4)]
@@ -403,7 +388,6 @@ def test_a_cluster_that_stays_away_is_told(shared: Processes, tmp_path: Path) ->
             list(cluster.map_unordered(waits, tasks))
 
 
-@needs_dask
 @pytest.mark.slow
 def test_a_task_that_kills_every_worker_is_told(nannies: Processes) -> None:
     with Cluster(nannies.address) as cluster, pytest.raises(WorkerLost, match="after worker died"):
@@ -413,7 +397,6 @@ def test_a_task_that_kills_every_worker_is_told(nannies: Processes) -> None:
 # ---- the command ---------------------------------------------------------------------------------
 
 
-@needs_dask
 @pytest.mark.slow
 def test_ctrl_c_ends_promptly_and_is_resumable(shared: Processes, tmp_path: Path) -> None:
     folder = tmp_path / "run"
@@ -444,7 +427,6 @@ def told(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> st
     return errors
 
 
-@needs_dask
 @pytest.mark.parametrize("address", ["", "here", "tcp://127.0.0.1", "127.0.0.1:8786"])
 def test_what_is_no_address_is_told(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -453,7 +435,6 @@ def test_what_is_no_address_is_told(
     assert words.startswith(f"--scheduler {address}: is no address; give what `dask")
 
 
-@needs_dask
 @pytest.mark.parametrize("kind", ["tcp://127.0.0.1:{}", "tcp://127.0.0.1:99999", "carrier://a:{}"])
 def test_an_address_where_nothing_answers_is_told(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.closed_loop import local_peaks, responses
+from ccd_casadi.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.reporting.lines import Array, Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.scaling import ScaledPlant, StateSpace, transmission_zeros
+from ccd_casadi.synthesis import synthesise
 from ccd_casadi.weights import Weights
 
 HZ = 2.0 * np.pi
@@ -75,6 +77,28 @@ def loop_data(
         peaks=peaks,
         resonances_hz=poles,
         antiresonances_hz=zeros,
+    )
+
+
+def synthesised_loop(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    omega_S: float,
+    omega_T: float,
+    label: str,
+) -> Loop:
+    """The loop of the design at (θ, ω_S, ω_T), rad/s, synthesised anew."""
+    plant, inner = scaled_plant(problem, theta), problem.inner
+    weights = problem.weights.at(omega_S, omega_T)
+    made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
+    return loop_data(
+        plant,
+        made.controller,
+        weights,
+        gamma=float(np.nan_to_num(made.figures.certificate.norm_bound)),
+        bandwidth_hz=made.figures.bandwidth / HZ,
+        omega_low=inner.omega_low,
+        label=label,
     )
 
 

@@ -5,14 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.case import HZ
-from ccd_casadi.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import figure_bode, table_bode
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import Loop, loop_data, table_gains
+from ccd_casadi.reporting.loops import Loop, synthesised_loop, table_gains
 from ccd_casadi.reporting.page import Section, Table, figure_html, paragraph, table_html
 from ccd_casadi.reporting.svg import CYCLE
-from ccd_casadi.synthesis import synthesise
 
 THETA = (60.0, 60.0)
 
@@ -37,29 +35,13 @@ def published_sections(problem: CoDesignProblem, answer: dict[str, Any]) -> list
 
 def _case(problem: CoDesignProblem, name: str, M_K: float) -> Loop | None:
     """The inner optimum at (60, 60) with the case's M_K; None where it is infeasible."""
-    weights = replace(problem.weights, M_K=M_K)
-    local = replace(problem, weights=weights)
+    local = replace(problem, weights=replace(problem.weights, M_K=M_K))
     found = true_inner(local, THETA)
     if found.optimum is None:
         return None
     figures = found.optimum.figures
-    plant = scaled_plant(local, THETA)
-    chosen = weights.at(figures.omega_S, figures.omega_T)
-    made = synthesise(
-        plant,
-        chosen,
-        omega_low=problem.inner.omega_low,
-        gamma_backoff=problem.inner.gamma_backoff,
-    )
-    return loop_data(
-        plant,
-        made.controller,
-        chosen,
-        gamma=made.figures.certificate.norm_bound,
-        bandwidth_hz=made.figures.bandwidth / HZ,
-        omega_low=problem.inner.omega_low,
-        label=f"case {name}, M_K = {M_K:g} N/m",
-    )
+    label = f"case {name}, M_K = {M_K:g} N/m"
+    return synthesised_loop(local, THETA, figures.omega_S, figures.omega_T, label)
 
 
 def _plant(loop: Loop, published: dict[str, Any]) -> str:

@@ -158,5 +158,4 @@ def has_square_symmetry(geometry: Geometry) -> bool:
 
 
 def _six(theta: Sequence[Any]) -> tuple[Any, ...]:
-    values = tuple(theta[i] for i in range(len(NAMES)))
-    return values
+    return tuple(theta[i] for i in range(len(NAMES)))

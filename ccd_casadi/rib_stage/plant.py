@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
-import numpy as np
 
 from ccd_casadi.plant import Mechanics, Plant
 from ccd_casadi.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
@@ -49,14 +48,14 @@ def rib_stage(
     geometry = Geometry(
         side=side,
         material=Material(young, poisson, density),
-        point_masses=tuple(PointMass(*_numbers(p, 3, "point_masses")) for p in point_masses),
+        point_masses=tuple(_point_mass(x, y, mass, side) for x, y, mass in point_masses),
         least_bay=least_bay,
     )
     stage = RibStage(
         geometry=geometry,
         order=MESHES[mesh],
-        actuators=_points(actuators, "actuators"),
-        sensors=_points(sensors, "sensors"),
+        actuators=_points(actuators),
+        sensors=_points(sensors),
         outputs=outputs,
         modes=MODES[modes],
         damping_ratio=zeta,
@@ -113,16 +112,13 @@ def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[floa
     return found.stage, tuple(float(theta[i]) for i in found.place)
 
 
-def _points(points: Points, key: str) -> tuple[Point, ...] | None:
-    found = tuple(_numbers(point, 2, key) for point in points)
-    return tuple((p[0], p[1]) for p in found) or None
+def _points(points: Points) -> tuple[Point, ...] | None:
+    return tuple((float(x), float(y)) for x, y in points) or None
 
 
-def _numbers(values: Sequence[float], count: int, key: str) -> tuple[float, ...]:
-    try:
-        found = tuple(float(v) for v in values)
-    except (TypeError, ValueError):
-        found = ()
-    if len(found) != count or not np.isfinite(found).all():
-        raise StageError(f"{key} holds {values!r}; give {count} numbers a point")
-    return found
+def _point_mass(x: float, y: float, mass: float, side: float) -> PointMass:
+    if not mass > 0.0:
+        raise StageError(f"point_masses: {mass:g} kg is no mass; give a number above 0")
+    if max(abs(x), abs(y)) > 0.5 * side * (1.0 + 1e-12):
+        raise StageError(f"point_masses: ({x:g}, {y:g}) is off the stage; move it inside")
+    return PointMass(float(x), float(y), float(mass))

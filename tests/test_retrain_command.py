@@ -1,0 +1,150 @@
+"""`python -m surrogates.retrain`: exit codes, bad input, and a copy to work on."""
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camel import Camel, entries
+
+import surrogates.truth as truth_module
+from surrogates.interface import Array
+from surrogates.retrain import main
+from surrogates.truth import Observations, TruthInterrupted
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    """Install a truth as the only one, under the name "camel"."""
+
+    def install(make: Any) -> None:
+        @contextmanager
+        def opened(folder: Path, **_: Any) -> Iterator[Any]:
+            yield make(folder)
+
+        class Point:
+            name = "camel"
+
+            def load(self) -> Any:
+                return opened
+
+        monkeypatch.setattr(truth_module, "entry_points", lambda group: [Point()])
+
+    return install
+
+
+def test_exit_codes(
+    camel_copy: Path,
+    tmp_path: Path,
+    installed: Callable[[Any], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    installed(Camel)
+    assert main([str(camel_copy), "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main([str(camel_copy)]) == 0
+    assert capsys.readouterr().out.startswith("verified (converged): 0 rounds")
+
+    class Empty(Camel):
+        def _at(self, X: Array) -> Observations:
+            return Observations(X, np.full((len(X), 2), np.nan))
+
+    class Killed(Camel):
+        def evaluate(self, X: Array) -> Observations:
+            raise TruthInterrupted("a worker died twice")
+
+    class Doubtful(Camel):
+        def finish(self, *_: Any) -> str:
+            return "not_verified"
+
+    shutil.copytree(camel_copy, tmp_path / "Doubtful")
+    for kind, code in ((Empty, 3), (Doubtful, 4), (Killed, 130)):
+        folder = tmp_path / kind.__name__
+        folder.mkdir(exist_ok=True)
+        installed(kind)
+        assert main([str(folder), "--quiet"]) == code
+        output, errors = capsys.readouterr()
+        assert output == ""
+        assert len(errors.splitlines()) == 1
+        assert ("resumes" in errors) == (code == 130)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "is missing, and there is not one truth installed but: camel, other"),
+        ("{", "is no readable JSON"),
+        ("[]", "truth: is missing"),
+        ('{"truth": 3}', "truth: is missing"),
+        ('{"truth": "os:system"}', "truth: 'os:system' is not installed (known: camel, other)"),
+        ('{"truth": "../evil.py"}', "is not installed"),
+        ('{"truth": "a\\u001b[2J"}', "'a\\x1b[2J' is not installed"),
+    ],
+)
+def test_a_folder_that_names_no_known_truth_is_refused(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    text: str | None,
+    words: str,
+) -> None:
+    points = [type("Point", (), {"name": name})() for name in ("other", "camel")]
+    monkeypatch.setattr(truth_module, "entry_points", lambda group: points)
+    if text is not None:
+        (tmp_path / "truth.json").write_text(text)
+    assert main([str(tmp_path)]) == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith(f"{tmp_path / 'truth.json'}: ")
+    assert words in errors
+
+
+@pytest.mark.parametrize(
+    "more",
+    [["--budget", "0"], ["--budget", "many"], ["--tolerance", "nan"], ["--tolerance", "-1"],
+     ["--batch", "0"], ["--explore", "1.5"], ["--workers", "0"], ["--seed", "-1"], ["--no"]],
+)  # fmt: skip
+def test_wrong_options_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    assert main([str(tmp_path), *more]) == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert len(errors.splitlines()) == 1
+    assert more[0] in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path / "absent")]) == 2
+    assert "there is no such run folder" in capsys.readouterr().err
+
+
+def test_a_copy_is_retrained_and_the_run_left_alone(
+    camel_copy: Path,
+    tmp_path: Path,
+    installed: Callable[[Any], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    installed(Camel)
+    with sqlite3.connect(camel_copy / "samples.sqlite") as database:
+        database.execute("create table t (x)")
+        database.execute("insert into t values (7)")
+    before = {path.name: path.read_bytes() for path in camel_copy.glob("*") if path.is_file()}
+    out = tmp_path / "out"
+    for _ in range(2):  # made, then gone on with
+        assert main([str(camel_copy), "--out", str(out), "--quiet"]) == 0
+        assert capsys.readouterr() == ("", "")
+    after = {path.name: path.read_bytes() for path in camel_copy.glob("*") if path.is_file()}
+    assert after == before
+    assert entries(out)[: len(entries(camel_copy))] == entries(camel_copy)
+    assert [e["event"] for e in entries(out)][-4:] == ["start", "end", "start", "end"]
+    with sqlite3.connect(out / "samples.sqlite") as database:
+        assert database.execute("select x from t").fetchall() == [(7,)]

@@ -1,0 +1,260 @@
+"""Retraining of case study 1: from sixteen samples to the verified optimum, whatever kills it."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camel import entries
+
+import surrogates.truth as truth_module
+from ccd_casadi import sampling
+from ccd_casadi.retraining import open_run
+from ccd_casadi.solve import main as solve
+from surrogates import load, sobol
+from surrogates.acquisition import NEAR, distances
+from surrogates.retrain import main
+from surrogates.retraining import Settings, retrain
+from surrogates.versions import Versions
+
+ROOT = Path(__file__).parent.parent
+TWO_MASS = ROOT / "runs" / "two_mass.toml"
+
+
+def started_from(folder: Path, n: int = 16, case: Path = TWO_MASS) -> Path:
+    """A run folder with a case and a few samples, and nothing else."""
+    folder.mkdir()
+    shutil.copy(case, folder / "case.toml")
+    with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
+        truth.evaluate(sobol(truth.lower, truth.upper, n, 0))
+    return folder
+
+
+def job(folder: Path, **settings: Any) -> Any:
+    with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
+        return retrain(folder, truth, Settings(**settings))
+
+
+@pytest.fixture(scope="module")
+def retrained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = started_from(tmp_path_factory.mktemp("two_mass") / "run")
+    outcome = job(folder)
+    assert (outcome.status, outcome.reason) == ("verified", "converged")
+    return folder
+
+
+def result(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "result.json").read_text())
+
+
+def test_sixteen_samples_are_enough_to_begin_with(retrained: Path) -> None:
+    found = result(retrained)
+    assert found["status"] == "verified"
+    assert found["objective"] == pytest.approx(-439.4648, abs=1e-3)
+    assert found["formulation"] == "lifted"
+    assert set(found["active"]) == {"m1 lower", "m2 lower", "S_max", "omega_S upper"}
+    assert found["retraining"]["version"] == Versions(retrained).names()[-1]
+    rounds = [line for line in entries(retrained) if line["event"] == "round"]
+    assert 16 + sum(len(line["batch"]) for line in rounds) <= 40
+    for name in ("controller.json", "report.html", "surrogate.json", "truth.json"):
+        assert (retrained / name).stat().st_size > 0
+
+
+def test_nothing_is_computed_a_second_time(
+    retrained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def untouchable(*_: Any) -> None:
+        raise AssertionError("this was sampled already")
+
+    for name in ("inner_unit", "design_unit", "true_design"):
+        monkeypatch.setattr(sampling, name, untouchable)
+    before = result(retrained)
+    outcome = job(retrained)
+    assert (outcome.status, outcome.rounds) == ("verified", 0)
+    assert result(retrained) == before
+
+
+@pytest.mark.parametrize("name", ["0001", pytest.param("0002", marks=pytest.mark.slow)])
+def test_solve_starts_from_a_named_version(retrained: Path, tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(retrained / "surrogates", folder / "surrogates")
+    words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--quiet"]
+    assert solve([*words, "--formulation", "lifted", "--surrogate", name]) == 0
+    found = result(folder)
+    assert found["objective"] == pytest.approx(-439.4648, abs=1e-3)
+    assert found["syntheses"] < 16 + 48, "without the 24 samples of the usual start"
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--surrogate", "0099"], "there is no such version; known are 0001 to"),
+        (["--surrogate", "../../x"], "there is no such version"),
+        (["--surrogate", "0001", "--formulation", "nested"], "no surrogate of the nested form"),
+        (["--surrogate", "0001", "--formulation", "direct"], "no surrogate of the direct form"),
+    ],
+)
+def test_solve_refuses_a_version_that_is_none(
+    retrained: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
+) -> None:
+    line = [str(TWO_MASS), "--out", str(retrained), "--quiet", "--formulation", "lifted", *more]
+    before = result(retrained)
+    assert solve(line) == 2
+    output, errors = capsys.readouterr()
+    assert (output, len(errors.splitlines())) == ("", 1)
+    assert words in errors
+    assert result(retrained) == before
+
+
+def test_a_nested_run_is_retrained_over_theta(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    shutil.copy(TWO_MASS, folder / "case.toml")
+    (folder / "truth.json").write_text('{"truth": "ccd_casadi", "formulation": "nested"}')
+    outcome = job(folder)
+    assert outcome.status == "verified"
+    found = result(folder)
+    assert found["formulation"] == "nested"
+    assert found["objective"] == pytest.approx(-439.4648, abs=1e-3)
+    newest, _ = load(folder / "surrogate.json")
+    assert newest[0].X.shape[1] == 2
+    count = found["syntheses"]
+    words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--quiet"]
+    assert solve([*words, "--surrogate", "0001"]) == 0
+    with sqlite3.connect(folder / "samples.sqlite") as database:
+        (after,) = database.execute("select count(*) from samples").fetchone()
+    assert after <= count + 200, "its thetas were found in the store"
+
+
+def test_a_damaged_case_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "truth.json").write_text('{"truth": "ccd_casadi"}')
+    if "ccd_casadi" not in {p.name for p in truth_module.entry_points(group=truth_module.GROUP)}:
+        pytest.skip("the package was installed before it had the entry point: run make setup")
+    assert main([str(tmp_path)]) == 2
+    assert f"{tmp_path / 'case.toml'}: there is no such file" in capsys.readouterr().err
+    (tmp_path / "case.toml").write_text("[plant]\n")
+    assert main([str(tmp_path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    shutil.copy(TWO_MASS, tmp_path / "case.toml")
+    (tmp_path / "truth.json").write_text('{"truth": "ccd_casadi", "formulation": "both"}')
+    assert main([str(tmp_path)]) == 2
+    assert "formulation: 'both' is unknown" in capsys.readouterr().err
+    (tmp_path / "truth.json").write_text('{"truth": "ccd_casadi"}')
+    (tmp_path / "samples.sqlite").write_text("no samples\n" * 100)
+    assert main([str(tmp_path)]) == 2
+    assert "samples.sqlite" in capsys.readouterr().err
+
+
+# ---- real processes ------------------------------------------------------------------------------
+
+
+JOB = """
+import sys
+from pathlib import Path
+from ccd_casadi.retraining import open_run
+import surrogates.truth as module
+
+class Point:
+    name = "ccd_casadi"
+    def load(self):
+        return open_run
+
+module.entry_points = lambda group: [Point()]
+import surrogates.retrain
+raise SystemExit(surrogates.retrain.main(sys.argv[1:]))
+"""
+
+
+def launched(folder: Path, *more: str) -> subprocess.Popen[str]:
+    """The command, with its entry point whether or not the package is installed anew."""
+    return subprocess.Popen(
+        [sys.executable, "-c", JOB, str(folder), "--quiet", "--workers", "1", *more],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def keys(folder: Path) -> list[str]:
+    with sqlite3.connect(folder / "samples.sqlite") as database:
+        return [row[0] for row in database.execute("select key from samples")]
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_it_soon_and_it_resumes(tmp_path: Path) -> None:
+    folder = started_from(tmp_path / "run")
+    process = launched(folder)
+    limit = time.monotonic() + 60.0
+    while not (folder / "retrain.jsonl").exists() and process.poll() is None:
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGINT)
+    began = time.monotonic()
+    output, errors = process.communicate(timeout=30)
+    if process.returncode == 0:
+        pytest.skip("it had finished")
+    assert (process.returncode, output) == (130, "")
+    assert time.monotonic() - began < 2.0
+    assert len(errors.splitlines()) == 1
+    assert "resumes" in errors
+    assert not (folder / "result.json").exists()
+
+
+@pytest.mark.slow
+def test_killed_at_random_it_ends_the_same(retrained: Path, tmp_path: Path) -> None:
+    folder = started_from(tmp_path / "run")
+    rng, killed = random.Random(4), 0
+    began = time.monotonic()
+    plain = launched(started_from(tmp_path / "plain"))
+    plain.communicate()
+    whole = time.monotonic() - began
+    while killed < 20:
+        process = launched(folder)
+        time.sleep(rng.uniform(0.2, 1.0) * whole)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        if process.returncode == -signal.SIGKILL:
+            killed += 1
+        else:
+            assert process.returncode == 0
+            shutil.rmtree(folder)
+            started_from(folder)
+    assert job(folder).status == "verified"
+    assert len(set(keys(folder))) == len(keys(folder))
+    ours, theirs = result(folder), result(retrained)
+    assert ours["objective"] == pytest.approx(theirs["objective"], rel=1e-6)
+    assert ours["theta"] == pytest.approx(theirs["theta"], rel=1e-6)
+    assert ours["active"] == theirs["active"]
+    for path in (folder / "surrogates").glob("*.json"):
+        json.loads(path.read_text())
+
+
+@pytest.mark.slow
+def test_two_jobs_lose_and_double_nothing(retrained: Path, tmp_path: Path) -> None:
+    folder = started_from(tmp_path / "run")
+    both = [launched(folder, "--batch", "2") for _ in range(2)]
+    assert [process.communicate()[1] for process in both] == ["", ""]
+    assert [process.returncode for process in both] == [0, 0]
+    rounds = [line for line in entries(folder) if line["event"] == "round"]
+    X = np.array([x for line in rounds for x in line["batch"]])
+    with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
+        gaps = [distances(truth, X[i : i + 1], np.delete(X, i, axis=0))[0] for i in range(len(X))]
+        known = truth.samples().X
+        assert (distances(truth, X, known) <= 1e-9).all(), "nothing is lost"
+    assert min(gaps) > NEAR, "no point was asked twice"
+    names = Versions(folder).names()
+    assert [int(name) for name in names] == list(range(1, len(names) + 1))
+    index = json.loads((folder / "surrogates" / "index.json").read_text())["versions"]
+    assert [record["version"] for record in index] == names
+    assert len({record["samples"] for record in index}) == len(index)
+    assert result(folder)["objective"] == pytest.approx(result(retrained)["objective"], rel=1e-6)
+    assert job(folder).rounds == 0
