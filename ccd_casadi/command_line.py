@@ -50,6 +50,12 @@ def parser(
             default=Path(DEFAULT_CASE),
             help=f"the case file (default: {DEFAULT_CASE})",
         )
+    _shared(result)
+    return result
+
+
+def _shared(result: argparse.ArgumentParser) -> None:
+    """--out, --workers, --seed and --quiet, which every command has."""
     result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
     result.add_argument(
         "--workers", metavar="N", type=_positive, default=usable_cores(),
@@ -57,6 +63,13 @@ def parser(
     )  # fmt: skip
     result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
+
+
+def run_parser(command: str, description: str) -> argparse.ArgumentParser:
+    """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
+    result = _Parser(prog=f"python -m {command}", description=description)
+    result.add_argument("run", metavar="RUN_DIR", type=Path, help="the folder of a finished solve")
+    _shared(result)
     return result
 
 
@@ -85,7 +98,8 @@ def run(
     except SystemExit as ended:  # argparse, after --help or a wrong option
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
-        print(_one_line(f"{getattr(options, 'case', '')}: plant: {error}"), file=sys.stderr)
+        place = getattr(options, "case", None) or getattr(options, "run", "")
+        print(_one_line(f"{place}: plant: {error}"), file=sys.stderr)
         return ExitCode.BAD_INPUT
     except UserError as error:
         print(_one_line(error), file=sys.stderr)

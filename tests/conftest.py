@@ -29,3 +29,15 @@ def camel_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Any]
 def camel_copy(camel_run: tuple[Path, Any, Any], tmp_path: Path) -> Path:
     """That job's folder, to be changed."""
     return Path(shutil.copytree(camel_run[0], tmp_path / "run"))
+
+
+@pytest.fixture(scope="session")
+def two_mass_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of case study 1, solved once (lifted); it is not to be changed."""
+    from ccd_casadi.solve import main
+
+    folder = tmp_path_factory.mktemp("two_mass")
+    case = Path(__file__).parent.parent / "runs" / "two_mass.toml"
+    options = ["--out", str(folder), "--formulation", "lifted", "--workers", "1", "--quiet"]
+    assert main([str(case), *options]) == 0
+    return folder

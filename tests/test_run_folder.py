@@ -1,0 +1,75 @@
+"""A finished run read back: the same design, and one line for what is missing or wrong."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccd_casadi.errors import UserError
+from ccd_casadi.run_folder import read_run
+
+
+def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], object]) -> None:
+    path = folder / name
+    found = json.loads(path.read_text())
+    change(found)
+    path.write_text(json.dumps(found))
+
+
+def test_the_design_is_measured_again_as_it_was_written(two_mass_run: Path) -> None:
+    run = read_run(two_mass_run)
+    assert run.figures.certified
+    result = json.loads((two_mass_run / "result.json").read_text())
+    assert run.figures.bandwidth / (2 * 3.141592653589793) == pytest.approx(
+        result["bandwidth_hz"], rel=1e-12
+    )
+    assert run.figures.gamma == pytest.approx(result["gamma"], rel=1e-9)
+    assert run.theta == tuple(result["theta"].values())
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("controller.json", lambda c: c["A"].pop(), "A"),
+        ("controller.json", lambda c: c.pop("B"), "B: is no matrix"),
+        ("controller.json", lambda c: c["D"][0].__setitem__(0, None), "D: is no finite matrix"),
+        ("controller.json", lambda c: c["D"][0].__setitem__(0, 1e9), "not certified"),
+        ("result.json", lambda r: r.update(status="infeasible"), "no feasible design"),
+        ("result.json", lambda r: r["theta"].update(m1=1.0), "theta.m1: is outside"),
+        ("result.json", lambda r: r["theta"].update(m1="x"), "theta.m1"),
+        ("result.json", lambda r: r["theta"].pop("m1"), "theta: does not name m1, m2"),
+        ("result.json", lambda r: r.update(gamma=float("nan")), "gamma: is no number"),
+        ("result.json", lambda r: r.update(omega_S_hz=-1.0), "omega_S_hz: is not positive"),
+    ],
+)
+def test_what_was_changed_is_named(
+    two_mass_run: Path, tmp_path: Path, name: str, change: Callable[..., object], words: str
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    edited(folder, name, change)
+    with pytest.raises(UserError, match=words) as caught:
+        read_run(folder)
+    assert str(folder / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["controller.json", "result.json"])
+@pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"\xff\xfe", b"[" * 100000])
+def test_a_damaged_file_is_named(
+    two_mass_run: Path, tmp_path: Path, name: str, text: bytes
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    (folder / name).write_bytes(text)
+    with pytest.raises(UserError, match="solve the case"):
+        read_run(folder)
+    (folder / name).unlink()
+    with pytest.raises(UserError, match="there is no such file"):
+        read_run(folder)
+
+
+def test_a_folder_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is no folder"):
+        read_run(tmp_path / "nothing")
