@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eig
+from slycot import tb01id
 
 from ccd_casadi.channels import Channel, find_channels
 from ccd_casadi.kernels.gamma import plant_gain
@@ -120,6 +121,33 @@ def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
     grid, gain = _gains(A, B, C)
     channels = _scaled_channels(find_channels(modal.K, modal.D, modal.B, modal.C), A, B, C)
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
+
+
+def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
+    """The scaled plant of any strictly proper state space in SI, for weights with this M_K (N/m).
+
+        ω₀² = M_K ‖C A B‖, the inertial compliance being C A B / s²
+
+    Coordinates are balanced (SLICOT's TB01ID); there are no derivatives and no channels. Raises
+    PlantError for a plant with feedthrough, that is not finite, or that no state drives.
+    """
+    n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
+    if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C)):
+        raise PlantError("its state space is not finite")
+    if np.any(system.D):
+        raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
+    inertial = float(np.linalg.norm(system.C @ system.A @ system.B, 2))
+    if not inertial > 0.0:
+        raise PlantError("C A B is zero: no force accelerates what is measured")
+    omega_0 = float(np.sqrt(M_K * inertial))
+    parts = (system.A / omega_0, system.B * (M_K / omega_0), system.C)
+    _, A, B, C, _ = tb01id(n, m, p, 0.0, *(np.array(part, order="F") for part in parts))
+    A, B, C = (np.ascontiguousarray(part) for part in (A, B, C))
+    grid, gain = _gains(A, B, C)
+    poles = np.linalg.eigvals(system.A)
+    natural = np.sort(np.abs(poles[poles.imag >= 0.0]))
+    none = (np.zeros((0, n, n)), np.zeros((0, n, m)), np.zeros((0, p, n)))
+    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
 
 
 def _scaled_channels(
