@@ -7,7 +7,7 @@ with the total derivatives of the true synthesis. Variables are scaled to the un
 residual to the gradient of J: r = ‖∇J + Aᵀμ‖∞/‖∇J‖∞ with μ >= 0 by non-negative least squares.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -23,6 +23,7 @@ from ccd_casadi.problem import CoDesignProblem, plant_of
 # The polish stops where steps no longer change J by more than rounding; a constraint closer
 # than this (in logarithm, or share of the box) is one that it runs along.
 ACTIVE = 1e-6
+STEP = 1e-4  # of the box: differences of true gradients
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def kkt_certificate(
     """First-order residuals at x; the second-order check too where `true_at` may synthesise."""
     lower, upper = lifted_bounds(problem)
     width = upper - lower
-    gradient, g, jacobian, names = _derivatives(problem, x, design, width)
+    gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
     slack_low, slack_high = (x - lower) / width, (upper - x) / width
     rows, labels, slack = [], [], []
     for value, row, name in zip(g, jacobian, names, strict=True):
@@ -78,7 +79,7 @@ def kkt_certificate(
     primal = max(0.0, float(-slack_low.min()), float(-slack_high.min()))
     if g.size:
         primal = max(primal, float(g.max()))
-    second = _second_order(problem, x, A[mu > 0.0], width, size, mu, labels, true_at)
+    second = _second_order(problem, x, A[mu > 0.0], size, mu, labels, true_at)
     return KktCertificate(
         stationarity=float(np.abs(residual).max()) / size,
         primal=primal,
@@ -90,12 +91,14 @@ def kkt_certificate(
     )
 
 
-def _derivatives(
-    problem: CoDesignProblem, x: Array, design: Sensitivities, width: Array
+def lagrangian_parts(
+    problem: CoDesignProblem, x: Array, design: Sensitivities
 ) -> tuple[Array, Array, Array, tuple[str, ...]]:
     """∇J, g and its Jacobian in unit-box variables, and the constraints' names."""
     plant = plant_of(problem)
     count = len(problem.names)
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
     theta = x[:count]
     symbol = ca.SX.sym("theta", count)
     f, lam = plant.hardware(symbol)
@@ -118,7 +121,6 @@ def _second_order(
     problem: CoDesignProblem,
     x: Array,
     strong: Array,
-    width: Array,
     size: float,
     mu: Array,
     labels: list[str],
@@ -130,27 +132,46 @@ def _second_order(
         return np.inf
     if true_at is None:
         return None
+    columns = lagrangian_hessian(
+        problem, x, Z, dict(zip(labels, map(float, mu), strict=True)), true_at
+    )
+    if columns is None:
+        return None
+    H = Z.T @ columns
+    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+
+
+def lagrangian_hessian(
+    problem: CoDesignProblem,
+    x: Array,
+    directions: Array,
+    multipliers: Mapping[str, float],
+    true_at: Callable[[Array], Sensitivities],
+) -> Array | None:
+    """∇²L Z (n, k) by differences of true gradients, unit-box variables; None where not certified.
+
+    At a bound the difference is one-sided. `multipliers` by the certificate's names.
+    """
     lower, upper = lifted_bounds(problem)
-    weights = dict(zip(labels, mu, strict=True))
+    width = upper - lower
 
     def slope(at: Array) -> Array | None:
         design = true_at(at)
         if not design.figures.certified:
             return None
-        gradient, _, jacobian, names = _derivatives(problem, at, design, width)
+        gradient, _, jacobian, names = lagrangian_parts(problem, at, design)
         return gradient + sum(
-            (weights.get(name, 0.0) * row for name, row in zip(names, jacobian, strict=True)),
+            (multipliers.get(name, 0.0) * row for name, row in zip(names, jacobian, strict=True)),
             start=np.zeros(x.size),
         )
 
-    H = np.empty((Z.shape[1], Z.shape[1]))
-    h = 1e-4
-    for k in range(Z.shape[1]):
-        step = h * Z[:, k] * width
+    columns = np.empty((x.size, directions.shape[1]))
+    for k, direction in enumerate(directions.T):
+        step = STEP * direction * width
         ends = [np.clip(x + sign * step, lower, upper) for sign in (1.0, -1.0)]
         slopes = [slope(end) for end in ends]
         span = float(np.linalg.norm((ends[0] - ends[1]) / width))
-        if slopes[0] is None or slopes[1] is None or span < 0.5 * h:
+        if slopes[0] is None or slopes[1] is None or span < 0.5 * STEP:
             return None
-        H[:, k] = Z.T @ (slopes[0] - slopes[1]) / span
-    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+        columns[:, k] = (slopes[0] - slopes[1]) / span
+    return columns

@@ -22,7 +22,10 @@ from surrogates import design
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g(x) <= 0, lower <= x <= upper, with names for what may bind."""
+    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper, with names for what may bind.
+
+    `g_lower` is minus infinity where it is not given; zero makes an equation of a row.
+    """
 
     x: ca.MX
     f: ca.MX
@@ -32,6 +35,7 @@ class NonlinearProgram:
     variables: tuple[str, ...]
     constraints: tuple[str, ...]
     exact_hessian: bool = True
+    g_lower: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -155,11 +159,12 @@ def solve_program(
         }
     problem: dict[str, Any] = {"x": z, "f": f, "g": g}
     solver = ca.nlpsol("outer", "ipopt", problem, options)
+    g_lower = -np.inf if program.g_lower is None else program.g_lower
     found: list[LocalOptimum] = []
     for start in np.atleast_2d(starts):
         z0 = np.clip((start - program.lower) / width, 0.0, 1.0)
         with interrupts_kept():
-            result = solver(x0=z0, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
+            result = solver(x0=z0, lbx=0.0, ubx=1.0, lbg=g_lower, ubg=0.0)
         stats = solver.stats()
         point = np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)
         found.append(

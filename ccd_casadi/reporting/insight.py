@@ -1,0 +1,175 @@
+"""What a designer asks of an optimum: the trade-off, what it answers to, what limits it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.pareto import Front
+from ccd_casadi.post_optimal import PostOptimal
+from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
+from ccd_casadi.reporting.loops import Loop
+from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.svg import CYCLE, GREY
+from ccd_casadi.reporting.units import shown_unit
+
+HZ = 2.0 * np.pi
+RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
+
+
+def figure_front(
+    problem: CoDesignProblem, front: Front, design: tuple[float, float, str], *, key: str = "front"
+) -> str:
+    """Bandwidth over hardware cost, and where each θ lies in its bounds along the curve.
+
+    `design` is (f, ω_b in Hz, words) of the run's own optimum.
+    """
+    cost = np.array([point.hardware_cost for point in front.points])
+    hz = np.array([point.bandwidth for point in front.points]) / HZ
+    good = np.array([point.efficient and point.verified for point in front.points])
+    failed = np.array([not point.verified for point in front.points])
+    curves = [
+        Curve(cost, hz, "fastest at this cost", GREY, marker="."),
+        Curve(
+            cost[good], hz[good], "efficient: nothing is lighter and faster", line="", marker="o"
+        ),
+    ]
+    if failed.any():
+        curves.append(Curve(cost[failed], hz[failed], "not verified", CYCLE[1], "", "x"))
+    mark = Mark(design[0], design[1], design[2], "s", offset=(58.0, -3.0))
+    top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
+    low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
+    theta = (np.array([point.theta for point in front.points]) - low) / width
+    parts = tuple(
+        Curve(cost, theta[:, i], name, CYCLE[i % len(CYCLE)], marker=".")
+        for i, name in enumerate(problem.names)
+    )
+    bottom = Panel("hardware cost f", "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
+    title = "Largest bandwidth at each hardware cost, and the hardware that reaches it"
+    return figure_lines([[top], [bottom]], key=key, title=title, heights=(3.3, 2.8))
+
+
+def caption_front(front: Front) -> str:
+    """How many points, how well they are known, and what the trade-off comes to."""
+    points = front.points
+    verified = sum(point.verified for point in points)
+    efficient = [point for point in points if point.efficient and point.verified]
+    words = (
+        f"{verified} of {len(points)} points verified by the true inner problem, in {front.rounds} "
+        f"rounds of prediction and truth, {front.syntheses} true syntheses. "
+    )
+    if len(efficient) == 1:
+        only = efficient[0]
+        return words + (
+            f"One point dominates all others, f = {number(only.hardware_cost)} with "
+            f"{number(only.bandwidth / HZ, 4)} Hz: here the lightest design is also the fastest, "
+            "and the curve shows what every further unit of cost would lose."
+        )
+    if len(efficient) > 1:
+        light, fast = efficient[0], efficient[-1]
+        rate = (fast.bandwidth - light.bandwidth) / HZ / (fast.hardware_cost - light.hardware_cost)
+        words += (
+            f"{len(efficient)} of them are efficient, from f = {number(light.hardware_cost)} with "
+            f"{number(light.bandwidth / HZ, 4)} Hz to f = {number(fast.hardware_cost)} with "
+            f"{number(fast.bandwidth / HZ, 4)} Hz: on average {number(rate, 3)} Hz per unit of f."
+        )
+    return words
+
+
+def table_front(problem: CoDesignProblem, front: Front) -> Table:
+    """One row a point."""
+    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
+    heads = (f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, shown, strict=True))
+    rows = tuple(
+        (
+            point.hardware_cost,
+            point.bandwidth / HZ,
+            point.predicted / HZ,
+            *(factor * v for (_, factor), v in zip(shown, point.theta, strict=True)),
+            ", ".join(point.active),
+            "efficient" if point.efficient else "",
+            "verified" if point.verified else point.reason,
+        )
+        for point in front.points
+    )
+    head = ("f", "ω_b (Hz)", "predicted (Hz)", *heads, "what binds", "", "status")
+    return Table(head, rows)
+
+
+def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
+    """The parameters that the optimum answers to, per unit, in the units of the case file."""
+    rows = []
+    for item in found.responses:
+        name, value, factor, unit = _unit(problem, item.parameter, item.value)
+        moved = [abs(item.objective), *np.abs(item.theta), *np.abs(item.ln_omega)]
+        if not np.nanmax(moved) > 0.0:
+            continue
+        theta = ", ".join(
+            f"{n} {number(v / factor, 3)}"
+            for n, v in zip((*problem.names, "ln ω_S", "ln ω_T"), (*item.theta, *item.ln_omega),
+                            strict=True)
+            if v != 0.0 and np.isfinite(v)
+        )  # fmt: skip
+        rows.append(
+            (
+                name,
+                f"{number(value)} {unit}".strip(),
+                item.objective / factor,
+                item.bandwidth / HZ / factor,
+                item.hardware_cost / factor,
+                theta or "does not move",
+            )
+        )
+    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", "d(θ, ln ω)/dp")
+    return Table(head, tuple(rows))
+
+
+def _unit(problem: CoDesignProblem, name: str, value: float) -> tuple[str, float, float, str]:
+    """Name, value, units of the file per SI unit, and the unit: Hz for ω_S and ω_T."""
+    variable = name.rpartition(" ")[0]
+    if variable in ("omega_S", "omega_T"):
+        return name.replace("omega", "ω"), value / HZ, 1.0 / HZ, "Hz"
+    if variable in problem.names:
+        unit, factor = shown_unit(problem.units[problem.names.index(variable)], value)
+        return name, factor * value, factor, unit
+    return name, value, 1.0, ""
+
+
+def response_sentences(found: PostOptimal) -> list[str]:
+    """What the table means, and where it ends."""
+    words = [
+        "Per unit of the parameter in the case file's unit, for the whole re-optimised design: "
+        "dJ*/dp and how ω_b, f and θ move with it. Parameters that are not listed change nothing."
+    ]
+    if not found.determined:
+        words.append(
+            "The second-order conditions do not determine how the design moves (dependent "
+            "constraints, or no strict minimum), so only dJ*/dp is given."
+        )
+    if found.weak:
+        words.append(
+            f"{', '.join(found.weak)} is only touched: beyond it the responses are one-sided."
+        )
+    return words
+
+
+def rule_sentence(loop: Loop, natural_hz: Sequence[float]) -> str:
+    """The rule of thumb, first resonance 3 to 5 times the bandwidth, against what was achieved."""
+    if not natural_hz:
+        return "The plant has no flexible mode: the rule of thumb says nothing about it."
+    first = min(natural_hz)
+    ratio = first / loop.bandwidth_hz
+    low, high = RULE
+    verdict = (
+        f"below the {low:g} to {high:g} that the rule of thumb asks for: the controller works "
+        "where the rule would not go, and its robustness to that resonance deserves a look"
+        if ratio < low
+        else f"within the {low:g} to {high:g} of the rule of thumb"
+        if ratio <= high
+        else f"above the {low:g} to {high:g} of the rule of thumb: the resonance is not what limits"
+    )
+    return (
+        f"The first resonance, {number(first, 4)} Hz, is {number(ratio, 3)} times the bandwidth, "
+        f"{verdict}. By the rule this stage would get {number(first / high, 3)} to "
+        f"{number(first / low, 3)} Hz."
+    )
