@@ -2,10 +2,9 @@
 
     max ω_b*(θ)   s.t.  f(θ) = f_k,  θ_min <= θ <= θ_max,  λ(θ) <= 0,     k = 1 … N
 
-An equation, not a bound: where lighter is also faster the curve shows by how much, and its
-efficient part (lighter and faster than all others) shrinks to what is worth building. IPOPT
-walks it on the lifted surrogates, each point started from its neighbour's; the true inner
-problem answers at every θ, and its designs teach the surrogates until both agree.
+An equation, not a bound: where lighter is also faster, the curve shows by how much. IPOPT walks
+it on the lifted surrogates, each point started from its neighbour's; the true inner problem
+answers at every θ, and its designs teach the surrogates until both agree.
 """
 
 from collections.abc import Sequence
@@ -30,6 +29,7 @@ from surrogates import GaussianProcess, design, to_casadi
 
 STARTS = 6  # of IPOPT at every point, besides its neighbours' optima
 FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
+DOMINATED = 1e-3  # of the costs' range: closer to the lightest, the fastest is the same design
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,9 @@ def pareto_front(
     max_rounds: int = 8,
     seed: int = 0,
 ) -> Front:
-    """The front by `points` costs, evenly spaced over what the box and λ allow.
+    """The front by `points` costs, evenly spaced from the lightest to the fastest design.
+
+    Where the lightest is the fastest there is no trade-off, and the costs go on to the largest.
 
     `samples` designs are sampled first (0: six per variable). Raises UserError where the
     hardware cost is constant, or where too few designs are certified to learn from.
@@ -86,7 +88,7 @@ def pareto_front(
     processes, fitted = fit_quantities(problem, known, seed), len(known)
     program = _program(problem, processes)
     starts = design("sobol", lower, upper, STARTS, seed + 1)
-    ends = [_extreme(program, problem, starts, sign) for sign in (1.0, -1.0)]
+    ends = _ends(program, problem, starts)
     f_low, f_high = (hardware_cost(plant_of(problem), x[:-2]) for x in ends)
     if not f_high - f_low > FLAT * max(abs(f_low), abs(f_high)):
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
@@ -160,19 +162,23 @@ def _at_theta(program: NonlinearProgram, theta: Array) -> NonlinearProgram:
     return replace(program, x=omega, f=f, g=g, lower=lower, upper=upper, variables=variables)
 
 
-def _extreme(
-    program: NonlinearProgram, problem: CoDesignProblem, starts: Array, sign: float
-) -> Array:
-    """Where the hardware cost is least (sign 1) or largest (-1) among predicted feasible designs.
+def _ends(program: NonlinearProgram, problem: CoDesignProblem, starts: Array) -> list[Array]:
+    """The lightest and the fastest predicted feasible design; where these are one, the heaviest.
 
     Raises UserError where IPOPT finds none.
     """
     f = plant_of(problem).hardware(program.x[: len(problem.names)])[0]
+    bandwidth = (program.f - problem.w1 * f) / problem.w2
     try:
-        return solve_program(replace(program, f=sign * f), starts).best.x
+        light, fast, heavy = (
+            solve_program(replace(program, f=part), starts).best.x for part in (f, -bandwidth, -f)
+        )
     except OuterFailure as error:
         words = "no design in the box is predicted to meet the constraints; widen the bounds"
         raise UserError(f"no trade-off: {words} ({error})") from None
+    costs = [hardware_cost(plant_of(problem), x[:-2]) for x in (light, fast, heavy)]
+    trades = costs[1] - costs[0] > DOMINATED * (costs[2] - costs[0])
+    return [light, fast if trades else heavy]
 
 
 def _point(

@@ -1,4 +1,4 @@
-"""How the optimum answers to what was given: S_max, S_low, every bound, w1 and w2.
+"""How the optimum answers to what was given: S_max, S_low, λ <= 0, every bound, w1 and w2.
 
 At a design that satisfies the optimality conditions of the true problem
 
@@ -123,7 +123,7 @@ def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
 def _parameters(
     problem: CoDesignProblem, x: Array, bandwidth: float, slope_f: Array, slope_b: Array
 ) -> Iterator[_Parameter]:
-    """w1, w2, S_max, S_low, and the bounds of θ, ω_S, ω_T."""
+    """w1, w2, S_max, S_low, the level of each λ, and the bounds of θ, ω_S, ω_T."""
     none = np.zeros(x.size)
     cost = float(plant_of(problem).hardware(x[: len(problem.names)])[0])
     yield _Parameter("w1", problem.w1, slope_f, cost=cost)
@@ -131,6 +131,8 @@ def _parameters(
     inner = problem.inner
     yield _Parameter("S_max", inner.S_max, none, {"S_max": -1.0 / inner.S_max})
     yield _Parameter("S_low", inner.S_low, none, {"S_low": -1.0 / inner.S_low})
+    for name in plant_of(problem).constraint_names:
+        yield _Parameter(f"{name} <= 0", 0.0, none, {name: -1.0})
     lower, upper = lifted_bounds(problem)
     for i, name in enumerate((*problem.names, "omega_S", "omega_T")):
         for end, bound, sign in (("lower", lower[i], 1.0), ("upper", upper[i], -1.0)):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.outer import lifted_bounds
 from ccd_casadi.pareto import Front
 from ccd_casadi.post_optimal import PostOptimal
 from ccd_casadi.problem import CoDesignProblem
@@ -14,6 +15,7 @@ from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.reporting.units import shown_unit
 
 HZ = 2.0 * np.pi
+ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
 
 
@@ -99,17 +101,23 @@ def table_front(problem: CoDesignProblem, front: Front) -> Table:
 def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
     """The parameters that the optimum answers to, per unit, in the units of the case file."""
     rows = []
+    lower, upper = lifted_bounds(problem)
+    units = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
+    shown = [factor for _, factor in units]
+    labels = [f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, units, strict=True)]
+    labels += ["ln ω_S", "ln ω_T"]
+    sizes = (upper - lower) * np.array([*shown, 1.0, 1.0])
     for item in found.responses:
         name, value, factor, unit = _unit(problem, item.parameter, item.value)
         moved = [abs(item.objective), *np.abs(item.theta), *np.abs(item.ln_omega)]
         if not np.nanmax(moved) > 0.0:
             continue
+        moves = (*(f * v for f, v in zip(shown, item.theta, strict=True)), *item.ln_omega)
         theta = ", ".join(
-            f"{n} {number(v / factor, 3)}"
-            for n, v in zip((*problem.names, "ln ω_S", "ln ω_T"), (*item.theta, *item.ln_omega),
-                            strict=True)
-            if v != 0.0 and np.isfinite(v)
-        )  # fmt: skip
+            f"{label} {number(v / factor, 3)}"
+            for label, v, size in zip(labels, moves, sizes, strict=True)
+            if abs(v) * (abs(item.value) or 1.0) > ROUNDING * size
+        )
         rows.append(
             (
                 name,
@@ -166,7 +174,7 @@ def rule_sentence(loop: Loop, natural_hz: Sequence[float]) -> str:
         if ratio < low
         else f"within the {low:g} to {high:g} of the rule of thumb"
         if ratio <= high
-        else f"above the {low:g} to {high:g} of the rule of thumb: the resonance is not what limits"
+        else f"above the {low:g} to {high:g} of the rule of thumb: by that rule it could be faster"
     )
     return (
         f"The first resonance, {number(first, 4)} Hz, is {number(ratio, 3)} times the bandwidth, "
