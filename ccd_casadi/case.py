@@ -24,12 +24,12 @@ from ccd_casadi.case_checks import (
     text,
     too_large,
 )
-from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection
+from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
 from ccd_casadi.models import BUILDERS, MODELS
-from ccd_casadi.problem import CoDesignProblem, PlantSource, plant_of
+from ccd_casadi.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.rib_stage import NAMES
 from ccd_casadi.rib_stage.model import OUTPUTS
 from ccd_casadi.rib_stage.plant import MESHES
@@ -331,6 +331,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         ),
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
+        robust=_robust(case.robust),
     )
     try:
         plant_of(problem)
@@ -342,6 +343,15 @@ def problem_of(case: Case) -> CoDesignProblem:
         words = f"{function} raised {type(error).__name__}: {error}; mend it"
         raise CaseError(_one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _robust(section: RobustSection) -> RobustSet | None:
+    """The set of plants that [robust] names; None where it names no other than the model."""
+    shift = section.resonance_shift
+    if shift == 0.0 and not section.damping:
+        return None
+    design = {"low": -shift, "nominal": 0.0, "high": shift}[section.design_at]
+    return RobustSet(shift, section.shifts if shift else 1, section.damping, design)
 
 
 def _frozen(value: Any) -> Any:

@@ -68,6 +68,12 @@ def steps(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers between 0 and 1"
 
 
+def factors(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and all(POSITIVE(v) is None for v in value):
+        return None
+    return f"is {shown(value)}; give a list of numbers above 0"
+
+
 def rows(width: int) -> Check:
     """A list of rows of `width` finite numbers."""
 

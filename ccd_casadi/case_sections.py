@@ -16,6 +16,7 @@ from ccd_casadi.case_checks import (
     Check,
     choice,
     count,
+    factors,
     interval,
     number,
     points,
@@ -95,6 +96,23 @@ class SuspensionSection:
 
 
 @dataclass(frozen=True)
+class RobustSection:
+    """[robust]: plants on which the loop has to be stable and ‖S‖∞ within S_max; off by default.
+
+    `resonance_shift` s: flexible frequencies at `shifts` places from -s to +s (relative), each with
+    damping times 1 and every factor of `damping`. `design_at`: which end of that range, or its
+    middle, the controller is synthesised for.
+    """
+
+    resonance_shift: float = _key(
+        number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True), 0.0
+    )
+    shifts: int = _key(count(2), 5)
+    damping: tuple[float, ...] = _key(factors, ())
+    design_at: str = _key(choice("low", "nominal", "high"), "low")
+
+
+@dataclass(frozen=True)
 class SamplingSection:
     """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
 
@@ -141,6 +159,7 @@ class Case:
     weights: WeightsSection
     inner: InnerSection
     suspension: SuspensionSection
+    robust: RobustSection
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
@@ -151,6 +170,7 @@ SECTIONS: dict[str, type] = {
     "weights": WeightsSection,
     "inner": InnerSection,
     "suspension": SuspensionSection,
+    "robust": RobustSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.kernels.gradients import design_with_gradients
+from ccd_casadi.off_design import Loop, off_design_gradients
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import DesignFigures, failed_row, figures_from_row
+from ccd_casadi.synthesis import DesignFigures, failed_row, figures_from_row, over_family
 from ccd_casadi.weights import Weights
 
 MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
@@ -50,20 +51,41 @@ def sensitivities(
     gamma_backoff: float = 1.02,
     guess: float = 0.0,
 ) -> Sensitivities:
-    """Synthesise, certify and differentiate at one point; gradients are NaN if not certified."""
+    """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
+
+    With a family the peak is the largest on any of it, its gradient that of the plant that has it.
+    """
     w0 = plant.omega_0
     w = weights.scaled(w0)
-    arguments = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, gamma_backoff)
-    slopes = (plant.dA, plant.dB, plant.dC)
+    made_on = plant if plant.family is None else plant.family.design
+    arguments = (made_on.A, made_on.B, made_on.C, w, made_on.grid, made_on.gain, gamma_backoff)
+    slopes = (made_on.dA, made_on.dB, made_on.dC)
     count = plant.dA.shape[0]
+    figures = None
     try:
-        row, _, _, _, gradient, fixed, gaps = design_with_gradients(
-            *arguments, omega_low / w0, guess, *slopes, plant.channels
+        row, *controller, gradient, fixed, gaps = design_with_gradients(
+            *arguments, omega_low / w0, guess, *slopes, made_on.channels
         )
+        if plant.family is not None:
+            figures, worst = over_family(plant, weights, row, tuple(controller), omega_low)
+            members = (plant, *plant.family.perturbed)
+            loops = [
+                Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0)
+                for at, omega in (
+                    (plant, figures.bandwidth),
+                    (members[worst], figures.sensitivity_peak_frequency),
+                    (plant, omega_low),
+                )
+            ]
+            gradient, fixed, gaps = off_design_gradients(
+                *arguments[:4], gamma_backoff, *slopes, row, gradient[3],
+                loops if figures.certified else [],
+            )  # fmt: skip
     except np.linalg.LinAlgError:
         row, gradient = failed_row(), np.full((4, count + 8), np.nan)
         fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
-    figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    if figures is None:
+        figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     gradient[0] *= w0
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.array(

@@ -28,6 +28,21 @@ class Suspension:
 
 
 @dataclass(frozen=True)
+class Perturbation:
+    """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.
+
+    Mode shapes stay. Modal damping ratios are multiplied by `damping`, or a given damping matrix,
+    which a shift leaves alone.
+    """
+
+    shift: float = 0.0
+    damping: float = 1.0
+
+
+NOMINAL = Perturbation()
+
+
+@dataclass(frozen=True)
 class ModalPlant:
     """q̈ + D q̇ + K q = B u, y = C q in mass-normalised modal coordinates at one θ, SI.
 
@@ -50,7 +65,9 @@ class ModalPlant:
     dC: Array
 
 
-def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
+def modal_plant(
+    system: Mechanics, suspension: Suspension, perturbation: Perturbation = NOMINAL
+) -> ModalPlant:
     """Mass-normalised modal coordinates, with suspension and modal damping.
 
     Raises PlantError where a stiffness is negative: the plant must be stable once suspended.
@@ -64,19 +81,21 @@ def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
     lam = np.where(rigid, 0.0, lam)
     modes = _aligned(modes, lam, rigid, system.C)
     root = np.sqrt(lam)
-    h = np.where(rigid, w_r**2, lam)
+    ratio = 1.0 + perturbation.shift
+    h = np.where(rigid, w_r**2, ratio**2 * lam)
     given = system.damping_ratio is None
     zeta = 0.0 if given else float(system.damping_ratio or 0.0)
+    zeta *= perturbation.damping * ratio  # of the model's own root, so that g is a function of λ
     g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
 
     def to_modal(matrix: Array) -> Array:
         return modes.T @ matrix @ modes
 
-    D_given = to_modal(system.D)
+    D_given = perturbation.damping * to_modal(system.D)
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
     dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I
-    dh = dM * h + _divided_differences(lam, h, rigid, np.ones_like(lam)) * dA
+    dh = dM * h + _divided_differences(lam, h, rigid, np.full_like(lam, ratio**2)) * dA
     slope_g = np.divide(zeta, root, out=np.zeros_like(root), where=~rigid)
     dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
     C = system.C @ modes
@@ -87,12 +106,12 @@ def modal_plant(system: Mechanics, suspension: Suspension) -> ModalPlant:
         D=D_given + np.diag(g),
         B=modes.T @ system.B,
         C=C,
-        natural=root,
+        natural=ratio * root,
         rigid=rigid,
         modes=modes,
         dM=dM,
         dK=dh,
-        dD=to_modal(dD) + dg,
+        dD=perturbation.damping * to_modal(dD) + dg,
         dB=modes.T @ dB,
         dC=dC @ modes,
     )

@@ -7,7 +7,7 @@ beside the samples that it determines.
 import hashlib
 import importlib.util
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,10 +17,10 @@ from ccd_casadi.derivatives import Sensitivities
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
-from ccd_casadi.modal import Suspension, modal_plant
+from ccd_casadi.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.models import BUILDERS, MODELS
 from ccd_casadi.plant import Array, ModelFunction, Plant, build_plant, mechanics
-from ccd_casadi.scaling import ScaledPlant, scale_plant
+from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.weights import Weights
 
 NUMERICS = 4  # raised whenever a change of ours moves the numbers that a sample holds
@@ -49,6 +49,27 @@ class PlantSource:
 
 
 @dataclass(frozen=True)
+class RobustSet:
+    """Plants on which the loop has to be stable and ‖S‖∞ within S_max.
+
+    Frequencies of the flexible modes times 1 + s, `shifts` values of s evenly over ±`shift`, and
+    with every one of them damping times each factor of `damping`. The controller is designed on the
+    plant shifted by `design_shift`.
+    """
+
+    shift: float
+    shifts: int
+    damping: tuple[float, ...]
+    design_shift: float
+
+    def perturbations(self, shifts: int | None = None) -> tuple[Perturbation, ...]:
+        """The set; `shifts` of them for a denser one."""
+        values = np.linspace(-self.shift, self.shift, self.shifts if shifts is None else shifts)
+        factors = sorted({1.0, *self.damping})
+        return tuple(Perturbation(float(s), z) for s in values for z in factors)
+
+
+@dataclass(frozen=True)
 class CoDesignProblem:
     """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout."""
 
@@ -64,13 +85,15 @@ class CoDesignProblem:
     inner: InnerProblem
     suspension: Suspension
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
+    robust: RobustSet | None = None
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
 
         S_max, S_low, bounds and the objective are not in it: the samples answer any of them.
         """
-        w = self.weights
+        w, robust = self.weights, self.robust
+        perturbed = {} if robust is None else {"robust": vars(robust)}
         return {
             "numerics": NUMERICS,
             "plant": self.source.identity(),
@@ -79,6 +102,7 @@ class CoDesignProblem:
             "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u],
             "omega_low": self.inner.omega_low,
             "gamma_backoff": self.inner.gamma_backoff,
+            **perturbed,
         }
 
     def inner_identity(self) -> dict[str, object]:
@@ -128,9 +152,19 @@ def _model(source: PlantSource) -> ModelFunction:
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
-    """The scaled plant at θ."""
-    modal = modal_plant(mechanics(plant_of(problem), theta), problem.suspension)
-    return scale_plant(modal, problem.weights.M_K)
+    """The scaled plant at θ, with its family where the problem is a robust one."""
+    system = mechanics(plant_of(problem), theta)
+
+    def scaled(*perturbation: Perturbation) -> ScaledPlant:
+        modal = modal_plant(system, problem.suspension, *perturbation)
+        return scale_plant(modal, problem.weights.M_K)
+
+    nominal, robust = scaled(), problem.robust
+    if robust is None:
+        return nominal
+    design = nominal if robust.design_shift == 0.0 else scaled(Perturbation(robust.design_shift))
+    others = (p for p in robust.perturbations() if p != Perturbation())
+    return replace(nominal, family=PlantFamily(design, tuple(scaled(p) for p in others)))
 
 
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:

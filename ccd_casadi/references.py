@@ -12,9 +12,7 @@ from ccd_casadi.modal import modal_plant
 from ccd_casadi.plant import Plant
 from ccd_casadi.problem import CoDesignProblem, plant_of
 from ccd_casadi.scaling import scale_plant
-from ccd_casadi.synthesis import Design, DesignFigures, Outcome
-
-UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
+from ccd_casadi.synthesis import UNBOUNDED, Design, DesignFigures, Outcome
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ccd_casadi.outer import OuterSolution
 from ccd_casadi.problem import CoDesignProblem
 from ccd_casadi.scaling import StateSpace
 from ccd_casadi.synthesis import DesignFigures
-from ccd_casadi.verify import VerifiedDesign
+from ccd_casadi.verify import RobustCheck, VerifiedDesign
 
 HZ = 2.0 * math.pi
 PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
@@ -62,6 +62,8 @@ def result_dict(
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.inner_gap <= tolerance),
     }
+    if verified.robust is not None:
+        checks["robust"] = verified.robust.passed
     failed = [name for name, passed in checks.items() if not passed]
     reason = "" if not failed else "failed: " + ", ".join(failed)
     result = {
@@ -96,6 +98,7 @@ def result_dict(
             }
             for check in verified.references
         },
+        **_robust(verified.robust),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         "syntheses": syntheses,
         "seconds": seconds,
@@ -176,6 +179,22 @@ def _kkt(certificate: KktCertificate) -> dict[str, Any]:
     return asdict(certificate) | {
         "second_order": None if second is None or math.isinf(second) else second,
         "vertex": second is not None and math.isinf(second),
+    }
+
+
+def _robust(check: RobustCheck | None) -> dict[str, Any]:
+    """What a robust design does on its nominal plant and on a dense set; nothing for others."""
+    if check is None:
+        return {}
+    return {
+        "robust": {
+            "nominal_sensitivity_peak": check.nominal.sensitivity_peak,
+            "stable": check.worst.certificate.stable,
+            "worst_sensitivity_peak": check.worst.sensitivity_peak,
+            "worst_shift": check.at.shift,
+            "worst_damping": check.at.damping,
+            "plants": check.plants,
+        }
     }
 
 

@@ -45,13 +45,25 @@ class ScaledChannel:
 
 
 @dataclass(frozen=True)
+class PlantFamily:
+    """A plant off its model: what the controller is designed on, and what it has to hold on.
+
+    All have the ω₀, the force and the drive of the plant that they belong to.
+    """
+
+    design: "ScaledPlant"
+    perturbed: tuple["ScaledPlant", ...]
+
+
+@dataclass(frozen=True)
 class ScaledPlant:
     """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
 
     `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
     the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
     with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
-    plant (see `channels`), empty where it is not.
+    plant (see `channels`), empty where it is not. With a `family` a synthesis is one for all of
+    it, and the peak of S the largest on any of it, this plant included.
     """
 
     A: Array
@@ -66,6 +78,7 @@ class ScaledPlant:
     dB: Array
     dC: Array
     channels: tuple[ScaledChannel, ...] = ()
+    family: PlantFamily | None = None
 
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""

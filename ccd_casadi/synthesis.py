@@ -5,16 +5,19 @@
 by one Riccati equation, at γ = gamma_backoff·γ_opt, certified from the rebuilt closed loop.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.design import Code, Figure, design
+from ccd_casadi.kernels.design import Code, Figure, assess, design
 from ccd_casadi.kernels.design import sweep as _sweep
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant, StateSpace
 from ccd_casadi.weights import Weights
+
+UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
+LEVEL = 1e-6  # relative: how far above the largest gain found a norm is certified
 
 
 class Outcome(StrEnum):
@@ -30,6 +33,7 @@ class Outcome(StrEnum):
     NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
+    NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 
 
 _OUTCOMES = {code: Outcome[code.name] for code in Code}
@@ -86,14 +90,20 @@ def synthesise(
     gamma_backoff: float = 1.02,
     guess: float = 0.0,
 ) -> Design:
-    """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none)."""
+    """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none).
+
+    With a family it is made on the family's design plant, see `over_family`.
+    """
     w0 = plant.omega_0
-    arguments = (plant.A, plant.B, plant.C, weights.scaled(w0), plant.grid, plant.gain)
+    made_on = plant if plant.family is None else plant.family.design
+    arguments = (made_on.A, made_on.B, made_on.C, weights.scaled(w0), made_on.grid, made_on.gain)
     try:
-        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, plant.channels)
+        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, made_on.channels)
     except np.linalg.LinAlgError:
         row, Ak, Bk, Ck = failed_row(), *(np.full((1, 1), np.nan) for _ in range(3))
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    if plant.family is not None:
+        figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
     return Design(figures, weights, plant.controller_si(Ak, Bk, Ck))
 
 
@@ -111,20 +121,65 @@ def sweep(
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     w = weights.scaled(w0)
     numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels)
+
+    def one_by_one() -> list[DesignFigures]:
+        points = [weights.at(float(s), float(t)) for s in S for t in T]
+        options = {"omega_low": omega_low, "gamma_backoff": gamma_backoff}
+        return [synthesise(plant, point, **options).figures for point in points]
+
+    if plant.family is not None:
+        return one_by_one()
     try:
         rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
     except np.linalg.LinAlgError:  # one bad point must not take the others along
-        points = [[weights.at(float(s), float(t)) for t in T] for s in S]
-        return [
-            synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff).figures
-            for line in points
-            for point in line
-        ]
+        return one_by_one()
     return [
         figures_from_row(rows[i, j], float(s), float(t), w0)
         for i, s in enumerate(S)
         for j, t in enumerate(T)
     ]
+
+
+def over_family(
+    plant: ScaledPlant,
+    weights: Weights,
+    row: Array,
+    controller: tuple[Array, Array, Array],
+    omega_low: float,
+) -> tuple[DesignFigures, int]:
+    """Figures of a scaled controller (A_K, B_K, C_K) on a plant and its perturbed siblings.
+
+    ω_b and σ_max(S(jω_low)) are the plant's own, ‖S‖∞ is the largest of all; second comes which
+    has it, 0 the plant itself. `row` is that of the synthesis on the family's design plant. γ_opt
+    is of that one; the certified norm is of the plant itself, and no optimal one there.
+    """
+    w0 = plant.omega_0
+    if row[Figure.CODE] != Code.CERTIFIED or plant.family is None:
+        return figures_from_row(row, weights.omega_S, weights.omega_T, w0), 0
+    w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
+
+    def assessed(member: ScaledPlant, gamma: float) -> Array:
+        own = row.copy()
+        loop = (member.A, member.B, member.C, *controller, Dk)
+        assess(*loop, w, gamma, omega_low / w0, own)
+        return own
+
+    own = assessed(plant, UNBOUNDED)
+    if own[Figure.CODE] == Code.CERTIFIED:
+        own = assessed(plant, max(row[Figure.GAMMA], (1.0 + LEVEL) * own[Figure.NORM]))
+    worst = 0
+    if own[Figure.CODE] == Code.CERTIFIED:
+        for i, member in enumerate(plant.family.perturbed, 1):
+            other = assessed(member, UNBOUNDED)
+            if other[Figure.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
+                figures = figures_from_row(own, weights.omega_S, weights.omega_T, w0)
+                return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), i
+            if other[Figure.PEAK] > own[Figure.PEAK]:
+                worst = i
+                own[[Figure.PEAK, Figure.PEAK_FREQUENCY]] = other[
+                    [Figure.PEAK, Figure.PEAK_FREQUENCY]
+                ]
+    return figures_from_row(own, weights.omega_S, weights.omega_T, w0), worst
 
 
 def failed_row() -> Array:

@@ -8,17 +8,20 @@ from ccd_casadi.closed_loop import measure
 from ccd_casadi.direct import acceptable, polish
 from ccd_casadi.inner import active_constraints
 from ccd_casadi.kkt import KktCertificate, kkt_certificate
-from ccd_casadi.modal import Suspension
+from ccd_casadi.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.outer import active_bounds, lifted_bounds, lifted_program
-from ccd_casadi.plant import Array, constraint_values, hardware_cost
+from ccd_casadi.plant import Array, constraint_values, hardware_cost, mechanics
 from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.references import UNBOUNDED, ReferenceCheck, check_references
+from ccd_casadi.references import ReferenceCheck, check_references
 from ccd_casadi.sampling import Truth
-from ccd_casadi.synthesis import Design, DesignFigures, synthesise
+from ccd_casadi.scaling import scale_plant
+from ccd_casadi.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
 from ccd_casadi.true_function import TrueQuantities
 
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
+PEAK = 1e-6  # relative; by how much S_max may be passed between the plants of a robust set
+DENSE = 41  # shifts of a robust set on which the design is measured at the end
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,21 @@ class VerifiedDesign:
     feasible: bool
     unsuspended: DesignFigures
     references: tuple[ReferenceCheck, ...] = ()
+    robust: "RobustCheck | None" = None
+
+
+@dataclass(frozen=True)
+class RobustCheck:
+    """A robust design on its nominal plant, and on a denser set than it was designed for.
+
+    `worst` has the largest ‖S‖∞ of that set, at `at`; an unstable loop is worse than any.
+    """
+
+    nominal: DesignFigures
+    worst: DesignFigures
+    at: Perturbation
+    plants: int
+    passed: bool
 
 
 def verify(truth: Truth, x: Array) -> VerifiedDesign:
@@ -92,7 +110,36 @@ def verify(truth: Truth, x: Array) -> VerifiedDesign:
         feasible=acceptable(problem, x, design),
         unsuspended=unsuspended,
         references=check_references(problem, theta, final),
+        robust=_check_robust(problem, theta, final),
     )
+
+
+def _check_robust(
+    problem: CoDesignProblem, theta: tuple[float, ...], design: Design
+) -> RobustCheck | None:
+    """The controller on `DENSE` shifts of the robust set; None where the problem has none."""
+    if problem.robust is None:
+        return None
+    system = mechanics(plant_of(problem), theta)
+
+    def measured(perturbation: Perturbation) -> DesignFigures:
+        return measure(
+            scale_plant(modal_plant(system, problem.suspension, perturbation), problem.weights.M_K),
+            design.controller,
+            design.weights,
+            gamma=UNBOUNDED,
+            omega_low=problem.inner.omega_low,
+        )
+
+    places = problem.robust.perturbations(DENSE)
+    found = [(measured(place), place) for place in places]
+
+    def badness(item: tuple[DesignFigures, Perturbation]) -> float:
+        return float(np.nan_to_num(item[0].sensitivity_peak, nan=np.inf))
+
+    worst, at = max(found, key=badness)
+    passed = badness((worst, at)) <= problem.inner.S_max * (1.0 + PEAK)
+    return RobustCheck(measured(Perturbation()), worst, at, len(places), passed)
 
 
 def _snapped(problem: CoDesignProblem, x: Array) -> Array:

@@ -93,10 +93,27 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
             "passed" if certificate["passed"] else "FAILED",
             f"{proof} ({poles}); {norm}",
         ),
+        *_robust(r),
         *_without_suspension(r),
         *_references(r),
         *_optimality(r),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
+    ]
+
+
+def _robust(r: Mapping[str, Any]) -> list[Fact]:
+    found = r.get("robust")
+    if not found:
+        return []
+    words = number(found["worst_sensitivity_peak"], 6) if found["stable"] else "unstable"
+    where = f"{100.0 * found['worst_shift']:+.2f} %, damping × {found['worst_damping']:g}"
+    return [
+        (
+            "Peak of S on the perturbed plants",
+            words,
+            f"largest of {found['plants']} plants, at a resonance shift of {where}; "
+            f"on the nominal plant {number(found['nominal_sensitivity_peak'], 5)}",
+        )
     ]
 
 
