@@ -6,17 +6,21 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test lint bench setup setup-test clean
+.PHONY: solve test lint docs bench setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
-test: setup-test lint
+test: setup-test lint docs
 	$(BIN)/python -m pytest
 
 lint: setup-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# The documentation site, in site/: a broken link or reference is an error.
+docs: setup-test
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: setup-test
 	$(BIN)/python benchmarks/synthesis.py
@@ -37,5 +41,5 @@ setup-test: .venv/.ready-test
 	touch $@
 
 clean:
-	rm -rf .venv *.egg-info
+	rm -rf .venv site *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
