@@ -149,6 +149,13 @@ class BaselineSection:
 
 
 @dataclass(frozen=True)
+class LimitsSection:
+    """[limits]: how long a user's plant function may take at each call, in s."""
+
+    plant_seconds: float = _key(POSITIVE, 60.0)
+
+
+@dataclass(frozen=True)
 class Case:
     """A checked case file."""
 
@@ -163,6 +170,7 @@ class Case:
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
+    limits: LimitsSection
 
 
 SECTIONS: dict[str, type] = {
@@ -174,4 +182,5 @@ SECTIONS: dict[str, type] = {
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,
+    "limits": LimitsSection,
 }

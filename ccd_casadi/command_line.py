@@ -13,8 +13,12 @@ from threadpoolctl import threadpool_limits
 from ccd_casadi.errors import UserError
 from ccd_casadi.parallel import WorkerLost, usable_cores
 from ccd_casadi.plant import PlantError
+from ccd_casadi.user_code import permit_user_code
+from surrogates.starting import begun
 
 DEFAULT_CASE = "runs/two_mass.toml"
+_DISK = "see to the disk or choose another --out, then give the same command: it resumes"
+_NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
 
@@ -55,7 +59,7 @@ def parser(
 
 
 def _shared(result: argparse.ArgumentParser) -> None:
-    """--out, --workers, --seed and --quiet, which every command has."""
+    """--out, --workers, --seed, --quiet and --no-user-code, which every command has."""
     result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
     result.add_argument(
         "--workers", metavar="N", type=_positive, default=usable_cores(),
@@ -63,6 +67,10 @@ def _shared(result: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    result.add_argument(
+        "--no-user-code", action="store_true",
+        help="refuse a case that names a plant function: it is code of who wrote it",
+    )  # fmt: skip
 
 
 def run_parser(command: str, description: str) -> argparse.ArgumentParser:
@@ -89,17 +97,17 @@ def run(
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
     code = ExitCode.INTERRUPTED
     options = None
+    begun()
     try:
         options = arguments.parse_args(argv)
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), permit_user_code(not options.no_user_code):
             code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except SystemExit as ended:  # argparse, after --help or a wrong option
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
-        place = getattr(options, "case", None) or getattr(options, "run", "")
-        print(_one_line(f"{place}: plant: {error}"), file=sys.stderr)
+        print(_one_line(f"{_place(options)}: plant: {error}"), file=sys.stderr)
         return ExitCode.BAD_INPUT
     except UserError as error:
         print(_one_line(error), file=sys.stderr)
@@ -108,11 +116,23 @@ def run(
         print(f"interrupted: {_one_line(error)}; {_RESUMABLE}", file=sys.stderr)
     except KeyboardInterrupt:
         print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
+    except MemoryError:
+        print(f"{_place(options)}: {_NO_MEMORY}", file=sys.stderr)
+        return ExitCode.BAD_INPUT
     except BrokenPipeError:
         # The reader of stdout went away; point it elsewhere so that the exit stays quiet.
         # What main concluded stands; if it was cut short, it was interrupted.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # the disk is full, or a file became unreadable
+        where = error.filename or _place(options)
+        print(_one_line(f"{where}: {error.strerror or error}; {_DISK}"), file=sys.stderr)
+        return ExitCode.BAD_INPUT
     return int(code)
+
+
+def _place(options: argparse.Namespace | None) -> object:
+    """The case file or run folder that a command was given."""
+    return getattr(options, "case", None) or getattr(options, "run", "")
 
 
 def run_folder(case: Path, out: Path | None) -> Path:

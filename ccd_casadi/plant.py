@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 ModelFunction = Callable[..., Mapping[str, Any]]
 
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
+# Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
+LARGEST = {"mass": 1000, "input": 100, "output": 100}
 _KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
 
 
@@ -85,6 +87,10 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
         raise PlantError("the plant model must return either damping or damping_ratio; give one")
     M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
     n = M.shape[0]
+    for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
+        if size > LARGEST[key]:
+            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
+            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
     D = ca.SX(result["damping"]) if "damping" in result else ca.SX.zeros(n, n)
     shapes = {"mass": (M, (n, n)), "stiffness": (K, (n, n)), "damping": (D, (n, n))}
     for key, (matrix, shape) in shapes.items():

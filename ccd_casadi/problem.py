@@ -19,8 +19,9 @@ from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
 from ccd_casadi.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.models import BUILDERS, MODELS
-from ccd_casadi.plant import Array, ModelFunction, Plant, build_plant, mechanics
+from ccd_casadi.plant import Array, ModelFunction, Plant, PlantError, build_plant, mechanics
 from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.user_code import limited, require_user_code, time_limit
 from ccd_casadi.weights import Weights
 
 NUMERICS = 4  # raised whenever a change of ours moves the numbers that a sample holds
@@ -34,6 +35,7 @@ class PlantSource:
     file: str | None
     function: str | None
     options: tuple[tuple[str, object], ...]
+    seconds: float = 60.0  # that a function may take; no part of what the plant is
 
     def identity(self) -> dict[str, object]:
         """What determines the plant; a file counts by its content, not by where it lies."""
@@ -119,7 +121,12 @@ class CoDesignProblem:
 
 
 def plant_of(problem: CoDesignProblem) -> Plant:
-    """The plant, built once in a process."""
+    """The plant, built once in a process.
+
+    Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
+    """
+    if problem.source.file is not None:
+        require_user_code(f"{problem.source.file}:{problem.source.function}")
     return _plant(problem.source, problem.names)
 
 
@@ -140,15 +147,22 @@ def _model(source: PlantSource) -> ModelFunction:
     if spec is None or spec.loader is None:
         raise UserError(f"{path}: not a Python file; name a file.py")
     module = importlib.util.module_from_spec(spec)
+    late = PlantError(
+        f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
+        "mend it, or give it longer with plant_seconds in a table [limits]"
+    )
     try:
-        spec.loader.exec_module(module)
+        with time_limit(source.seconds, late):
+            spec.loader.exec_module(module)
+    except PlantError:
+        raise
     except (Exception, SystemExit) as error:
         message = f"{path}: cannot be loaded: {type(error).__name__}: {error}"
         raise UserError(message) from error
     function = getattr(module, source.function, None)
     if not callable(function):
         raise UserError(f"{path}: defines no function {source.function}; check plant.function")
-    return function
+    return limited(function, source.seconds, late)
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:

@@ -29,6 +29,7 @@ from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.samples import SampleStore, problem_hash
 from ccd_casadi.sampling import BandwidthSample, QuantitySample, Truth, quantity_sample
 from ccd_casadi.solve import PATIENCE, conclude, rescue, write_run
+from ccd_casadi.user_code import permit_user_code
 from surrogates import GaussianProcess
 from surrogates.truth import NAMES, Observations, TruthError, TruthInterrupted
 
@@ -38,10 +39,16 @@ CLOSE = 1e-2  # of the box: a verified design so near is where the next verifica
 
 @contextmanager
 def open_run(
-    folder: Path, *, tolerance: float | None, workers: int, seed: int, quiet: bool
+    folder: Path,
+    *,
+    tolerance: float | None,
+    workers: int,
+    seed: int,
+    quiet: bool,
+    user_code: bool = True,
 ) -> Iterator["CoDesignTruth"]:
     """The truth of a run folder with a case.toml. Raises TruthError."""
-    with _worded(), threadpool_limits(limits=1):
+    with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
         formulation = _formulation(folder)

@@ -15,6 +15,13 @@ The package knows nothing of what the function means. scikit-learn is imported w
 something is fitted and not before.
 """
 
+import sys as _sys
+
+from surrogates import starting as _starting
+
+if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
+    _starting.starting()
+
 from surrogates import casadi_members as _casadi_members  # registers their expressions
 from surrogates.assessment import Assessment, assess
 from surrogates.casadi_export import to_casadi
@@ -36,7 +43,7 @@ from surrogates.sparse_process import SparseProcess, fit_sparse
 from surrogates.transform import Exponential, Transform
 from surrogates.validation import Errors, cross_validate, errors
 
-del _casadi_members
+del _casadi_members, _starting, _sys
 
 __all__ = [
     "Assessment",

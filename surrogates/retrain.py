@@ -13,6 +13,7 @@ from surrogates.copies import copy_run
 from surrogates.interface import SurrogateFitError
 from surrogates.retraining import Settings, retrain
 from surrogates.serialise import SurrogateFileError
+from surrogates.starting import begun
 from surrogates.truth import TruthError, TruthInterrupted, opener_of
 
 
@@ -82,11 +83,17 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    result.add_argument(
+        "--no-user-code",
+        action="store_true",
+        help="refuse a run folder whose truth is code that comes with it",
+    )
     return result
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
+    begun()
     try:
         options = parser().parse_args(argv)
     except SystemExit as ended:
@@ -100,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             copy_run(run, folder)
         opened = opener(
             folder, tolerance=options.tolerance, workers=options.workers, seed=options.seed,
-            quiet=quiet,
+            quiet=quiet, user_code=not options.no_user_code,
         )  # fmt: skip
         with opened as truth:
             outcome = retrain(folder, truth, settings, quiet)
@@ -109,6 +116,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return ExitCode.BAD_INPUT
     except OSError as error:
         print(f"{error.filename or folder}: {error.strerror or error}", file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    except MemoryError:
+        print(f"{folder}: not enough memory; retrain with fewer samples", file=sys.stderr)
         return ExitCode.BAD_INPUT
     except (KeyboardInterrupt, TruthInterrupted) as error:
         words = f": {error}" if str(error) else ""

@@ -91,10 +91,20 @@ class Truth(Protocol):
 
 
 class Opener(Protocol):
-    """What an entry point of the group names; raises TruthError."""
+    """What an entry point of the group names; raises TruthError.
+
+    With `user_code` False nothing may run that the folder or a file that it names holds.
+    """
 
     def __call__(
-        self, folder: Path, *, tolerance: float | None, workers: int, seed: int, quiet: bool
+        self,
+        folder: Path,
+        *,
+        tolerance: float | None,
+        workers: int,
+        seed: int,
+        quiet: bool,
+        user_code: bool,
     ) -> AbstractContextManager[Truth]: ...
 
 

@@ -53,6 +53,7 @@ def test_options_have_defaults() -> None:
         "workers": usable_cores(),
         "seed": 0,
         "quiet": False,
+        "no_user_code": False,
     }
 
 
@@ -65,6 +66,7 @@ def test_options_are_read(tmp_path: Path) -> None:
         "workers": 3,
         "seed": 7,
         "quiet": True,
+        "no_user_code": False,
     }
     assert not out.parent.exists()  # reading an option makes nothing
 

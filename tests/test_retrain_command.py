@@ -107,7 +107,7 @@ def test_a_folder_that_names_no_known_truth_is_refused(
 @pytest.mark.parametrize(
     "more",
     [["--budget", "0"], ["--budget", "many"], ["--tolerance", "nan"], ["--tolerance", "-1"],
-     ["--batch", "0"], ["--explore", "1.5"], ["--workers", "0"], ["--seed", "-1"], ["--no"]],
+     ["--batch", "0"], ["--explore", "1.5"], ["--workers", "0"], ["--seed", "-1"], ["--what"]],
 )  # fmt: skip
 def test_wrong_options_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str]

@@ -1,0 +1,267 @@
+"""What comes from a colleague executes nothing but the plant function it names, and on request not
+even that; nothing is stored or read as code; no name in a file leads out of the run folder."""
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccd_casadi.case import load_case, problem_of
+from ccd_casadi.compare import main as compare
+from ccd_casadi.errors import UserError
+from ccd_casadi.inner_command import main as inner
+from ccd_casadi.insight import main as insight
+from ccd_casadi.plant import PlantError
+from ccd_casadi.problem import plant_of
+from ccd_casadi.solve import main as solve
+from ccd_casadi.user_code import permit_user_code, time_limit
+from surrogates import SurrogateFileError, load
+from surrogates.retrain import main as retrain
+from surrogates.truth import TruthError, opener_of
+
+ROOT = Path(__file__).parent.parent
+SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
+LIVE = {"ccd_casadi/parallel.py", "ccd_casadi/cluster.py"}  # pipes between processes of one run
+TRAP = """
+import pathlib
+(pathlib.Path(__file__).parent / "executed").touch()
+from ccd_casadi.models import MODELS
+
+def f(theta, **options):
+    return MODELS["two_mass"](theta, 0.01)
+"""
+
+
+@pytest.fixture
+def trap(tmp_path: Path) -> Path:
+    """A case whose plant leaves a file behind as soon as anything of it runs."""
+    (tmp_path / "trap.py").write_text(TRAP)
+    text = (ROOT / "runs" / "two_mass.toml").read_text()
+    start, end = text.index("model ="), text.index("[theta")
+    path = tmp_path / "trap.toml"
+    path.write_text(text[:start] + 'function = "trap.py:f"\n\n' + text[end:])
+    return path
+
+
+@pytest.fixture
+def trapped_run(two_mass_run: Path, trap: Path) -> Path:
+    """A finished run whose case file was exchanged for the trap."""
+    folder = Path(shutil.copytree(two_mass_run, trap.parent / "run"))
+    shutil.copy(trap, folder / "case.toml")
+    shutil.copy(trap.parent / "trap.py", folder)
+    return folder
+
+
+# ---- user code -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        (solve, ["--quiet"]),
+        (compare, ["--quiet"]),
+        (inner, ["--theta", "m1=60,m2=60"]),
+        (insight, ["--quiet"]),
+        (retrain, ["--quiet"]),
+    ],
+    ids=["solve", "compare", "inner", "insight", "retrain"],
+)
+def test_no_user_code_refuses_a_plant_function_and_runs_nothing_of_it(
+    trapped_run: Path,
+    trap: Path,
+    capsys: pytest.CaptureFixture[str],
+    command: Callable[[list[str]], int],
+    more: list[str],
+) -> None:
+    of_a_run = command in (insight, retrain)
+    words = [str(trapped_run if of_a_run else trap), *more, "--no-user-code"]
+    assert command(words) == 2
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert len(errors.splitlines()) == 1
+    assert "trap.py:f is code, which --no-user-code refuses" in errors
+    assert ("case.toml" if of_a_run else "trap.toml") in errors
+    assert not list(trap.parent.rglob("executed"))
+
+
+def test_models_of_the_package_are_no_user_code(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--theta", "m1=60,m2=60", "--omega-s-hz", "800", "--omega-t-hz", "40"]
+    assert inner([str(ROOT / "runs" / "two_mass.toml"), *words, "--no-user-code"]) == 0
+
+
+def test_a_plant_that_was_built_before_is_refused_too(trap: Path) -> None:
+    problem = problem_of(load_case(trap))
+    plant_of(problem)
+    with permit_user_code(allowed=False), pytest.raises(UserError, match="refuses"):
+        plant_of(problem)
+    plant_of(problem)  # and allowed again afterwards
+
+
+def test_checking_a_case_executes_nothing(trap: Path) -> None:
+    load_case(trap)
+    assert not (trap.parent / "executed").exists()
+
+
+def test_truth_json_names_installed_packages_only(two_mass_run: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    for name in ("trap", "os:system", "trap.py:f", "../trap", str(tmp_path / "trap.py"), ""):
+        (folder / "truth.json").write_text(json.dumps({"truth": name, "formulation": "lifted"}))
+        with pytest.raises(TruthError, match="is not installed"):
+            opener_of(folder)
+
+
+# ---- time ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "    while True: pass\n",
+        "    while True:\n        try:\n            while True: pass\n"
+        "        except Exception:\n            pass\n",
+        "    import time\n    time.sleep(1e6)\n",
+    ],
+    ids=["busy", "stubborn", "asleep"],
+)
+def test_a_plant_that_hangs_is_ended_in_one_line(
+    trap: Path, capsys: pytest.CaptureFixture[str], body: str
+) -> None:
+    (trap.parent / "trap.py").write_text("def f(theta, **options):\n" + body)
+    trap.write_text(trap.read_text() + "\n[limits]\nplant_seconds = 0.2\n")
+    assert solve([str(trap), "--quiet"]) == 2
+    errors = capsys.readouterr().err
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith(f"{trap}: plant: trap.py:f did not return within 0.2 s; ")
+    assert not trap.with_suffix("").exists()
+
+
+def test_an_import_that_hangs_is_ended_too(trap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (trap.parent / "trap.py").write_text("while True: pass\n")
+    trap.write_text(trap.read_text() + "\n[limits]\nplant_seconds = 0.2\n")
+    assert inner([str(trap), "--theta", "m1=60,m2=60"]) == 2
+    assert "did not return within 0.2 s" in capsys.readouterr().err
+
+
+def test_the_limit_ends_with_its_block() -> None:
+    import signal
+
+    before = signal.getsignal(signal.SIGALRM)
+    with time_limit(60.0, PlantError("late")):
+        pass
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is before
+
+
+@pytest.mark.parametrize(
+    ("matrices", "words"),
+    [
+        ("mass=ca.SX.eye(10**6), stiffness=ca.SX.eye(10**6), input=ca.SX(10**6, 1), "
+         "output=ca.SX(1, 10**6)", "mass has 1000000 rows or columns"),
+        ("mass=ca.SX.eye(2), stiffness=ca.SX.eye(2), input=ca.SX(2, 10**6), output=ca.SX(1, 2)",
+         "input has 1000000"),
+        ("mass=ca.SX.eye(2), stiffness=ca.SX.eye(2), input=ca.SX(2, 1), output=ca.SX(10**6, 2)",
+         "output has 1000000"),
+    ],
+)  # fmt: skip
+def test_a_plant_too_large_for_memory_is_refused(trap: Path, matrices: str, words: str) -> None:
+    source = "import casadi as ca\ndef f(t):\n    return dict(damping_ratio=0.1, hardware_cost=1, "
+    (trap.parent / "trap.py").write_text(source + matrices + ")\n")
+    with pytest.raises(UserError, match=words):
+        problem_of(load_case(trap))
+
+
+# ---- no code in data -----------------------------------------------------------------------------
+
+
+def calls(path: Path) -> Iterator[tuple[str, ast.Call]]:
+    """Every call in a source file by its dotted name."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call):
+            yield ast.unparse(node.func), node
+
+
+FORBIDDEN = {
+    "eval", "exec", "compile", "__import__", "importlib.import_module", "import_module",
+    "os.system", "os.popen", "marshal.loads", "marshal.load", "shelve.open", "yaml.load",
+    "joblib.load", "dill.loads", "cloudpickle.loads", "cloudpickle.load", "np.fromfile",
+    "pickle.load", "ca.Function.load", "ca.Function.deserialize", "ca.external", "ca.Importer",
+    "ctypes.CDLL", "runpy.run_path", "subprocess.run", "subprocess.Popen",
+}  # fmt: skip
+
+
+def test_no_source_reads_code_from_data() -> None:
+    seen = []
+    for path in SOURCES:
+        name = path.relative_to(ROOT).as_posix()
+        for called, node in calls(path):
+            seen.append(called)
+            assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
+            for keyword in node.keywords:
+                if keyword.arg in ("allow_pickle", "shell"):
+                    assert ast.unparse(keyword.value) == "False", f"{name}:{node.lineno}"
+            if called.startswith("pickle."):
+                assert name in LIVE, f"{name}:{node.lineno}: {called}"
+            if called.endswith("exec_module"):
+                assert name == "ccd_casadi/problem.py", f"{name}:{node.lineno}: {called}"
+    assert "spec.loader.exec_module" in seen, "the scan sees calls"
+
+
+def test_plant_files_are_loaded_where_permission_is_asked() -> None:
+    text = (ROOT / "ccd_casadi" / "problem.py").read_text()
+    assert text.count("exec_module") == 1
+    assert "require_user_code(" in text
+
+
+# ---- names that lead out of the folder -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["../x", "/etc/passwd", "..", "", ".", "0001/../../x", "0001.json", "\x00", "x" * 5000]
+)
+def test_a_surrogates_name_is_no_path(
+    two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    shutil.copy(folder / "surrogate.json", tmp_path / "x.json")
+    case = str(folder / "case.toml")
+    assert solve([case, "--out", str(folder), "--surrogate", name, "--quiet"]) == 2
+    errors = capsys.readouterr().err
+    assert len(errors.splitlines()) == 1
+    assert errors.startswith("--surrogate ")
+
+
+def test_a_surrogate_file_of_another_kind_is_not_built(tmp_path: Path) -> None:
+    for kind in ("os.system", "__class__", "Surrogate", ["gaussian_process"], None):
+        path = tmp_path / "s.json"
+        record = {"kind": kind, "args": ["touch executed"]}
+        path.write_text(json.dumps({"schema": "surrogates/2", "surrogates": [record], "extra": {}}))
+        with pytest.raises(SurrogateFileError):
+            load(path)
+
+
+# ---- dependencies --------------------------------------------------------------------------------
+
+
+def test_every_dependency_is_pinned_to_one_version() -> None:
+    for name in ("requirements.lock", "requirements-test.lock"):
+        lines = (ROOT / name).read_text().splitlines()
+        for line in lines:
+            if line and not line.startswith(("#", "-r ")):
+                package, _, version = line.partition("==")
+                assert version, f"{name}: {line}"
+                assert package.strip() == package
+                assert np.all([c.isalnum() or c in "-_.+" for c in package + version]), line
+
+
+def test_what_is_installed_fits_together() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "--disable-pip-version-check", "check"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
