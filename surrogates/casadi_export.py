@@ -7,12 +7,19 @@ samples and 8 inputs, mean with gradient: 0.07 ms so, 0.25 ms unrolled in SX (an
 
 from collections.abc import Sequence
 from functools import singledispatch
-from math import factorial
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from surrogates.flat_limit import (
+    UNDER_ROOT,
+    FlatLimit,
+    even_odd,
+    matern_series,
+    remainder_of_exp,
+    remainder_of_matern,
+)
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
 from surrogates.interface import Array, Surrogate
 from surrogates.kernels import ROOT5, Kernel
@@ -20,9 +27,12 @@ from surrogates.kernels import ROOT5, Kernel
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
 NEAR = 1e-2
-# Added to s under the root of the odd Taylor terms. They start at r³, so that the
-# value changes by less than 1e-45, and AD finds 0 · 1e15 instead of 0 · inf.
-UNDER_ROOT = 1e-30
+
+
+class _Symbols:
+    exp = staticmethod(ca.exp)
+    sqrt = staticmethod(ca.sqrt)
+    choose = staticmethod(ca.if_else)
 
 
 def to_casadi(
@@ -51,6 +61,9 @@ def to_casadi(
     return ca.Function(name, [x], outputs, ["x"], ["mean", "std"][: len(outputs)])
 
 
+SYMBOLS = _Symbols()
+
+
 @singledispatch
 def expression(surrogate: Surrogate, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     """Return (mean,) or, with `std`, (mean, std) of a surrogate at the symbol x (d).
@@ -68,13 +81,17 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     unit = (x - ca.DM(process.lower)) / ca.DM(process.upper - process.lower)
     z, s = squared_distances(unit, process.X, lengths)
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
-    weights = process.weights.reshape(-1, n)
-    total = ca.dot(ca.DM(weights[0]), phi[0])
-    if process.has_gradients:
-        # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
-        along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
-        total -= 2.0 * ca.dot(along, phi[1])
-    mean = process.output_mean + process.output_scale * (p.signal_variance * total)
+    if process.flat is not None:
+        scaled = flat_mean(process.flat, unit)
+    else:
+        weights = process.weights.reshape(-1, n)
+        total = ca.dot(ca.DM(weights[0]), phi[0])
+        if process.has_gradients:
+            # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
+            along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
+            total -= 2.0 * ca.dot(along, phi[1])
+        scaled = p.signal_variance * total
+    mean = process.output_mean + process.output_scale * scaled
     if not std:
         return (mean,)
     k = phi[0]
@@ -86,6 +103,35 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     variance = p.signal_variance - ca.sumsqr(ca.mtimes(ca.DM(half), k))
     floor = VARIANCE_FLOOR * p.signal_variance
     return mean, process.band * process.output_scale * ca.sqrt(ca.fmax(variance, floor))
+
+
+def flat_mean(flat: FlatLimit, unit: ca.MX) -> ca.MX:
+    """`FlatLimit.mean` of a symbol."""
+    p = ca.dot(ca.DM(flat.polynomial), legendre_products(flat.exponents, 2.0 * unit - 1.0))
+    x = (unit - 0.5) / ca.DM(flat.lengths)
+    if flat.kernel is Kernel.RBF:
+        u = ca.mtimes(ca.DM(flat.points), x)
+        total = ca.dot(ca.DM(flat.values), remainder_of_exp(u, flat.degree, SYMBOLS))
+        if flat.slopes is not None:
+            along = ca.mtimes(ca.DM(flat.slopes), x)
+            total += ca.dot(along, remainder_of_exp(u, flat.degree - 1, SYMBOLS))
+        return ca.exp(-0.5 * ca.sumsqr(x)) * (p + total)
+    z = ca.repmat(x, 1, len(flat.points)) - ca.DM(flat.points.T)
+    s = ca.sum1(z * z).T
+    remainders = remainder_of_matern(s, int(flat.slopes is not None), SYMBOLS)
+    total = ca.dot(ca.DM(flat.values), remainders[0])
+    if flat.slopes is not None:
+        along = ca.sum1(z * ca.DM(flat.slopes.T)).T
+        total -= 2.0 * ca.dot(along, remainders[1])
+    return p + total
+
+
+def legendre_products(exponents: Array, v: ca.MX) -> ca.MX:
+    """Π_j P_{e_ij}(v_j) as (m, 1) for exponents (m, d) and v (d): `polynomial.products`."""
+    powers = [ca.MX.ones(v.shape[0]), v]
+    for k in range(1, int(exponents.max(initial=1))):
+        powers.append(((2 * k + 1) * v * powers[k] - k * powers[k - 1]) / (k + 1))
+    return products_of(exponents, powers)
 
 
 def squared_distances(unit: ca.MX, X: Array, lengths: Array) -> tuple[ca.MX, ca.MX]:
@@ -110,34 +156,33 @@ def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
     r = ca.sqrt(far)
     e = ca.exp(-ROOT5 * r)
     closed = [(1.0 + ROOT5 * r + (5.0 / 3.0) * far) * e, (-5.0 / 6.0) * (1.0 + ROOT5 * r) * e]
-    c = _matern_series()
+    c = matern_series(10)
     # φ = Σ c_m r^m and φ' = Σ (m/2) c_m r^(m-2); c_1 = c_3 = 0, which is what makes
     # the kernel twice differentiable.
     c1 = [0.5 * (m + 2) * c[m + 2] for m in range(len(c) - 2)]
-    taylor = [_even_odd(c, 5, s, near), _even_odd(c1, 3, s, near)]
+    taylor = [even_odd(c, 5, s, near), even_odd(c1, 3, s, near)]
     return [
         ca.if_else(s < NEAR**2, inner, outer)
         for inner, outer in zip(taylor[: order + 1], closed, strict=False)
     ]
 
 
-def _matern_series() -> list[float]:
-    """Taylor coefficients of (1 + a r + a² r²/3) e^(-a r), a = √5, degrees 0 to 9."""
-    coefficients = []
-    for m in range(10):
-        terms = 1.0 / factorial(m)
-        terms -= 1.0 / factorial(m - 1) if m >= 1 else 0.0
-        terms += 1.0 / (3.0 * factorial(m - 2)) if m >= 2 else 0.0
-        coefficients.append((-ROOT5) ** m * terms)
-    coefficients[1] = coefficients[3] = 0.0  # exactly, not to rounding
-    return coefficients
+def products_of(exponents: Array, powers: list[ca.MX]) -> ca.MX:
+    """Π_j powers_{e_ij}(j) as (m, 1), powers_k (d, 1): one gather to each factor.
 
-
-def _even_odd(c: list[float], first_odd: int, s: ca.MX, r: ca.MX) -> ca.MX:
-    """Σ c_m r^m by Horner in s = r², the odd terms from first_odd with one r outside."""
-    even, odd = ca.MX(0.0), ca.MX(0.0)
-    for coefficient in reversed(c[0::2]):
-        even = coefficient + s * even
-    for coefficient in reversed(c[first_odd::2]):
-        odd = coefficient + s * odd
-    return even + s ** ((first_odd - 1) // 2) * r * odd
+    A term of total degree p has at most p factors that are not 1, so that p gathers
+    make all terms at once; unrolled, 500 terms of 20 inputs would be 10⁴ nodes.
+    """
+    e = exponents.astype(int)
+    d = e.shape[1]
+    degree = int(e.sum(axis=1).max())
+    stack = ca.vertcat(*powers)
+    result = ca.MX.ones(len(e))
+    table = np.zeros((len(e), max(degree, 1)), dtype=int)  # entry 0 of the stack is 1
+    for i, row in enumerate(e):
+        factors = [power * d + j for j, power in enumerate(row) if power]
+        table[i, : len(factors)] = factors
+    for column in table.T:
+        if column.any():
+            result = result * stack[column.tolist()]
+    return result

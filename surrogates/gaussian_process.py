@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
+from surrogates.flat_limit import FlatLimit, flat_limit
 from surrogates.interface import Array, box, freeze, points_in
 from surrogates.kernels import Hyperparameters, Kernel, covariance
 from surrogates.likelihood import factorise, symmetric_inverse
@@ -98,21 +99,10 @@ class GaussianProcess:
             self.sample_noise,
         )[0]
 
-    @property
-    def rounding(self) -> float:
-        """Scale of the rounding error of one evaluation of the mean, output units.
-
-        eps σ² Σ_i |α_i| c_i, c = 1 for values and 1 / l_j for gradients. A fit of a
-        very smooth function, with gradients above all, has large weights that
-        cancel: near 1e-8 of the output scale it is still far below the error of the
-        fit, yet NumPy, CasADi and another machine agree no better than this. More
-        noise or jitter lowers it and costs one to two digits of accuracy.
-        """
-        p = self.hyperparameters
-        largest = np.repeat(np.append(1.0, 1.0 / p.length_scales), len(self.X))
-        total = float(largest[: self.weights.size] @ np.abs(self.weights))
-        eps = float(np.finfo(float).eps)
-        return self.output_scale * eps * p.signal_variance * total
+    @cached_property
+    def flat(self) -> FlatLimit | None:
+        """The mean without cancellation, where large weights of a smooth function would cancel."""
+        return flat_limit(self.kernel, self.hyperparameters, self.X, self.weights)
 
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
@@ -127,16 +117,15 @@ class GaussianProcess:
         Raises:
             ValueError: X does not have the inputs of the box.
         """
-        points = points_in(self, X)
+        unit = (points_in(self, X) - self.lower) / (self.upper - self.lower)
+        if not return_std and self.flat is not None:
+            return self.output_mean + self.output_scale * self.flat.mean(unit)
         p = self.hyperparameters
         k = p.signal_variance * covariance(
-            self.kernel,
-            (points - self.lower) / (self.upper - self.lower),
-            self.X,
-            p.length_scales,
-            gradients_of_b=self.has_gradients,
+            self.kernel, unit, self.X, p.length_scales, gradients_of_b=self.has_gradients
         )
-        mean = self.output_mean + self.output_scale * (k @ self.weights)
+        scaled = k @ self.weights if self.flat is None else self.flat.mean(unit)
+        mean = self.output_mean + self.output_scale * scaled
         if not return_std:
             return mean
         v = solve_triangular(self.factor, k.T, lower=True)
