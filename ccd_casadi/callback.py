@@ -13,7 +13,9 @@ from ccd_casadi.plant import Array
 class VectorCallback(ca.Callback):
     """x (n,) -> values (m,) and ∂values (m, n); keep a reference to it while it is in use.
 
-    NaN values make IPOPT shorten its step. Hessians are not available: use a quasi-Newton method.
+    NaN values make IPOPT shorten its step. Hessians are not available, and a quasi-Newton method is
+    to be used, unless x is of the order of 1 and `hessians` asks for CasADi's central differences
+    of the Jacobian.
     """
 
     def __init__(
@@ -23,9 +25,10 @@ class VectorCallback(ca.Callback):
         outputs: int,
         values: Callable[[Array], Array],
         jacobian: Callable[[Array], Array],
+        hessians: bool = False,
     ) -> None:
         ca.Callback.__init__(self)
-        self._sizes = inputs, outputs
+        self._sizes, self._hessians = (inputs, outputs), hessians
         self._values, self._jacobian = values, jacobian
         self._derivative: ca.Callback | None = None
         self.construct(name, {})
@@ -53,7 +56,8 @@ class VectorCallback(ca.Callback):
     def get_jacobian(
         self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]
     ) -> ca.Function:
-        self._derivative = _Jacobian(name, self._sizes, self._jacobian, options)
+        more = {"enable_fd": True, "fd_method": "central"} if self._hessians else {}
+        self._derivative = _Jacobian(name, self._sizes, self._jacobian, {**options, **more})
         return self._derivative
 
 

@@ -25,10 +25,12 @@ from ccd_casadi.case_checks import (
     too_large,
 )
 from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
+from ccd_casadi.diagnosis import Severity, diagnose
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
-from ccd_casadi.models import BUILDERS, MODELS
+from ccd_casadi.models import BUILDERS, MODELS, SHIPPED
+from ccd_casadi.plant import PlantError
 from ccd_casadi.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.rib_stage import NAMES
 from ccd_casadi.rib_stage.model import OUTPUTS
@@ -292,7 +294,8 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
 def problem_of(case: Case) -> CoDesignProblem:
     """The case in SI, as the lower layers take it.
 
-    The plant is traced once here. Raises CaseError where it cannot be.
+    The plant is made once here, and one of the user's own is looked at over its box. Raises
+    CaseError where it is none.
     """
     inner, w = case.inner, case.weights
     file = function = None
@@ -335,6 +338,10 @@ def problem_of(case: Case) -> CoDesignProblem:
     )
     try:
         plant_of(problem)
+        if case.plant.model not in SHIPPED:
+            for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
+                if finding.severity is Severity.ERROR:
+                    raise PlantError(finding.words)
     except UserError as error:
         raise CaseError(_one_line(f"{case.path}: plant: {error}")) from error
     except Exception as error:

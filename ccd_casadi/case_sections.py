@@ -89,10 +89,11 @@ class InnerSection:
 
 @dataclass(frozen=True)
 class SuspensionSection:
-    """[suspension]: where rigid-body poles are put."""
+    """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
 
     frequency_hz: float = _key(POSITIVE, 0.1)
     damping_ratio: float = _key(POSITIVE, 0.7)
+    rigid_modes: int | None = _key(count(0), None)
 
 
 @dataclass(frozen=True)

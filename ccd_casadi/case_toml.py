@@ -20,7 +20,8 @@ def case_to_toml(case: Case) -> str:
 
 
 def _pairs(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in table.items()]
+    given = {key: value for key, value in table.items() if value is not None}
+    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in given.items()]
 
 
 def _toml_key(key: str) -> str:

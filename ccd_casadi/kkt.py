@@ -100,7 +100,7 @@ def lagrangian_parts(
     lower, upper = lifted_bounds(problem)
     width = upper - lower
     theta = x[:count]
-    symbol = ca.SX.sym("theta", count)
+    symbol = ca.MX.sym("theta", count)
     f, lam = plant.hardware(symbol)
     slopes = ca.Function("slopes", [symbol], [ca.jacobian(f, symbol), ca.jacobian(lam, symbol)])
     df, dlam = (np.array(value) for value in slopes(theta))

@@ -54,6 +54,8 @@ class Plant:
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
     plant modelled more closely, by name: a design is certified on them again, not optimised.
+    `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
+    result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
     """
 
     names: tuple[str, ...]
@@ -63,6 +65,9 @@ class Plant:
     outputs: int
     inputs: int
     references: Mapping[str, Callable[[Sequence[float]], Mechanics]] = field(default_factory=dict)
+    values: Callable[[Sequence[float]], Mechanics] | None = None
+    notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
+    domain: tuple[Array, Array] | None = None
 
 
 def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
@@ -77,37 +82,19 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
         raise PlantError(f"the plant model does not take its options: {error}") from error
     except KeyError as error:
         raise PlantError(f"the plant model asks for a theta that the case lacks: {error}") from None
-    missing = [key for key in _REQUIRED if key not in result]
-    if missing:
-        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
-    unknown = sorted(set(result) - _KNOWN)
-    if unknown:
-        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
-    if ("damping" in result) == ("damping_ratio" in result):
-        raise PlantError("the plant model must return either damping or damping_ratio; give one")
+    check_keys(result)
     M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
     n = M.shape[0]
-    for key, size in {"mass": n, "input": B.shape[1], "output": C.shape[0]}.items():
-        if size > LARGEST[key]:
-            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
-            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
+    check_sizes(n, B.shape[1], C.shape[0])
     D = ca.SX(result["damping"]) if "damping" in result else ca.SX.zeros(n, n)
-    shapes = {"mass": (M, (n, n)), "stiffness": (K, (n, n)), "damping": (D, (n, n))}
-    for key, (matrix, shape) in shapes.items():
-        if matrix.shape != shape:
-            raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
-    if B.shape[0] != n or C.shape[1] != n:
-        raise PlantError(f"input is {B.shape} and output {C.shape}; expected (n, m), (p, n), n={n}")
-    ratio = result.get("damping_ratio")
-    if ratio is not None and not 0.0 < float(ratio) < 1.0:
-        raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
+    check_shapes(M, D, K, B, C)
+    damping_ratio = checked_ratio(result.get("damping_ratio"))
     constraints = dict(result.get("constraints", {}))
     scalars = {"hardware_cost": result["hardware_cost"], **constraints}
     for key, value in scalars.items():
         if ca.SX(value).shape != (1, 1):
             raise PlantError(f"{key} is {ca.SX(value).shape}, not a scalar; return one number")
     lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
-    damping_ratio = None if ratio is None else float(ratio)
     dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]
     slopes = [ca.densify(ca.jacobian(ca.vec(matrix), theta)) for matrix in dense]
     matrices = ca.Function("matrices", [theta], dense + slopes)
@@ -121,24 +108,70 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     )
 
 
-def mechanics(plant: Plant, theta: Sequence[float]) -> Mechanics:
-    """The plant's matrices and exact derivatives at θ.
+def check_keys(result: Mapping[str, Any]) -> None:
+    """Raise PlantError unless a model's result has the keys of a plant and no others."""
+    missing = [key for key in _REQUIRED if key not in result]
+    if missing:
+        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
+    unknown = sorted(set(result) - _KNOWN)
+    if unknown:
+        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
+    if ("damping" in result) == ("damping_ratio" in result):
+        raise PlantError("the plant model must return either damping or damping_ratio; give one")
+
+
+def check_sizes(states: int, inputs: int, outputs: int) -> None:
+    """Raise PlantError where a plant is too large to be meant."""
+    for key, size in {"mass": states, "input": inputs, "output": outputs}.items():
+        if size > LARGEST[key]:
+            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
+            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
+
+
+def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
+    """Raise PlantError unless M, D, K are (n, n), B (n, m) and C (p, n)."""
+    n = M.shape[0]
+    for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
+        if matrix.shape != (n, n):
+            raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
+    if B.shape[0] != n or C.shape[1] != n:
+        raise PlantError(f"input is {B.shape} and output {C.shape}; expected (n, m), (p, n), n={n}")
+
+
+def checked_ratio(ratio: Any) -> float | None:
+    """A model's damping_ratio as a number, or None. Raises PlantError outside (0, 1)."""
+    if ratio is not None and not 0.0 < float(ratio) < 1.0:
+        raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
+    return None if ratio is None else float(ratio)
+
+
+def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
+    """The plant's matrices and exact derivatives at θ; without derivatives where that is cheaper.
 
     Raises PlantError where they are not finite, M or K not symmetric, or M not positive definite.
     """
-    system = plant.evaluate(theta)
+    cheaper = plant.values is not None and not derivatives
+    system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
     M, K = system.M, system.K
     values = (M, system.D, K, system.B, system.C, *system.derivatives)
     if not all(np.isfinite(value).all() for value in values):
-        raise PlantError(f"the plant is not finite at theta = {_words(plant, theta)}")
+        raise PlantError(f"the plant is not finite at theta = {theta_words(plant, theta)}")
     for name, matrix in (("mass", M), ("stiffness", K)):
-        if np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
-            raise PlantError(f"{name} is not symmetric at theta = {_words(plant, theta)}")
+        gap = np.abs(matrix - matrix.T)
+        if gap.max() > 1e-9 * np.abs(matrix).max():
+            i, j = np.unravel_index(int(gap.argmax()), gap.shape)
+            entries = (
+                f"row {i + 1}, column {j + 1} is {matrix[i, j]:g}, its mirror {matrix[j, i]:g}"
+            )
+            words = f"{name} is not symmetric at theta = {theta_words(plant, theta)}"
+            raise PlantError(f"{words}: {entries}; make it symmetric")
     try:
         np.linalg.cholesky(M)
     except np.linalg.LinAlgError:
-        message = f"mass is not positive definite at theta = {_words(plant, theta)}"
-        raise PlantError(message) from None
+        least = float(np.linalg.eigvalsh(M)[0])
+        words = f"mass is not positive definite at theta = {theta_words(plant, theta)}"
+        remedy = "give every coordinate a mass, or narrow the bounds of theta"
+        raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
     return system
 
 
@@ -164,5 +197,6 @@ def constraint_values(plant: Plant, theta: Sequence[float] | Array) -> Array:
     return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
 
 
-def _words(plant: Plant, theta: Sequence[float]) -> str:
+def theta_words(plant: Plant, theta: Sequence[float]) -> str:
+    """θ as `name=value, name=value`."""
     return ", ".join(f"{name}={value:g}" for name, value in zip(plant.names, theta, strict=True))

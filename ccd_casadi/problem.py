@@ -19,6 +19,7 @@ from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
 from ccd_casadi.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.models import BUILDERS, MODELS
+from ccd_casadi.numeric_plant import own_plant
 from ccd_casadi.plant import Array, ModelFunction, Plant, PlantError, build_plant, mechanics
 from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.user_code import limited, require_user_code, time_limit
@@ -125,21 +126,28 @@ def plant_of(problem: CoDesignProblem) -> Plant:
 
     Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
     """
-    if problem.source.file is not None:
-        require_user_code(f"{problem.source.file}:{problem.source.function}")
-    return _plant(problem.source, problem.names)
+    if problem.source.model is not None:
+        return _known_plant(problem.source, problem.names)
+    require_user_code(f"{problem.source.file}:{problem.source.function}")
+    return _own_plant(problem.source, problem.names, problem.lower, problem.upper)
 
 
 @lru_cache(maxsize=8)
-def _plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+def _known_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
     if source.model in BUILDERS:
         return BUILDERS[source.model](names, **dict(source.options))
-    return build_plant(_model(source), names, dict(source.options))
+    assert source.model is not None
+    return build_plant(MODELS[source.model], names, dict(source.options))
 
 
-def _model(source: PlantSource) -> ModelFunction:
-    if source.model is not None:
-        return MODELS[source.model]
+@lru_cache(maxsize=8)
+def _own_plant(
+    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
+) -> Plant:
+    return own_plant(_own_function(source), names, dict(source.options), lower, upper)
+
+
+def _own_function(source: PlantSource) -> ModelFunction:
     assert source.file is not None
     assert source.function is not None
     path = Path(source.file)

@@ -117,6 +117,7 @@ def _design(problem: CoDesignProblem, solution: "Solution") -> Section:
         table_html(theta_table(problem, solution.result))
         + facts_html(design_facts(problem, solution.result))
         + f"\n<h3>What binds</h3>\n{what}"
+        + "".join(paragraph(f"Note: {words}.") for words in solution.result.get("notes", ()))
     )
     return Section("The design", body)
 

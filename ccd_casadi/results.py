@@ -14,7 +14,7 @@ import numpy as np
 from ccd_casadi.iterates import FormulationResult
 from ccd_casadi.kkt import KktCertificate
 from ccd_casadi.outer import OuterSolution
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.problem import CoDesignProblem, plant_of
 from ccd_casadi.scaling import StateSpace
 from ccd_casadi.synthesis import DesignFigures
 from ccd_casadi.verify import RobustCheck, VerifiedDesign
@@ -99,6 +99,7 @@ def result_dict(
             for check in verified.references
         },
         **_robust(verified.robust),
+        "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         "syntheses": syntheses,
         "seconds": seconds,

@@ -16,13 +16,15 @@ from ccd_casadi.case_sections import Case
 from ccd_casadi.case_toml import case_to_toml
 from ccd_casadi.cluster import pool
 from ccd_casadi.command_line import ExitCode, add_scheduler, parser, run, run_folder
+from ccd_casadi.diagnosis import Severity, diagnose, first_seen
 from ccd_casadi.direct import solve_direct
 from ccd_casadi.iterates import FormulationResult
 from ccd_casadi.known import Surrogates, named_surrogate
 from ccd_casadi.lifted import solve_lifted
+from ccd_casadi.models import SHIPPED
 from ccd_casadi.nested import solve_nested
 from ccd_casadi.outer import unmet_constraint
-from ccd_casadi.problem import box, plant_of
+from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.results import (
     controller_dict,
     infeasible_dict,
@@ -206,12 +208,26 @@ def summary(solution: Solution) -> str:
     return "\n".join(lines)
 
 
+def tell(case: Case, problem: CoDesignProblem) -> None:
+    """On stderr: what is serious about a plant of the user's own, and what it is made of."""
+    if case.plant.model in SHIPPED:
+        return
+    found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
+    for item in found:
+        if item.severity is not Severity.NOTE:
+            print(f"{item.severity.value}: plant: {item.words}", file=sys.stderr)
+    for words in plant_of(problem).notes(problem.start):
+        print(f"note: {words}", file=sys.stderr)
+
+
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
+    if not options.quiet:
+        tell(case, problem)
     given = None
     if options.surrogate is not None:
         given = named_surrogate(folder, options.surrogate, options.formulation, problem)

@@ -171,7 +171,7 @@ def _sweep(
 
 def _cost_gradient(problem: CoDesignProblem) -> Callable[[Array], Array]:
     """∂f/∂θ from the CasADi expression."""
-    symbol = ca.SX.sym("theta", len(problem.names))
+    symbol = ca.MX.sym("theta", len(problem.names))
     f, _ = plant_of(problem).hardware(symbol)
     function = ca.Function("slope", [symbol], [ca.jacobian(f, symbol)])
     return lambda theta: np.array(function(theta)).ravel()

@@ -485,7 +485,7 @@ def test_a_users_plant_that_is_none_is_refused(
     ("result", "words"),
     [
         (GOOD + " | {'mass': ca.diag(ca.vertcat(60 - t['m1'], 1))}", "mass is not positive def"),
-        (GOOD + " | {'stiffness': math.nan * ca.DM.ones(2, 2)}", "is not finite at theta = m1=55"),
+        (GOOD + " | {'stiffness': math.nan * ca.DM.ones(2, 2)}", "is not finite at theta = m1="),
         (GOOD + " | {'stiffness': ca.DM([[1, 2], [3, 4]])}", "stiffness is not symmetric"),
     ],
 )

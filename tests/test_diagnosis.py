@@ -1,0 +1,143 @@
+"""What is told of a wrong or awkward plant, on loading and by the command `check`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ccd_casadi.case import CaseError, load_case, problem_of
+from ccd_casadi.check import main as check
+from ccd_casadi.diagnosis import Topic, diagnose
+from ccd_casadi.solve import main as solve
+
+ROOT = Path(__file__).parent.parent
+GOOD = (
+    "{'mass': ca.diag(ca.vertcat(m1, m2)), 'stiffness': 2e8 * chain, 'damping_ratio': 0.01,"
+    " 'input': ca.DM([1, 0]), 'output': ca.DM([[1, 0]]), 'hardware_cost': m1 + m2}"
+)
+
+
+def case_file(folder: Path, result: str, suspension: str = "", before: str = "") -> Path:
+    """A case with the bounds of case study 1 whose plant function returns `result`."""
+    (folder / "plant.py").write_text(
+        "import casadi as ca\n\n\ndef f(t):\n    m1, m2 = t['m1'], t['m2']\n"
+        f"    chain = ca.DM([[1, -1], [-1, 1]])\n{before}    return {result}\n"
+    )
+    text = (ROOT / "runs" / "two_mass.toml").read_text()
+    text = text.replace('model = "two_mass"', 'function = "plant.py:f"').replace(
+        "zeta = 0.01 ", "#"
+    )
+    path = folder / "own.toml"
+    path.write_text(f"{text}\n[suspension]\n{suspension}\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("result", "suspension", "words"),
+    [
+        # wrong at corners or in the middle only, where the start is sound
+        (GOOD + "|{'mass': ca.diag(ca.vertcat(m1 - 56, m2))}", "", "mass is not positive definite"),
+        (GOOD + "|{'mass': ca.diag(ca.vertcat(m1 - 56, m2))}", "", "least eigenvalue is -1;"),
+        (GOOD + "|{'stiffness': 2e8 * chain - (m1 > 69) * ca.DM([[0, 1], [0, 0]])}", "",
+         "stiffness is not symmetric at theta = m1=70"),
+        (GOOD + "|{'stiffness': 2e8 * chain - (m2 < 56) * 1e6 * ca.DM.eye(2)}", "",
+         "negative eigenvalue; the plant is not stable at theta = m1=55, m2=55"),
+        (GOOD + "|{'input': ca.DM([0, 0])}", "", "no mode is both driven and measured"),
+        (GOOD, "rigid_modes = 2", "1 rigid-body modes at the start, where"),
+        (GOOD + "|{'stiffness': 2e8 * chain + 1e5 * ca.DM.eye(2)}", "rigid_modes = 1",
+         "0 rigid-body modes at the start, where suspension.rigid_modes expects 1"),
+    ],
+)  # fmt: skip
+def test_a_wrong_plant_is_refused_on_loading(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], result: str, suspension: str, words: str
+) -> None:
+    path = case_file(tmp_path, result, suspension)
+    with pytest.raises(CaseError) as caught:
+        problem_of(load_case(path))
+    assert str(caught.value).startswith(f"{path}: plant: ")
+    assert words in str(caught.value)
+    assert check([str(path)]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_the_expected_number_of_rigid_modes_passes_and_a_wrong_one_is_no_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert check([str(case_file(tmp_path, GOOD, "rigid_modes = 1"))]) == 0
+    assert check([str(case_file(tmp_path, GOOD, "rigid_modes = -1"))]) == 2
+    assert "suspension.rigid_modes: is -1" in capsys.readouterr().err
+
+
+HIDDEN = (
+    "    M = ca.diag(ca.vertcat(m1, m2, m2))\n    K = 1e8*ca.DM([[2,-1,-1],[-1,1,0],[-1,0,1]])\n"
+)
+THREE = GOOD + "|{'mass': M, 'stiffness': K, 'input': ca.DM([1,0,0]), 'output': ca.DM([[1,0,0]])}"
+
+
+def test_a_hidden_mode_is_told_by_its_frequency(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two equal masses on equal springs, seen from the third: their opposed motion is hidden."""
+    path = case_file(tmp_path, THREE, before=HIDDEN)
+    assert check([str(path)]) == 0
+    out = capsys.readouterr().out
+    hz = (1e8 / 67.56) ** 0.5 / 6.283185307
+    assert f"the mode at {hz:.5g} Hz at the start is not driven and not measured" in out
+    assert "(uncontrollable, unobservable)" in out
+    assert out.count("warning") == 1
+    # a damper between both lets the motion out again, whatever its matrix does to symmetry
+    asymmetric = THREE.replace("'damping_ratio': 0.01", "'damping': ca.diag(ca.DM([0, 1e4, 2e4]))")
+    (tmp_path / "damped").mkdir()
+    assert check([str(case_file(tmp_path / "damped", asymmetric, before=HIDDEN))]) == 0
+    assert "not driven" not in capsys.readouterr().out
+
+
+def test_a_rigid_motion_that_no_input_drives_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    free = GOOD + "|{'stiffness': 0 * chain}"
+    assert check([str(case_file(tmp_path, free))]) == 0
+    assert "of 2 rigid-body motions at the start one or more are not driven" in (
+        capsys.readouterr().out
+    )
+
+
+def test_zeros_and_the_bandwidth_to_expect_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert check([str(ROOT / "runs" / "two_mass.toml"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    # two equal masses: the antiresonance is that of one on the spring, the resonance √2 above
+    assert found["modes"][1]["frequency_hz"] == pytest.approx(250.0, abs=0.05)
+    (zero,) = found["zeros"]
+    assert zero["frequency_hz"] == pytest.approx(250.0 / 2**0.5, rel=1e-3)
+    assert zero["damping_ratio"] == pytest.approx(0.01 / 2**0.5, rel=0.05)
+    assert 0.001 < zero["dip"] < 0.1
+    assert [f["severity"] for f in found["findings"]] == ["note"]
+    low, high = found["bandwidth_window_hz"]
+    assert low < 52.6 < high  # the true ω_b* there
+    # M_K that suits scales with the square of the bandwidth
+    suits = found["M_K_for_bandwidth"]
+    assert suits[2]["M_K"] / suits[0]["M_K"] == pytest.approx(6.25)
+
+
+def test_a_zero_in_the_right_half_plane_is_a_warning(tmp_path: Path) -> None:
+    """Force on one mass, sensor beyond the other, as at the far end of a lever."""
+    lever = GOOD + "|{'output': ca.DM([[-9, 10]])}"
+    problem = problem_of(load_case(case_file(tmp_path, lever)))
+    words = [f.words for f in diagnose(problem)[1] if f.topic is Topic.ZERO]
+    assert "right half-plane" in words[0]
+    # 10 X2/F - 9 X1/F = 0 at s² = k/(9 m2), damping neglected
+    hz = (2e8 / 9 / 67.56) ** 0.5 / 6.283185307
+    assert f"{hz:.4g}"[:3] in words[0]
+
+
+def test_solve_tells_what_is_serious_unless_it_is_quiet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = case_file(tmp_path, THREE, before=HIDDEN)
+    text = path.read_text().replace("S_max = 1.75", "S_max = 1.001")
+    path.write_text(text + "\n[sampling]\nlifted_points = 8\n[outer]\nmax_refinements = 0\n")
+    words = [str(path), "--formulation", "lifted", "--workers", "1", "--out", str(tmp_path / "run")]
+    assert solve(words) == 3
+    assert "warning: plant: the mode at" in capsys.readouterr().err
+    assert solve([*words, "--quiet"]) == 3
+    assert len(capsys.readouterr().err.splitlines()) == 1
