@@ -47,12 +47,16 @@ class BandwidthSample:
 
 @dataclass(frozen=True)
 class QuantitySample:
-    """Values (4,) and derivatives (4, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified."""
+    """Values (4,) and derivatives (4, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
+
+    `peak_frequency` is where S is largest, rad/s; NaN where it is not known.
+    """
 
     x: tuple[float, ...]
     values: Array
     gradients: Array
     certified: bool
+    peak_frequency: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -290,7 +294,8 @@ def quantity_sample(x: tuple[float, ...], sample: Sample, count: int) -> Quantit
             ]
         )
     gradients = np.array(sample.gradients).reshape(4, count + 2)
-    return QuantitySample(x, values, gradients, sample.certified)
+    where = sample.sensitivity_peak_frequency
+    return QuantitySample(x, values, gradients, sample.certified, where)
 
 
 def _number(value: float) -> float | None:

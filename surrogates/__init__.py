@@ -32,6 +32,7 @@ from surrogates.fitting import Kind, fit
 from surrogates.gaussian_process import GaussianProcess, condition, loo_errors
 from surrogates.interface import Surrogate, SurrogateFitError
 from surrogates.kernels import Hyperparameters, Kernel
+from surrogates.maximum import Maximum, fit_maximum, pieces_of
 from surrogates.network import Network, fit_network
 from surrogates.outputs import fit_outputs
 from surrogates.polynomial import Polynomial, fit_polynomial
@@ -59,6 +60,7 @@ __all__ = [
     "Hyperparameters",
     "Kernel",
     "Kind",
+    "Maximum",
     "Network",
     "Polynomial",
     "RadialBasis",
@@ -80,6 +82,7 @@ __all__ = [
     "errors",
     "extrapolation",
     "fit",
+    "fit_maximum",
     "fit_network",
     "fit_outputs",
     "fit_polynomial",
@@ -89,6 +92,7 @@ __all__ = [
     "latin_hypercube",
     "load",
     "loo_errors",
+    "pieces_of",
     "save",
     "sobol",
     "to_casadi",

@@ -159,7 +159,7 @@ def _words(
             f"The samples look as if the function had {what}: the worst tenth of them hold "
             f"{share:.0%} of the squared error, the worst near ({where}). One smooth surrogate "
             "is not enough: model the smooth quantities behind it, each by a surrogate of its "
-            "own, and leave the maximum or the switch between them to the optimiser."
+            "own (fit_maximum), and leave the maximum or the switch to the optimiser."
         )
     elif kfold.q2 < GOOD:
         said.append(

@@ -14,6 +14,7 @@ from surrogates.casadi_export import (
 )
 from surrogates.flat_limit import UNDER_ROOT
 from surrogates.interface import Surrogate, no_deviation
+from surrogates.maximum import Maximum
 from surrogates.network import Network
 from surrogates.polynomial import Polynomial, total_degree
 from surrogates.radial_basis import DEGREES, Basis, RadialBasis
@@ -99,3 +100,13 @@ def _(surrogate: Exponential, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     inside = expression(surrogate.logarithm, x, std)
     value = ca.exp(inside[0])
     return (value, value * inside[1]) if std else (value,)
+
+
+@expression.register
+def _(surrogate: Maximum, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
+    best = expression(surrogate.pieces[0], x, std)
+    for piece in surrogate.pieces[1:]:
+        other = expression(piece, x, std)
+        larger = other[0] > best[0]
+        best = tuple(ca.if_else(larger, b, a) for a, b in zip(best, other, strict=True))
+    return best

@@ -20,6 +20,7 @@ import numpy as np
 
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate
+from surrogates.maximum import Maximum
 from surrogates.network import Network
 from surrogates.polynomial import Polynomial
 from surrogates.radial_basis import RadialBasis
@@ -35,6 +36,7 @@ KINDS: dict[str, type[Any]] = {
     "radial_basis": RadialBasis,
     "network": Network,
     "exponential": Exponential,
+    "maximum": Maximum,
 }
 
 
