@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import rosen, rosen_der
+from scipy.optimize import minimize, rosen, rosen_der
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 
@@ -15,6 +15,7 @@ from surrogates import (
     Hyperparameters,
     Kernel,
     SurrogateFitError,
+    checked,
     condition,
     cross_validate,
     design,
@@ -22,6 +23,7 @@ from surrogates import (
     fit,
     fit_outputs,
     loo_errors,
+    profile_likelihood,
 )
 from surrogates.bands import calibrated
 from surrogates.kernels import covariance, observed_covariance, radial
@@ -393,3 +395,44 @@ def test_many_close_samples_without_noise_are_fitted() -> None:
     Y = np.sin(2 * X[:, 0] + X[:, 1]) + (X[:, 0] + 2 * X[:, 1]) ** 2 / 2
     gp = fit(X, Y, lower=[0, 0], upper=[1, 1], noise=0.0, starts=1)
     assert gp.loo.rms < 1e-4
+
+
+@KERNELS
+def test_the_profile_likelihood_is_the_likelihood_with_mean_and_variance_eliminated(
+    kernel: Kernel,
+) -> None:
+    X = design("sobol", [0, 0], [1, 1], 24, seed=3)
+    t = np.sin(3.0 * X[:, 0]) + X[:, 1] ** 2 + 5.0
+    lengths = np.array([0.25, 0.35])  # longer ones drown the differences in rounding
+    value, slope = profile_likelihood._negative(kernel, X, t, lengths)
+    C = covariance(kernel, X, X, lengths) + profile_likelihood.JITTER * np.eye(24)
+
+    def negative(mean_and_log_variance: np.ndarray) -> float:
+        mean, variance = mean_and_log_variance[0], np.exp(mean_and_log_variance[1])
+        residual = t - mean
+        log_det = np.linalg.slogdet(C)[1]
+        inside = residual @ np.linalg.solve(C, residual) / variance
+        return 0.5 * (24 * np.log(variance) + log_det + inside)
+
+    least = minimize(negative, [5.0, 0.0], method="Nelder-Mead", options={"fatol": 1e-10}).fun
+    assert value + 12.0 == pytest.approx(least, abs=1e-6)  # ½ n of the quadratic form
+    for j, e in enumerate(1e-5 * np.eye(2)):
+        up, down = (
+            profile_likelihood._negative(kernel, X, t, lengths * np.exp(sign * e))[0]
+            for sign in (1.0, -1.0)
+        )
+        assert slope[j] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-6)
+
+
+def test_exact_samples_are_polished_about_their_own_mean() -> None:
+    # Far from zero mean in its own units: the sample mean is a poor one at long length scales.
+    X = design("lhs", [0] * 6, [1] * 6, 80, seed=2)
+    Y = np.exp(X @ [1.0, 0.8, 0.5, 0.0, 0.1, 0.3])
+    gp = fit(X, Y, lower=[0] * 6, upper=[1] * 6, kernel="rbf", noise=0.0)
+    samples = checked(X, Y, [0] * 6, [1] * 6, None, 0.0)
+    at = profile_likelihood._negative(
+        Kernel.RBF, samples.unit, samples.targets, gp.hyperparameters.length_scales
+    )
+    assert np.abs(at[1][gp.hyperparameters.length_scales < 900]).max() < 0.05
+    repeated = fit(np.repeat(X, 1, 0), np.ones(80), lower=[0] * 6, upper=[1] * 6, noise=0.0)
+    assert repeated.predict(X[:3]) == pytest.approx(1.0)
