@@ -7,8 +7,7 @@ the step, is the cross-check: their difference bounds the error from above.
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
@@ -72,13 +71,33 @@ def own_plant(
     return plant
 
 
-@dataclass(frozen=True)
 class _Values:
-    """What a model returns at one θ, as arrays; `scalars` are f and λ."""
+    """What a model returns at one θ, as arrays when they are asked for; `scalars` are f and λ."""
 
-    system: Mechanics
-    constraint_names: tuple[str, ...]
-    scalars: Array
+    def __init__(self, result: Mapping[str, Any]) -> None:
+        check_keys(result)
+        self._result = result
+        constraints = dict(result.get("constraints", {}))
+        self.constraint_names = tuple(constraints)
+        self.scalars = np.array(
+            [
+                _number(key, value)
+                for key, value in {"hardware_cost": result["hardware_cost"], **constraints}.items()
+            ]
+        )
+
+    @cached_property
+    def system(self) -> Mechanics:
+        """M, D, K, B, C, with derivatives to no parameter."""
+        result = self._result
+        sparse = [ca.DM(result[key]) for key in ("mass", "stiffness", "input", "output")]
+        check_sizes(sparse[0].shape[0], sparse[2].shape[1], sparse[3].shape[0])
+        M, K, B, C = (_array(matrix) for matrix in sparse)
+        D = _array(result["damping"]) if "damping" in result else np.zeros_like(M)
+        check_shapes(M, D, K, B, C)
+        ratio = checked_ratio(result.get("damping_ratio"))
+        none = tuple(np.zeros((0, *matrix.shape)) for matrix in (M, D, K, B, C))
+        return Mechanics(M, D, K, B, C, ratio, none)  # type: ignore[arg-type]
 
 
 class DifferencedModel:
@@ -137,6 +156,7 @@ class DifferencedModel:
             hardware=ca.Function("hardware", [theta], [both[0], lam]),
             outputs=middle.system.C.shape[0],
             inputs=middle.system.B.shape[1],
+            exact_hessian=False,
             values=self.values,
             notes=notes,
         )
@@ -144,9 +164,17 @@ class DifferencedModel:
     def __call__(self, theta: Sequence[float] | Array) -> Mechanics:
         """M, D, K, B, C and their derivatives at θ."""
         here = self._at(theta)
-        slopes = self._slopes(theta, lambda item: _matrices(item.system), 4)
+        ratio = here.system.damping_ratio
+
+        def parts(item: _Values) -> tuple[Array, ...]:
+            if item.system.damping_ratio != ratio:
+                words = "damping_ratio changes with theta; return damping, a matrix"
+                raise PlantError(f"{words}, in its place")
+            return _matrices(item.system)
+
+        slopes = self._slopes(theta, parts, 4)
         return Mechanics(
-            *_matrices(here.system), here.system.damping_ratio, tuple(slopes)  # type: ignore[arg-type]
+            *_matrices(here.system), ratio, tuple(slopes)  # type: ignore[arg-type]
         )  # fmt: skip
 
     def values(self, theta: Sequence[float] | Array) -> Mechanics:
@@ -182,8 +210,7 @@ class DifferencedModel:
     ) -> list[Array]:
         """Derivatives of every part, a leading axis over θ; `order` 4, or 2 with twice the step."""
         point = np.asarray(theta, float)
-        here = self._at(point)
-        ratio, base = here.system.damping_ratio, parts(here)
+        base = parts(self._at(point))
         rows: list[list[Array]] = []
         for i, width in enumerate(self.upper - self.lower):
             h = STEP * width
@@ -195,11 +222,7 @@ class DifferencedModel:
             for offset in offsets:
                 moved = point.copy()
                 moved[i] = point[i] if offset == away else centre + offset * h
-                item = self._at(moved)
-                if item.system.damping_ratio != ratio:
-                    words = "damping_ratio changes with theta; return damping, a matrix"
-                    raise PlantError(f"{words}, in its place")
-                found.append(parts(item))
+                found.append(parts(self._at(moved)))
             # The weights sum to zero: without the value at θ a constant has no slope at all.
             columns = (np.array(column) for column in zip(*found, strict=True))
             rows.append(
@@ -211,24 +234,15 @@ class DifferencedModel:
         return self._read(tuple(float(value) for value in theta))
 
     def _call(self, theta: tuple[float, ...]) -> _Values:
-        result = self._model(dict(zip(self.names, theta, strict=True)), **self._options)
-        check_keys(result)
-        sparse = [ca.DM(result[key]) for key in ("mass", "stiffness", "input", "output")]
-        check_sizes(sparse[0].shape[0], sparse[2].shape[1], sparse[3].shape[0])
-        M, K, B, C = (_array(matrix) for matrix in sparse)
-        D = _array(result["damping"]) if "damping" in result else np.zeros_like(M)
-        check_shapes(M, D, K, B, C)
-        ratio = checked_ratio(result.get("damping_ratio"))
-        constraints = dict(result.get("constraints", {}))
-        values = {"hardware_cost": result["hardware_cost"], **constraints}
-        scalars = {key: _array(value) for key, value in values.items()}
-        for key, value in scalars.items():
-            if value.shape != (1, 1):
-                raise PlantError(f"{key} is {value.shape}, not a scalar; return one number")
-        none = tuple(np.zeros((0, *matrix.shape)) for matrix in (M, D, K, B, C))
-        system = Mechanics(M, D, K, B, C, ratio, none)  # type: ignore[arg-type]
-        flat = np.array([value[0, 0] for value in scalars.values()])
-        return _Values(system, tuple(constraints), flat)
+        return _Values(self._model(dict(zip(self.names, theta, strict=True)), **self._options))
+
+
+def _number(key: str, value: Any) -> float:
+    if isinstance(value, int | float):
+        return float(value)
+    if ca.DM(value).shape != (1, 1):
+        raise PlantError(f"{key} is {ca.DM(value).shape}, not a scalar; return one number")
+    return float(ca.DM(value))
 
 
 def _array(value: Any) -> Array:

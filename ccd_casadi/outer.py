@@ -77,6 +77,7 @@ def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> Nonlinea
         upper=np.array(problem.upper),
         variables=problem.names,
         constraints=plant.constraint_names,
+        exact_hessian=plant.exact_hessian,
     )
 
 
@@ -105,7 +106,7 @@ def lifted_program(
         upper=upper,
         variables=(*problem.names, "omega_S", "omega_T"),
         constraints=("S_max", "S_low", *plant.constraint_names),
-        exact_hessian=exact_hessian,
+        exact_hessian=exact_hessian and plant.exact_hessian,
     )
 
 
@@ -232,6 +233,7 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         upper=np.append(upper, 2.0),
         variables=(*problem.names, "slack"),
         constraints=plant.constraint_names,
+        exact_hessian=plant.exact_hessian,
     )
     try:
         best = solve_program(program, np.column_stack([points, np.ones(len(points))])).best.x[:-1]

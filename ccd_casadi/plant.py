@@ -56,6 +56,7 @@ class Plant:
     plant modelled more closely, by name: a design is certified on them again, not optimised.
     `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
     result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
+    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
     """
 
     names: tuple[str, ...]
@@ -65,6 +66,7 @@ class Plant:
     outputs: int
     inputs: int
     references: Mapping[str, Callable[[Sequence[float]], Mechanics]] = field(default_factory=dict)
+    exact_hessian: bool = True
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
     domain: tuple[Array, Array] | None = None
