@@ -18,6 +18,8 @@ from ccd_casadi.case_checks import (
     POSITIVE,
     Check,
     choice,
+    count,
+    flag,
     number,
     rows,
     shown,
@@ -29,7 +31,7 @@ from ccd_casadi.diagnosis import Severity, diagnose
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
-from ccd_casadi.models import BUILDERS, MODELS, SHIPPED
+from ccd_casadi.models import BUILDERS, DATA, MODELS, SHIPPED
 from ccd_casadi.plant import PlantError
 from ccd_casadi.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.rib_stage import NAMES
@@ -64,6 +66,12 @@ _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
     ("rib_stage", "actuators"): rows(2),
     ("rib_stage", "sensors"): rows(2),
     ("rib_stage", "point_masses"): rows(3),
+    ("modal_table", "table"): text,
+    ("modal_table", "rigid_below_hz"): POSITIVE,
+    ("sampled_matrices", "folder"): text,
+    ("sampled_matrices", "modes"): count(1),
+    ("sampled_matrices", "static_correction"): flag,
+    ("sampled_matrices", "rigid_below_hz"): POSITIVE,
 }
 _KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 
@@ -195,6 +203,19 @@ def _plant(
         wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
+    data = DATA.get(model or "")
+    if data is not None:
+        if data not in options:
+            raise fail(f"plant.{data}", f"is missing; add it, which {model} needs")
+        try:
+            place = (path.parent / options[data]).resolve()
+            exists = place.exists()
+        except (OSError, ValueError):
+            exists = False
+        if not exists:
+            words = f"there is no {shown(options[data])}; give its path relative to the case file"
+            raise fail(f"plant.{data}", words)
+        options[data] = str(place)  # absolute, as a function's file
     return PlantSection(model, function, options)
 
 

@@ -45,6 +45,10 @@ def text(value: Any) -> str | None:
     return None if isinstance(value, str) else f"is {shown(value)}; give a text in quotes"
 
 
+def flag(value: Any) -> str | None:
+    return None if isinstance(value, bool) else f"is {shown(value)}; give true or false"
+
+
 def interval(value: Any) -> str | None:
     remedy = "give two positive numbers [low, high] with low < high"
     if not isinstance(value, list | tuple) or len(value) != 2:

@@ -18,7 +18,7 @@ from ccd_casadi.errors import UserError
 from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
 from ccd_casadi.modal import Perturbation, Suspension, modal_plant
-from ccd_casadi.models import BUILDERS, MODELS
+from ccd_casadi.models import BUILDERS, DATA, MODELS
 from ccd_casadi.numeric_plant import own_plant
 from ccd_casadi.plant import Array, ModelFunction, Plant, PlantError, build_plant, mechanics
 from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
@@ -43,11 +43,15 @@ class PlantSource:
         digest = None
         if self.file is not None:
             digest = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+        options = dict(self.options)
+        data = DATA.get(self.model or "")
+        if data is not None:
+            digest = _digest(Path(str(options.pop(data, ""))))
         return {
             "model": self.model,
             "function": self.function,
             "source": digest,
-            "options": dict(self.options),
+            "options": options,
         }
 
 
@@ -119,6 +123,16 @@ class CoDesignProblem:
             "sweep_points": list(inner.sweep_points),
             "method": self.method,
         }
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of every file in a folder, by name and content."""
+    found = hashlib.sha256()
+    for file in [path] if path.is_file() else sorted(item for item in path.glob("*")):
+        if file.is_file():
+            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            found.update(f"{'' if file == path else file.name}\0{content}\n".encode())
+    return found.hexdigest()
 
 
 def plant_of(problem: CoDesignProblem) -> Plant:
