@@ -1,0 +1,400 @@
+"""What a finished design survives: every figure against another way to it."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from helpers import HZ, SUSPENSION, few, random_plant, scaled
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import trapezoid
+
+from ccd_casadi.closed_loop import responses
+from ccd_casadi.interchange import named_controller, named_plant, to_control
+from ccd_casadi.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plant import mechanics
+from ccd_casadi.robustness.__main__ import main
+from ccd_casadi.robustness.margins import margins
+from ccd_casadi.robustness.move import mass_feedforward, simulate
+from ccd_casadi.robustness.perturbed import (
+    damping_line,
+    shift_line,
+    single_modes,
+    system_of,
+    tolerances,
+    worst_in_box,
+)
+from ccd_casadi.robustness.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robustness.signals import closed_loop, gains, noise
+from ccd_casadi.robustness.structured import structured_bound
+from ccd_casadi.run_folder import FinishedRun, read_run
+from ccd_casadi.scaling import StateSpace, scale_plant
+from ccd_casadi.synthesis import synthesise
+from ccd_casadi.weights import Weights
+
+GRID = np.unique(np.concatenate([np.geomspace(0.2, 3000.0, 800), np.linspace(120, 260, 600)]))
+
+
+@pytest.fixture(scope="module")
+def run(two_mass_run: Path) -> FinishedRun:
+    return read_run(two_mass_run)
+
+
+def matrix(plant: StateSpace, controller: StateSpace) -> np.ndarray:
+    return closed_loop(plant, controller).A
+
+
+def stable(plant: StateSpace, controller: StateSpace) -> bool:
+    return bool(np.linalg.eigvals(matrix(plant, controller)).real.max() < 0.0)
+
+
+# ---- the setpoint -------------------------------------------------------------------------------
+
+
+def flown(profile: Setpoint) -> tuple[np.ndarray, np.ndarray]:
+    """Times, and (position, velocity, acceleration, jerk) there, by the intervals' polynomials."""
+    state, now = np.zeros(4), 0.0
+    times, states = [0.0], [state]
+    for span, snap in zip(profile.durations, profile.snaps, strict=True):
+        for t in np.linspace(0.0, span, 9)[1:]:
+            p, v, a, j = state
+            states.append(
+                np.array([
+                    p + v * t + a * t**2 / 2 + j * t**3 / 6 + snap * t**4 / 24,
+                    v + a * t + j * t**2 / 2 + snap * t**3 / 6,
+                    a + j * t + snap * t**2 / 2,
+                    j + snap * t,
+                ])
+            )  # fmt: skip
+            times.append(now + t)
+        state, now = states[-1], now + span
+    return np.array(times), np.array(states)
+
+
+positive = st.floats(1e-3, 1e3)
+
+
+@given(positive, positive, positive, positive, positive)
+@few(max_examples=100)
+def test_a_setpoint_arrives_at_rest_within_its_bounds(
+    stroke: float, v: float, a: float, j: float, s: float
+) -> None:
+    limits = Limits(stroke, v, a, j, s)
+    profile = setpoint(limits)
+    assert (profile.durations >= 0.0).all()
+    _, states = flown(profile)
+    bounds = np.array([stroke, v, a, j])
+    assert (np.abs(states) <= bounds * (1.0 + 1e-9)).all()
+    reached = np.abs(states).max(axis=0)
+    end = np.array([stroke, 0.0, 0.0, 0.0])
+    assert np.abs(states[-1] - end) == pytest.approx(0.0, abs=1e-8 * max(1.0, *reached))
+    assert reached[1:] == pytest.approx(
+        [profile.velocity, profile.acceleration, profile.jerk], rel=1e-9
+    )
+
+
+@given(st.tuples(positive, positive, positive, positive, positive), st.integers(1, 4))
+@few(max_examples=50)
+def test_more_room_never_takes_longer(values: Sequence[float], which: int) -> None:
+    wider = list(values)
+    wider[which] *= 1.5
+    before, after = setpoint(Limits(*values)), setpoint(Limits(*wider))
+    assert after.duration <= before.duration * (1.0 + 1e-9)
+
+
+def test_a_setpoint_by_hand() -> None:
+    """100 m/s³ in 10 ms of snap, 2 m/s² after 10 ms more, 0.1 m/s after 20 ms more, 0.01 m."""
+    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    assert profile.durations[:8] == pytest.approx(
+        [0.01, 0.01, 0.01, 0.02, 0.01, 0.01, 0.01, 0.02], rel=1e-9
+    )
+    assert profile.duration == pytest.approx(0.18, rel=1e-9)
+
+
+def test_the_shortest_of_moves_has_snap_alone() -> None:
+    """8 s t⁴ = stroke: eight equal pieces."""
+    profile = setpoint(Limits(1e-6, 1e3, 1e3, 1e3, 1.0))
+    t = (1e-6 / 8.0) ** 0.25
+    assert profile.durations[profile.durations > 1e-12] == pytest.approx([t] * 8, rel=1e-6)
+
+
+# ---- the move ------------------------------------------------------------------------------------
+
+
+def rigid_loop(mass: float, gain: float, zeta: float) -> tuple[StateSpace, StateSpace]:
+    """A free mass, and a lead with roll-off that holds it."""
+    plant = StateSpace(
+        np.array([[0.0, 1.0], [0.0, 0.0]]),
+        np.array([[0.0], [1.0 / mass]]),
+        np.array([[1.0, 0.0]]),
+        np.zeros((1, 1)),
+    )
+    lead = control.ss(control.tf([2 * zeta * np.sqrt(gain * mass), gain], [1.0 / 600.0, 1.0]))
+    return plant, StateSpace(lead.A, lead.B, lead.C, lead.D)
+
+
+def test_a_mass_driven_by_its_own_feedforward_has_no_error() -> None:
+    plant, controller = rigid_loop(3.0, 3e4, 0.7)
+    loop = closed_loop(plant, controller)
+    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    move = simulate(loop, profile, axis=0, forces=np.array([3.0]), window=1e-9, bandwidth_hz=15.0)
+    assert move.peak_error < 1e-13
+    assert move.settling == 0.0
+    assert move.peak_force[0] == pytest.approx(3.0 * profile.acceleration, rel=1e-3)
+    assert move.duration == pytest.approx(profile.duration)
+
+
+def test_a_move_against_python_control() -> None:
+    """forced_response on a fine grid, the setpoint held linear between its points."""
+    plant, controller = rigid_loop(3.0, 3e4, 0.7)
+    loop = closed_loop(plant, controller)
+    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
+    dense = np.linspace(0.0, 0.36, 20001)
+    times, states = flown(profile)
+    r = np.interp(dense, times, states[:, 0])
+    fine = np.interp(dense, move.time, move.position)  # of the same setpoint, closer points
+    assert r == pytest.approx(fine, abs=3e-6)
+    system = control.ss(loop.A, loop.B_r, -loop.C_y, np.ones((1, 1)))
+    error = control.forced_response(system, dense, fine).outputs
+    assert np.interp(dense, move.time, move.error) == pytest.approx(error, abs=2e-7)
+    inside = np.abs(move.error) <= 1e-7
+    at = move.duration + move.settling
+    assert inside[move.time > at].all()
+    assert not inside[np.flatnonzero(move.time <= at)[-1]]
+
+
+def test_feedforward_of_a_stage_with_several_inputs() -> None:
+    """The forces that it asks for accelerate the axis at 1 and no other one."""
+    plant = random_plant(11, rigid=3, flexible=2, inputs=3, outputs=3)
+    modal = modal_plant(mechanics(plant, (0.4, 0.5)), Suspension(0.0, 0.0))
+    for axis in range(3):
+        forces = mass_feedforward(modal, axis)
+        assert forces is not None
+        s = 1e-4j
+        G = modal.C @ np.linalg.solve(
+            s**2 * np.eye(len(modal.K)) + s * modal.D + modal.K, modal.B.astype(complex)
+        )
+        assert (s**2 * G @ forces).real == pytest.approx(np.eye(3)[axis], abs=1e-6)
+    one_sided = replace(modal, B=modal.B[:, :1])
+    assert mass_feedforward(one_sided, 0) is None
+
+
+# ---- margins -------------------------------------------------------------------------------------
+
+
+def test_margins_are_where_stability_ends(run: FinishedRun) -> None:
+    G, K, _ = responses(run.plant, run.controller, HZ * GRID)
+    found = margins(run.plant, run.controller, GRID, G, K)
+    plant, loop = run.plant.plant_si(), found.loops[0]
+
+    def with_gain(factor: float) -> bool:
+        k = run.controller
+        return stable(plant, StateSpace(k.A, k.B, factor * k.C, factor * k.D))
+
+    assert with_gain(0.999 * loop.gain_up)
+    assert not with_gain(1.001 * loop.gain_up)
+    assert with_gain(1.001 * loop.gain_down)
+    assert not with_gain(0.999 * loop.gain_down)
+    assert 1.0 < loop.disk.gain <= loop.gain_up
+    assert 0.0 < loop.disk.phase_deg <= loop.phase_deg
+    L = to_control(named_plant(plant)) * to_control(named_controller(run.controller))
+    alpha, decibels, degrees = control.disk_margins(L, HZ * GRID)
+    assert loop.disk.alpha == pytest.approx(alpha, rel=1e-6)
+    assert 20.0 * np.log10(loop.disk.gain) == pytest.approx(decibels, rel=1e-6)
+    assert loop.disk.phase_deg == pytest.approx(degrees, rel=1e-6)
+    assert found.outputs.alpha <= loop.disk.alpha * (1.0 + 1e-9)
+    assert found.outputs.alpha == pytest.approx(loop.disk.alpha, rel=1e-3)
+
+
+def mimo(seed: int) -> tuple:
+    plant = random_plant(seed, rigid=2, flexible=2, inputs=2, outputs=2)
+    M_K = 2e4
+    weights = Weights(
+        M_S=2.0, A_S=1e-4, omega_S=1.0 * HZ, c_K=1e4, omega_K=100.0 * HZ, M_K=M_K,
+        A_l=1.0, A_u=1e-2, omega_T=10.0 * HZ,
+    )  # fmt: skip
+    system = mechanics(plant, (0.4, 0.6))
+    G = scaled(system, M_K)
+    made = synthesise(G, weights, omega_low=HZ)
+    assert made.figures.certified
+    return G, modal_plant(system, SUSPENSION), made.controller, M_K
+
+
+def test_every_gain_inside_the_joint_disk_keeps_a_2_x_2_loop() -> None:
+    plant, _, controller, _ = mimo(4)
+    hz = np.geomspace(0.05, 1000.0, 200)
+    G, K, _ = responses(plant, controller, HZ * hz)
+    found = margins(plant, controller, hz, G, K)
+    assert [item.name for item in found.loops] == ["output 1", "output 2", "input 1", "input 2"]
+    for where, margin in (("outputs", found.outputs), ("inputs", found.inputs)):
+        ends = 1.0 + 0.999 * (margin.gain - 1.0)
+        for factors in ([ends, ends], [ends, 1 / ends], [1 / ends, ends], [1 / ends, 1 / ends]):
+            k = controller
+            D = np.diag(factors)
+            scaled_k = (
+                StateSpace(k.A, k.B @ D, k.C, k.D @ D)
+                if where == "outputs"
+                else StateSpace(k.A, k.B, D @ k.C, D @ k.D)
+            )
+            assert stable(plant.plant_si(), scaled_k)
+        assert margin.alpha <= min(m.disk.alpha for m in found.loops if m.name[0] == where[0])
+
+
+# ---- noise ---------------------------------------------------------------------------------------
+
+
+def test_rms_values_against_integrals_over_frequency(run: FinishedRun) -> None:
+    found = noise(closed_loop(run.plant.plant_si(), run.controller), 1e-9, 2e-3)
+    hz = np.unique(np.concatenate([np.geomspace(1e-4, 1e5, 20001), np.linspace(100, 300, 20001)]))
+    G, K, S = responses(run.plant, run.controller, HZ * hz)
+    T, GS = (G @ K @ S)[:, 0, 0], (S @ G)[:, 0, 0]
+    KS = (K @ S)[:, 0, 0]
+    for value, response, density in (
+        (found.position_by_noise, T, 1e-9), (found.force_by_noise, KS, 1e-9),
+        (found.position_by_disturbance, GS, 2e-3), (found.force_by_disturbance, T, 2e-3),
+    ):  # fmt: skip
+        rms = density * np.sqrt(trapezoid(np.abs(response) ** 2, hz))
+        assert value[0] == pytest.approx(rms, rel=1e-3)
+    assert gains(G, K)[0] == pytest.approx(np.abs(S[:, 0, 0]))
+
+
+# ---- plants off the model ------------------------------------------------------------------
+
+
+def shifted_stable(run: FinishedRun, shift: float) -> bool:
+    modal = modal_plant(system_of(run), run.problem.suspension, Perturbation(shift))
+    return stable(scale_plant(modal, run.weights.M_K).plant_si(), run.controller)
+
+
+def test_the_ends_of_a_line_are_where_the_loop_is_lost(run: FinishedRun) -> None:
+    line = shift_line(run, system_of(run), 0.05, 21)
+    low, high = line.stable
+    assert -0.0077 < low < -0.0075  # the nominal design of case study 1 stands 0.76 %
+    assert shifted_stable(run, low + 1e-6)
+    assert not shifted_stable(run, low - 1e-6)
+    assert high == 0.05
+    assert line.within[0] <= 0.0 <= line.within[1] < high
+    assert len(line.judged) == 21
+    damped = damping_line(run, system_of(run), 0.5, 2.0, 7)
+    assert damped.stable == pytest.approx((0.5, 2.0))
+    # this plant has one flexible mode: alone it is all of them
+    alone = single_modes(run, system_of(run), 0.05)
+    assert [item.stable for item in alone] == [False, True]
+    # its damping matrix stays where the frequency moves, so both ways are the same plant
+    assert alone[1].peak == pytest.approx(line.judged[-1].peak, rel=1e-9)
+
+
+def test_the_worst_of_a_box_is_worse_than_all_that_was_seen(run: FinishedRun) -> None:
+    line = shift_line(run, system_of(run), 0.006, 9)
+    worst = worst_in_box(run, system_of(run), 0.006, (0.8, 1.25))
+    assert worst.badness >= max(item.badness for item in line.judged)
+    assert abs(worst.place[0]) <= 0.006 * (1.0 + 1e-12)
+    assert 0.8 * (1 - 1e-12) <= worst.place[1] <= 1.25 * (1 + 1e-12)
+
+
+def test_random_hardware_repeats_and_its_worst_is_at_a_corner(run: FinishedRun) -> None:
+    """Both masses 1 % lighter: k falls with their fourth powers, and the resonance with it."""
+    first = tolerances(run, 0.01, 25, 3, quiet=True)
+    again = tolerances(run, 0.01, 25, 3, quiet=True)
+    # as texts, in which one NaN is another
+    assert repr(first) == repr(again)
+    assert repr(first) != repr(tolerances(run, 0.01, 25, 4, quiet=True))
+    assert len(first.judged) == 25
+    for item in first.judged:
+        assert (np.abs(np.array(item.place) / run.theta - 1.0) <= 0.01).all()
+    assert not first.worst.stable
+    assert first.worst.place == pytest.approx(0.99 * np.array(run.theta))
+
+
+def test_the_structured_bound_is_one_and_no_loose_one(run: FinishedRun) -> None:
+    """One mode: the true limit is the shift at which stability is lost."""
+    modal = modal_plant(system_of(run), run.problem.suspension)
+    bound = structured_bound(run.plant, modal, run.controller, np.geomspace(0.2, 3000.0, 200))
+    assert bound is not None
+    limit = -shift_line(run, system_of(run), 0.05, 21).stable[0]
+    assert bound.shift == pytest.approx(limit, rel=1e-4)  # by as much a grid may miss it
+    assert bound.stiffness >= 1.0 / bound.mu.max()
+
+
+def test_errors_within_the_structured_bound_keep_two_modes_stable() -> None:
+    plant, modal, controller, M_K = mimo(4)
+    bound = structured_bound(plant, modal, controller, np.geomspace(0.05, 3000.0, 300))
+    assert bound is not None
+    assert bound.modes == 2
+    flexible = np.flatnonzero(~modal.rigid)
+    rng = np.random.default_rng(0)
+    corners = [np.array(c) for c in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    for delta in (*corners, *rng.uniform(-1.0, 1.0, (30, 2))):
+        K = modal.K.copy()
+        K[flexible, flexible] *= 1.0 + 0.999 * bound.stiffness * delta
+        assert stable(scale_plant(replace(modal, K=K), M_K).plant_si(), controller)
+
+
+# ---- the command ---------------------------------------------------------------------------
+
+
+def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--out", str(out), "--samples", "10", "--seed", "5", "--quiet"]
+    assert main([str(two_mass_run), *options]) == 0
+    found = json.loads((out / "robustness.json").read_text())
+    assert found["seed"] == 5
+    assert not found["survives"]
+    assert found["resonance_shift"]["stable_between"][0] == pytest.approx(-0.00758, abs=2e-5)
+    assert found["structured"]["shift"] == pytest.approx(0.00758, abs=2e-5)
+    assert [item["feedforward"] for item in found["move"]["runs"]] == [False, True]
+    assert found["move"]["runs"][1]["settling"] == 0.0
+    assert found["move"]["runs"][1]["rms_error"] < 1e-7
+    assert found["tolerances"]["samples"] == 10
+    page = (out / "robustness.html").read_text()
+
+    class Tags(HTMLParser):
+        def __init__(self) -> None:
+            super().__init__()
+            self.ids: list[str] = []
+
+        def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+            assert tag != "script"
+            self.ids += [value or "" for name, value in attributes if name == "id"]
+
+    tags = Tags()
+    tags.feed(page)
+    assert len(tags.ids) == len(set(tags.ids))
+    assert page.count("<svg") == 6
+    assert "not stable on all plants" in page
+    assert "-0.76 %" in page
+    assert sorted(p.name for p in out.iterdir()) == ["robustness.html", "robustness.json"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--axis", "2"], "--axis: is 2; the plant has outputs 1 to 1"),
+        (["--damping", "1.5", "2"], "--damping: is 1.5 2"),
+        (["--tolerance", "-1"], "--tolerance"),
+        (["--shift", "60"], "not below 50 %"),
+        (["--stroke", "0"], "no number above 0"),
+        (["--samples", "0"], "no whole number"),
+    ],
+)
+def test_a_wrong_option_is_named(
+    two_mass_run: Path, tmp_path: Path, options: list[str], words: str, capsys
+) -> None:
+    assert main([str(two_mass_run), "--out", str(tmp_path), *options]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_a_folder_that_holds_no_run(two_mass_run: Path, tmp_path: Path, capsys) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    (folder / "controller.json").unlink()
+    assert main([str(folder)]) == 2
+    assert "solve the case first" in capsys.readouterr().err
