@@ -230,7 +230,7 @@ def _structured(found: Study) -> list[Section]:
         return []
     caption = (
         "Upper bound of the structured singular value of complex errors δ_i in the modal "
-        f"stiffnesses, one for each of {bound.modes} modes: at every frequency the loop is stable "
+        f"stiffnesses, one a mode ({bound.modes} in all): at every frequency the loop is stable "
         "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
         f"shown, {bound.stiffness:.4g}."
     )
