@@ -48,10 +48,10 @@ class DesignFile:
     units: Mapping[str, str] = field(default_factory=dict)
 
 
-def named_plant(plant: StateSpace) -> NamedSystem:
-    """Forces u1, … in N to displacements y1, … in m."""
+def named_plant(plant: StateSpace, period: float = 0.0) -> NamedSystem:
+    """Forces u1, … in N to displacements y1, … in m; `period` in s."""
     inputs, outputs = _names("u", plant.B.shape[1]), _names("y", plant.C.shape[0])
-    return NamedSystem(plant, inputs, outputs, "N", "m")
+    return NamedSystem(plant, inputs, outputs, "N", "m", period)
 
 
 def named_controller(controller: StateSpace, period: float = 0.0) -> NamedSystem:
