@@ -48,9 +48,11 @@ from ccd_casadi.reporting.slices import (
     tables_slices,
 )
 from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_figure
+from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.truths import Truths, read_truths
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.rib_stage.plant import stage_of
+from ccd_casadi.surrogate_quality import recommendation
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.solve import Solution
@@ -97,6 +99,7 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
             *stage_sections(problem, {"start": problem.start, "optimum": solution.verified.theta}),
             *_loop(problem, solution, solution.verified),
             _history(case, problem, solution, solution.verified),
+            *_trust(solution),
             _sweep(problem, solution, solution.verified, truths),
         ]
     return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
@@ -212,6 +215,20 @@ def _history(
     caption = caption_history(history, lifted=len(outcome.surrogates) == 3)
     table = table_history(history, problem.names)
     return Section(heading, figure_html(figure_history(history), caption, table))
+
+
+def _trust(solution: "Solution") -> list[Section]:
+    """Nothing where nothing was predicted."""
+    qualities = solution.quality
+    if not qualities:
+        return []
+    words = paragraph(recommendation(qualities))
+    figure = figure_html(figure_trust(qualities), caption_trust(qualities), *data_trust(qualities))
+    return [
+        Section(
+            "Can the surrogate be trusted?", words + table_html(table_trust(qualities)) + figure
+        )
+    ]
 
 
 def _sweep(

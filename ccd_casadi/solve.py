@@ -26,6 +26,7 @@ from ccd_casadi.nested import solve_nested
 from ccd_casadi.outer import unmet_constraint
 from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.results import (
+    clean,
     controller_dict,
     infeasible_dict,
     result_dict,
@@ -33,6 +34,7 @@ from ccd_casadi.results import (
 )
 from ccd_casadi.samples import SampleStore
 from ccd_casadi.sampling import Truth
+from ccd_casadi.surrogate_quality import Quality, quality_dict, surrogate_quality
 from ccd_casadi.verify import VerifiedDesign, verify
 from surrogates import design, save
 
@@ -52,6 +54,7 @@ class Solution:
     result: dict[str, Any]
     outcome: FormulationResult
     verified: VerifiedDesign | None
+    quality: tuple[Quality, ...] = ()
 
     @property
     def exit_code(self) -> ExitCode:
@@ -93,6 +96,7 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(truth, outcome.x)
+    quality = surrogate_quality(outcome.surrogates, verified.x, seed)
     result = result_dict(
         truth.problem,
         formulation,
@@ -103,7 +107,8 @@ def conclude(
         seconds=perf_counter() - began,
         seed=seed,
     )
-    return Solution(result, outcome, verified)
+    result["surrogate_quality"] = clean(quality_dict(quality))
+    return Solution(result, outcome, verified, quality)
 
 
 def _formulate(

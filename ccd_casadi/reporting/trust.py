@@ -1,0 +1,112 @@
+"""Can the surrogate be trusted? Samples predicted without themselves, and the words for it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.reporting.svg import BLUE, GREY
+from ccd_casadi.surrogate_quality import Quality
+from surrogates.gaussian_process import TWO_SIDED_95
+
+WORDS = {
+    "bandwidth": "bandwidth ω_b",
+    "sensitivity_peak": "peak of S",
+    "sensitivity_low": "|S| at ω_low",
+}
+AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–"}
+LEAST_BAND = 3.0  # standardised residuals shown at least, either way
+
+
+def figure_trust(qualities: Sequence[Quality], *, key: str = "trust") -> str:
+    """A column for each output: predicted without the sample over true, and residuals below."""
+    above = [_predicted(q) for q in qualities]
+    below = [_residuals(q) for q in qualities]
+    title = "samples predicted without themselves, and their standardised residuals"
+    return figure_lines([above, below], key=key, title=title, heights=[3.3, 2.6])
+
+
+def _predicted(q: Quality) -> Panel:
+    both = np.concatenate([q.true, q.predicted])
+    margin = 0.04 * float(np.ptp(both)) or 1.0
+    span = (float(both.min()) - margin, float(both.max()) + margin)
+    ends = np.array(span)
+    return Panel(
+        f"true ({AXES[q.name]})",
+        f"predicted ({AXES[q.name]})",
+        (
+            Curve(ends, ends, "", GREY, "--", width=0.8),
+            Curve(q.true, q.predicted, "", BLUE, "", "o"),
+        ),
+        x_range=span,
+        y_range=span,
+        title=WORDS[q.name],
+    )
+
+
+def _residuals(q: Quality) -> Panel:
+    most = max(LEAST_BAND, 1.1 * float(np.abs(q.standardised).max()))
+    return Panel(
+        f"true ({AXES[q.name]})",
+        "residual / deviation (–)",
+        (Curve(q.true, q.standardised, "", BLUE, "", "o"),),
+        levels=tuple(Level(sign * TWO_SIDED_95, "95 % band") for sign in (1.0, -1.0)),
+        y_range=(-most, most),
+    )
+
+
+def caption_trust(qualities: Sequence[Quality]) -> str:
+    """What is drawn, and the figures to read off it."""
+    n = len(qualities[0].true)
+    parts = [
+        f"{WORDS[q.name]}: rms error {number(q.loo.rms, 2)} {q.unit}, Q² {number(q.loo.q2)}, "
+        f"{100 * q.coverage:.0f} % within their bands"
+        for q in qualities
+    ]
+    return (
+        f"Each of the {n} samples of the last surrogate, predicted from the others (above; on the "
+        "dashed line the prediction is exact) and the difference in units of the predicted "
+        "deviation (below). " + "; ".join(parts) + ". Points far outside the bands, or a curve in "
+        "place of a cloud, are what a smooth surrogate cannot follow."
+    )
+
+
+def table_trust(qualities: Sequence[Quality]) -> Table:
+    """Errors left out, calibration, kinks and support at the design, output by output."""
+    return Table(
+        (
+            "output", "samples", "leave one out, rms", "largest", "k-fold, rms", "Q²",
+            "in 95 % bands", "samples look", "at the design",
+        ),
+        tuple(
+            (
+                WORDS[q.name], len(q.true), *(f"{number(e, 3)} {q.unit}" for e in _errors(q)),
+                number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.roughness.value,
+                "; ".join(q.extrapolates) or "supported",
+            )
+            for q in qualities
+        ),
+    )  # fmt: skip
+
+
+def _errors(q: Quality) -> tuple[float, ...]:
+    return q.loo.rms, q.loo.max, q.kfold.rms
+
+
+def data_trust(qualities: Sequence[Quality]) -> tuple[Table, ...]:
+    """The numbers behind the figure."""
+    return tuple(
+        Table(
+            (
+                f"{WORDS[q.name]}, true ({AXES[q.name]})",
+                f"predicted ({AXES[q.name]})",
+                "residual / deviation",
+            ),
+            tuple(
+                tuple(map(float, row))
+                for row in zip(q.true, q.predicted, q.standardised, strict=True)
+            ),
+        )
+        for q in qualities
+    )

@@ -1,0 +1,79 @@
+"""What a run says about its own surrogates, in result.json and in the report."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
+from ccd_casadi.surrogate_quality import quality_dict, recommendation, surrogate_quality
+from surrogates import GaussianProcess, Roughness, design, errors, fit
+
+HZ = 2.0 * np.pi
+BOX = {"lower": [50.0, 50.0], "upper": [70.0, 70.0]}
+X = design("sobol", **BOX, n=60, seed=3)
+
+
+def process(kink: float) -> GaussianProcess:
+    u = (X - 50.0) / 20.0
+    Y = HZ * (60.0 + 4.0 * np.sin(u.sum(1)) + kink * np.abs(u @ [1.0, -0.7] - 0.2))
+    return fit(X, Y, **BOX, noise=1e-4, starts=1)
+
+
+def test_a_smooth_bandwidth_is_trusted_in_its_own_unit() -> None:
+    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    assert q.smooth_enough
+    assert not q.extrapolates
+    assert q.true.min() > 59.0  # Hz, not rad/s
+    assert q.loo.rms == pytest.approx(errors(q.true - q.predicted, q.true).rms, rel=1e-6)
+    assert q.kfold.rms >= 0.5 * q.loo.rms
+    assert 0.8 <= q.coverage <= 1.0
+    assert recommendation([q]) == "The surrogates follow their samples, and support the design."
+
+
+def test_a_kinked_bandwidth_recommends_lifted() -> None:
+    (q,) = surrogate_quality([process(20.0)], np.array([60.0, 60.0]))
+    assert q.roughness is not Roughness.SMOOTH
+    assert "--formulation lifted" in recommendation([q])
+    several = [q, replace(q, name="sensitivity_peak", unit="%")]
+    assert "fit_maximum" in recommendation(several)
+
+
+def test_a_design_beyond_the_samples_is_flagged() -> None:
+    near = X[(X < 58.0).all(axis=1)]
+    few = fit(near, near.sum(1) ** 2, **BOX, starts=1)
+    (q,) = surrogate_quality([few], np.array([69.0, 69.0]))
+    assert q.extrapolates
+    assert "extrapolates" in recommendation([q])
+    table = table_trust([q])
+    assert "box widths" in str(table.rows[0][-1])
+
+
+def test_nothing_is_said_of_no_surrogate() -> None:
+    assert quality_dict(surrogate_quality([], np.zeros(2))) == {}
+    assert recommendation([]) == ""
+
+
+def test_the_figure_shows_every_sample_and_the_bands() -> None:
+    qualities = surrogate_quality([process(5.0)], np.array([60.0, 60.0]))
+    svg = figure_trust(qualities)
+    assert "predicted (Hz)" in svg
+    assert svg.count("95 % band") == 2
+    assert f"{100 * qualities[0].coverage:.0f} % within" in caption_trust(qualities)
+
+
+def test_a_run_holds_its_quality(two_mass_run: Path) -> None:
+    result = json.loads((two_mass_run / "result.json").read_text())
+    quality = result["surrogate_quality"]
+    bandwidth = quality["outputs"]["bandwidth"]
+    saved = json.loads((two_mass_run / "surrogate.json").read_text())["extra"]["loo"][0]
+    assert bandwidth["leave_one_out"]["rms"] == pytest.approx(saved["rms"] / HZ)
+    assert bandwidth["leave_one_out"]["q2"] == pytest.approx(saved["q2"])
+    assert 0.0 <= bandwidth["coverage_95"] <= 1.0
+    assert quality["recommendation"]
+    text = (two_mass_run / "report.html").read_text()
+    assert re.search(r"<h2>Can the surrogate be trusted\?</h2>", text)
+    assert quality["recommendation"].replace("'", "&#x27;") in text
