@@ -73,6 +73,8 @@ create table if not exists samples (
 create table if not exists results (
     key text primary key, problem text not null, theta text not null, json text not null
 );
+create index if not exists samples_of_problem on samples (problem);
+create index if not exists results_of_problem on results (problem);
 """
 
 
@@ -226,17 +228,19 @@ class SampleStore:
 
     def select(self, problem: str | None = None) -> list[Sample]:
         """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
-        query = f"select {', '.join(_COLUMNS)} from samples where ? is null or problem = ?"
+        where, given = _of(problem)
         with self._worded():
-            rows = self._db.execute(query, (problem, problem)).fetchall()
+            query = f"select {', '.join(_COLUMNS)} from samples {where}"
+            rows = self._db.execute(query, given).fetchall()
             samples = [_from_row(row) for row in rows]
         return sorted(samples, key=lambda s: (s.theta, s.omega_S, s.omega_T, s.key))
 
     def count(self, problem: str | None = None) -> int:
         """Number of samples (of one problem hash, if given)."""
-        query = "select count(*) from samples where ? is null or problem = ?"
+        where, given = _of(problem)
         with self._worded():
-            return int(self._db.execute(query, (problem, problem)).fetchone()[0])
+            query = f"select count(*) from samples {where}"
+            return int(self._db.execute(query, given).fetchone()[0])
 
     def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
         marks = ", ".join("?" * (len(_COLUMNS) + 1))
@@ -276,6 +280,11 @@ class SampleStore:
             else:
                 advice = "it is damaged or no sample store; move it away or choose another --out"
             raise SampleStoreError(f"{self.path}: {text}; {advice}") from error
+
+
+def _of(problem: str | None) -> tuple[str, tuple[str, ...]]:
+    """The rows of one problem hash, or all: a condition that an index answers, and its values."""
+    return ("", ()) if problem is None else ("where problem = ?", (problem,))
 
 
 def _to_row(sample: Sample) -> tuple[object, ...]:
