@@ -44,7 +44,9 @@ def filled(path: Path, rows: int) -> list[str]:
             for x in rng.uniform([55.0, 55.0, 4.2, 5.1], [70.0, 70.0, 9.3, 8.7], (UNIT, 4)):
                 theta, omega = tuple(map(float, x[:2])), tuple(map(float, np.exp(x[2:])))
                 key = sample_key(owner, theta, *omega)
-                unit.append(replace(model, key=key, theta=theta, omega_S=omega[0], omega_T=omega[1]))
+                unit.append(
+                    replace(model, key=key, theta=theta, omega_S=omega[0], omega_T=omega[1])
+                )
                 if owner == truth.hash:
                     keys.append(key)
             inner = sample_key(owner, unit[0].theta, 0.0, 0.0)

@@ -28,7 +28,7 @@ from ccd_casadi.case_checks import (
 )
 from ccd_casadi.case_sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
 from ccd_casadi.diagnosis import Severity, diagnose
-from ccd_casadi.errors import UserError
+from ccd_casadi.errors import UserError, described, one_line
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.modal import Suspension
 from ccd_casadi.models import BUILDERS, DATA, MODELS, SHIPPED
@@ -81,7 +81,7 @@ def load_case(path: str | Path) -> Case:
     path = Path(path)
 
     def fail(words: str) -> CaseError:
-        return CaseError(_one_line(f"{path}: {words}"))
+        return CaseError(one_line(f"{path}: {words}"))
 
     try:
         text = path.read_bytes().decode("utf-8-sig")  # some editors write a byte-order mark
@@ -108,7 +108,7 @@ def parse_case(data: Mapping[str, Any], path: Path) -> Case:
     """Check the tables of a case file. Raises CaseError on the first mistake."""
 
     def fail(key: str, words: str) -> CaseError:
-        return CaseError(_one_line(f"{path}: {key}: {words}"))
+        return CaseError(one_line(f"{path}: {key}: {words}"))
 
     known = ("plant", "theta", *SECTIONS)
     for name, table in data.items():
@@ -276,17 +276,11 @@ def _closest(name: str, known: Any) -> str:
     return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
 
 
-def _one_line(value: object) -> str:
-    """On one line, with what a terminal would obey (a key may hold it) written as escapes."""
-    words = " ".join(str(value).split())
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in words)
-
-
 def parse_theta(case: Case, text: str) -> tuple[float, ...]:
     """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
 
     def fail(words: str) -> CaseError:
-        return CaseError(_one_line(f"{case.path}: --theta: {words}"))
+        return CaseError(one_line(f"{case.path}: --theta: {words}"))
 
     names = [parameter.name for parameter in case.theta]
     found: dict[str, float] = {}
@@ -364,12 +358,12 @@ def problem_of(case: Case) -> CoDesignProblem:
                 if finding.severity is Severity.ERROR:
                     raise PlantError(finding.words)
     except UserError as error:
-        raise CaseError(_one_line(f"{case.path}: plant: {error}")) from error
+        raise CaseError(one_line(f"{case.path}: plant: {error}")) from error
     except Exception as error:
         if function is None:
             raise
-        words = f"{function} raised {type(error).__name__}: {error}; mend it"
-        raise CaseError(_one_line(f"{case.path}: plant.function: {words}")) from error
+        words = f"{function} raised {described(error)}; mend it"
+        raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
 
 

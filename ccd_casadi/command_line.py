@@ -10,11 +10,11 @@ from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.errors import UserError
+from ccd_casadi.errors import UserError, one_line
 from ccd_casadi.parallel import WorkerLost, usable_cores
 from ccd_casadi.plant import PlantError
 from ccd_casadi.user_code import permit_user_code
-from surrogates.starting import begun
+from surrogates.ctrl_c import begun, ctrl_c_noticed, was_ctrl_c
 
 DEFAULT_CASE = "runs/two_mass.toml"
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"
@@ -35,7 +35,7 @@ class ExitCode(IntEnum):
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line, as for every other bad input, in place of the usage."""
-        self.exit(ExitCode.BAD_INPUT, f"{_one_line(message)}; see {self.prog} --help\n")
+        self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
 
 
 def parser(
@@ -96,26 +96,28 @@ def run(
 ) -> int:
     """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
     code = ExitCode.INTERRUPTED
-    options = None
     begun()
     try:
         options = arguments.parse_args(argv)
+    except SystemExit as ended:  # after --help or a wrong option
+        return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    try:
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
-        with threadpool_limits(limits=1), permit_user_code(not options.no_user_code):
+        with (
+            threadpool_limits(limits=1),
+            permit_user_code(not options.no_user_code),
+            ctrl_c_noticed(),
+        ):
             code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
-    except SystemExit as ended:  # argparse, after --help or a wrong option
-        return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
-        print(_one_line(f"{_place(options)}: plant: {error}"), file=sys.stderr)
+        print(one_line(f"{_place(options)}: plant: {error}"), file=sys.stderr)
         return ExitCode.BAD_INPUT
     except UserError as error:
-        print(_one_line(error), file=sys.stderr)
+        print(one_line(error), file=sys.stderr)
         return ExitCode.BAD_INPUT
     except WorkerLost as error:
-        print(f"interrupted: {_one_line(error)}; {_RESUMABLE}", file=sys.stderr)
-    except KeyboardInterrupt:
-        print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
+        print(f"interrupted: {one_line(error)}; {_RESUMABLE}", file=sys.stderr)
     except MemoryError:
         print(f"{_place(options)}: {_NO_MEMORY}", file=sys.stderr)
         return ExitCode.BAD_INPUT
@@ -125,12 +127,16 @@ def run(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:  # the disk is full, or a file became unreadable
         where = error.filename or _place(options)
-        print(_one_line(f"{where}: {error.strerror or error}; {_DISK}"), file=sys.stderr)
+        print(one_line(f"{where}: {error.strerror or error}; {_DISK}"), file=sys.stderr)
         return ExitCode.BAD_INPUT
+    except BaseException as error:
+        if not was_ctrl_c(error):
+            raise
+        print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
     return int(code)
 
 
-def _place(options: argparse.Namespace | None) -> object:
+def _place(options: argparse.Namespace) -> object:
     """The case file or run folder that a command was given."""
     return getattr(options, "case", None) or getattr(options, "run", "")
 
@@ -180,7 +186,3 @@ def _whole(text: str, least: int) -> int:
         words = f"{text[:20]!r} is no whole number from {least} to 999999999; give one"
         raise argparse.ArgumentTypeError(words)
     return int(text)
-
-
-def _one_line(value: object) -> str:
-    return " ".join(str(value).split())

@@ -1,7 +1,5 @@
 """What a run folder knows already: its true samples, and the versions of its surrogates."""
 
-import json
-import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,8 +48,9 @@ def named_surrogate(
         raise UserError(f"--surrogate {name}: was made for other bounds; retrain the run folder")
     X = lower + processes[0].X * (upper - lower)
     if formulation == "nested":
-        store = folder / "samples.sqlite"
-        return Surrogates(processes, _exact(X, known_thetas(store, problem), upper - lower), ())
+        with SampleStore(folder / "samples.sqlite") as store:
+            known = known_thetas(store, problem)
+        return Surrogates(processes, _exact(X, known, upper - lower), ())
     return Surrogates(processes, X[:, :-2], _quantities(processes, X))
 
 
@@ -62,38 +61,30 @@ def known_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Ar
     """
     lower, upper = lifted_bounds(problem)
     key = problem_hash(problem.identity())
-    query = "select key from samples where problem = ? and gradients is not null order by rowid"
-    keys = [row[0] for row in _rows(store.path, query, key)]
+    keys = store.keys_with_gradients(key)
     known = store.get(keys)
     slack = SAME * (upper - lower)
     found = []
     for item in keys:
         row = known[item]
+        if len(row.theta) != len(problem.names) or len(row.gradients or ()) != 4 * len(lower):
+            raise store.damaged()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
         if (x >= lower - slack).all() and (x <= upper + slack).all():
             found.append((np.clip(x, lower, upper), row))
     return found
 
 
-def known_thetas(path: Path, problem: CoDesignProblem) -> Array:
+def known_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
     """Every θ (n, n_θ) inside the box whose inner problem was solved, oldest first."""
     lower, upper = box(problem)
     designs = problem_hash(problem.identity())
     key = problem_hash({"problem": designs, "inner": problem.inner_identity()})
-    query = "select theta from results where problem = ? order by rowid"
-    thetas = [json.loads(row[0]) for row in _rows(path, query, key)]
+    thetas = store.thetas(key)
+    if any(len(theta) != len(lower) for theta in thetas):
+        raise store.damaged()
     X = np.array(thetas, dtype=float).reshape(-1, len(lower))
     return X[((lower <= X) & (upper >= X)).all(axis=1)]
-
-
-def _rows(path: Path, query: str, key: str) -> list[tuple[str, ...]]:
-    if not path.exists():
-        return []
-    database = sqlite3.connect(path.resolve().as_uri() + "?mode=ro", uri=True, timeout=60.0)
-    try:
-        return database.execute(query, (key,)).fetchall()
-    finally:
-        database.close()
 
 
 def _exact(X: Array, known: Array, width: Array) -> Array:

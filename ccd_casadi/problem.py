@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.derivatives import Sensitivities
-from ccd_casadi.errors import UserError
+from ccd_casadi.errors import UserError, described
 from ccd_casadi.inner import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.inner_search import search_inner
 from ccd_casadi.modal import Perturbation, Suspension, modal_plant
@@ -22,7 +22,7 @@ from ccd_casadi.models import BUILDERS, DATA, MODELS
 from ccd_casadi.numeric_plant import own_plant
 from ccd_casadi.plant import Array, ModelFunction, Plant, PlantError, build_plant, mechanics
 from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
-from ccd_casadi.user_code import limited, require_user_code, time_limit
+from ccd_casadi.user_code import limited, require_user_code
 from ccd_casadi.weights import Weights
 
 NUMERICS = 4  # raised whenever a change of ours moves the numbers that a sample holds
@@ -174,14 +174,12 @@ def _own_function(source: PlantSource) -> ModelFunction:
         "mend it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
-        with time_limit(source.seconds, late):
-            spec.loader.exec_module(module)
+        limited(spec.loader.exec_module, source.seconds, late)(module)
+        function = limited(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise
-    except (Exception, SystemExit) as error:
-        message = f"{path}: cannot be loaded: {type(error).__name__}: {error}"
-        raise UserError(message) from error
-    function = getattr(module, source.function, None)
+    except Exception as error:
+        raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
     if not callable(function):
         raise UserError(f"{path}: defines no function {source.function}; check plant.function")
     return limited(function, source.seconds, late)

@@ -89,7 +89,7 @@ class CoDesignTruth:
         """What the store holds inside the box, oldest first."""
         problem = self.truth.problem
         if self.nested:
-            known = known_thetas(self.truth.store.path, problem)
+            known = known_thetas(self.truth.store, problem)
             return self._bandwidths(self.truth.bandwidths(known) if len(known) else [])
         count = len(problem.names)
         designs = known_designs(self.truth.store, problem)

@@ -59,6 +59,8 @@ class Sample:
 
 _COLUMNS = tuple(field.name for field in fields(Sample))
 _REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
+_TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
+_DAMAGED = "a row is damaged"
 _THETA, _CERTIFIED, _GRADIENTS = map(_COLUMNS.index, ("theta", "certified", "gradients"))
 _TABLES = """
 create table if not exists meta (name text primary key, value text not null);
@@ -121,7 +123,7 @@ class SampleStore:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        with self._worded():
+        with self.worded():
             self._db = sqlite3.connect(self.path, timeout=BUSY_SECONDS, isolation_level=None)
             try:
                 self._check()
@@ -139,10 +141,15 @@ class SampleStore:
 
     def _check(self) -> None:
         """Refuse, untouched, a database that is not ours or has another schema."""
-        query = "select name from sqlite_master where type = 'table'"
-        tables = {name for (name,) in self._db.execute(query)}
-        if not tables:
+        kinds = self._db.execute("select name, type from sqlite_master").fetchall()
+        tables = {name for name, kind in kinds if kind == "table"}
+        if not kinds:
             return  # new, or being made by another process in one transaction
+        if any(kind in ("trigger", "view") for _, kind in kinds):
+            raise SampleStoreError(
+                f"{self.path}: holds statements (triggers, views) that no store of ours has; "
+                "choose another --out"
+            )
         if not {"meta", "problems", "samples", "results"} <= tables:
             raise SampleStoreError(
                 f"{self.path}: is a database of another program; choose another --out"
@@ -185,13 +192,13 @@ class SampleStore:
 
     def put_problem(self, key: str, problem: Mapping[str, object]) -> None:
         """Keep what a problem hash stands for, so that the file explains itself."""
-        with self._worded(), self._transaction():
+        with self.worded(), self._transaction():
             text = json.dumps(problem, sort_keys=True)
             self._db.execute("insert or ignore into problems values (?, ?)", (key, text))
 
     def put(self, samples: Iterable[Sample], problem: str | None = None) -> None:
         """Write samples in one transaction; known keys stay as they are, but gain gradients."""
-        with self._worded(), self._transaction():
+        with self.worded(), self._transaction():
             self._insert(samples, problem)
 
     def put_unit(
@@ -203,7 +210,7 @@ class SampleStore:
         """Write a unit's samples and its result (key, problem, θ, payload): all or nothing."""
         key, owner, theta, payload = result
         row = (key, owner, json.dumps(list(theta)), json.dumps(payload, sort_keys=True))
-        with self._worded(), self._transaction():
+        with self.worded(), self._transaction():
             self._insert(samples, problem)
             self._db.execute("insert or ignore into results values (?, ?, ?, ?)", row)
 
@@ -211,7 +218,7 @@ class SampleStore:
         """The samples known among `keys`."""
         found: dict[str, Sample] = {}
         columns = ", ".join(_COLUMNS)
-        with self._worded():
+        with self.worded():
             for i in range(0, len(keys), 500):
                 part = list(keys[i : i + 500])
                 marks = ", ".join("?" * len(part))
@@ -222,14 +229,14 @@ class SampleStore:
 
     def get_result(self, key: str) -> dict[str, Any] | None:
         """The payload of a unit of work, None where it is not known."""
-        with self._worded():
+        with self.worded():
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
             return None if row is None else _decoded(row[0])
 
     def select(self, problem: str | None = None) -> list[Sample]:
         """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
         where, given = _of(problem)
-        with self._worded():
+        with self.worded():
             query = f"select {', '.join(_COLUMNS)} from samples {where}"
             rows = self._db.execute(query, given).fetchall()
             samples = [_from_row(row) for row in rows]
@@ -238,9 +245,21 @@ class SampleStore:
     def count(self, problem: str | None = None) -> int:
         """Number of samples (of one problem hash, if given)."""
         where, given = _of(problem)
-        with self._worded():
+        with self.worded():
             query = f"select count(*) from samples {where}"
             return int(self._db.execute(query, given).fetchone()[0])
+
+    def thetas(self, problem: str) -> list[tuple[float, ...]]:
+        """θ of every unit of work of one problem hash, oldest first."""
+        query = "select theta from results where problem = ? order by rowid"
+        with self.worded():
+            return [numbers_of(_decoded(row[0])) for row in self._db.execute(query, (problem,))]
+
+    def keys_with_gradients(self, problem: str) -> list[str]:
+        """Keys of the samples of one problem hash that have gradients, oldest first."""
+        query = "select key from samples where problem = ? and gradients is not null order by rowid"
+        with self.worded():
+            return [row[0] for row in self._db.execute(query, (problem,))]
 
     def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
         marks = ", ".join("?" * (len(_COLUMNS) + 1))
@@ -262,12 +281,16 @@ class SampleStore:
                 self._db.execute("rollback")
             raise
 
+    def damaged(self) -> SampleStoreError:
+        """What to raise where a row cannot be what was written."""
+        return SampleStoreError(f"{self.path}: {_DAMAGED}; move it away or choose another --out")
+
     @contextmanager
-    def _worded(self) -> Iterator[None]:
+    def worded(self) -> Iterator[None]:
         """SQLite's errors as one line that says what to do."""
         try:
             yield
-        except (sqlite3.ProgrammingError, sqlite3.IntegrityError):
+        except sqlite3.ProgrammingError:
             raise  # a mistake of the program, not of the file
         except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             text = " ".join(str(error).split())
@@ -306,16 +329,28 @@ def _from_row(row: Sequence[Any]) -> Sample:
         math.nan if value is None and name in _REALS else value
         for name, value in zip(_COLUMNS, row, strict=True)
     ]
-    values[_THETA] = tuple(_decoded(values[_THETA]))
+    values[_THETA] = numbers_of(_decoded(values[_THETA]))
     values[_CERTIFIED] = bool(values[_CERTIFIED])
     if values[_GRADIENTS] is not None:
-        numbers = _decoded(values[_GRADIENTS])
-        values[_GRADIENTS] = tuple(math.nan if item is None else item for item in numbers)
+        values[_GRADIENTS] = numbers_of(_decoded(values[_GRADIENTS]))
+    for name, value in zip(_COLUMNS, values, strict=True):
+        if name in _TEXTS and not isinstance(value, str):
+            raise sqlite3.DatabaseError(_DAMAGED)
+    numbers_of([value for name, value in zip(_COLUMNS, values, strict=True) if name in _REALS])
     return Sample(*values)
+
+
+def numbers_of(items: Any) -> tuple[float, ...]:
+    """A list of numbers (null: NaN) as it was stored. Raises sqlite3.DatabaseError for others."""
+    if not isinstance(items, list) or not all(
+        item is None or type(item) in (int, float) for item in items
+    ):
+        raise sqlite3.DatabaseError(_DAMAGED)
+    return tuple(math.nan if item is None else float(item) for item in items)
 
 
 def _decoded(text: Any) -> Any:
     try:
         return json.loads(text)
-    except (ValueError, TypeError) as error:
-        raise sqlite3.DatabaseError("a row is damaged") from error
+    except (ValueError, TypeError, RecursionError) as error:
+        raise sqlite3.DatabaseError(_DAMAGED) from error

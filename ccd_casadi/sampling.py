@@ -112,7 +112,10 @@ class Truth:
         for key, theta in zip(keys, points, strict=True):
             known = payloads[key]
             assert known is not None
-            sample = _bandwidth_sample(theta, known)
+            try:
+                sample = _bandwidth_sample(theta, known)
+            except (KeyError, TypeError, ValueError) as error:
+                raise self.store.damaged() from error
             found.append(sample)
             if not sample.feasible and (
                 self.nearest is None or sample.violation < self.nearest.violation
@@ -125,7 +128,10 @@ class Truth:
         """Values and derivatives at every row of X = (θ, ln ω_S, ln ω_T), in their order."""
         points = [tuple(float(v) for v in x) for x in np.atleast_2d(X)]
         keys = [self._design_key(x) for x in points]
+        count = len(self.problem.names)
         known = {key: s for key, s in self.store.get(keys).items() if s.gradients is not None}
+        if any(len(sample.gradients or ()) != 4 * (count + 2) for sample in known.values()):
+            raise self.store.damaged()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
         size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
         chunks = [todo[i : i + size] for i in range(0, len(todo), size)]
@@ -135,7 +141,6 @@ class Truth:
                 self.store.put(samples, self.hash)
                 known |= {sample.key: sample for sample in samples}
                 progress.advance(len(samples))
-        count = len(self.problem.names)
         for x, key in zip(points, keys, strict=True):
             sample = known[key]
             self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
@@ -266,18 +271,32 @@ def _sample(
 
 
 def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample:
+    """What was stored of a unit of work. Raises KeyError, TypeError or ValueError if damaged."""
     feasible = payload["bandwidth"] is not None
     nan = float("nan")
+    gradient = payload["gradient"] or [None] * len(theta)
+    active, shortfall = payload["active"], payload["shortfall"]
+    positive = [payload[key] for key in ("bandwidth", "omega_S", "omega_T")] if feasible else []
+    violation, syntheses = payload["violation"], payload["syntheses"]
+    if (
+        len(gradient) != len(theta)
+        or not all(v is None or type(v) is float for v in gradient)
+        or not all(type(v) is float and 0.0 < v < np.inf for v in positive)
+        or not (violation is None or type(violation) is float)
+        or not all(isinstance(word, str) for word in [shortfall, *active])
+        or type(syntheses) is not int
+    ):
+        raise ValueError("a stored result holds what none is made of")
     return BandwidthSample(
         theta=theta,
         bandwidth=payload["bandwidth"] if feasible else nan,
-        gradient=tuple(nan if v is None else v for v in payload["gradient"] or [None] * len(theta)),
+        gradient=tuple(nan if v is None else v for v in gradient),
         omega_S=payload["omega_S"] if feasible else nan,
         omega_T=payload["omega_T"] if feasible else nan,
-        active=tuple(payload["active"]),
-        shortfall=payload["shortfall"],
-        violation=np.inf if payload["violation"] is None else payload["violation"],
-        syntheses=payload["syntheses"],
+        active=tuple(active),
+        shortfall=shortfall,
+        violation=np.inf if violation is None else violation,
+        syntheses=syntheses,
     )
 
 

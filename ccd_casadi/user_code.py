@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any
 
-from ccd_casadi.errors import UserError
+from ccd_casadi.errors import UserError, described
 
 AGAIN = 1.0  # s after which a function that swallowed the first alarm gets another
 
@@ -74,12 +74,24 @@ def time_limit(seconds: float, error: UserError) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def limited(function: Callable[..., Any], seconds: float, error: UserError) -> Callable[..., Any]:
-    """The function with a time limit on every call of it."""
+def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Callable[..., Any]:
+    """The function with a time limit on every call, and with no way out but a value or an error.
+
+    Raises `late` after so many seconds, and UserError where the function would end the process
+    (SystemExit) or raises what cannot even be shown.
+    """
 
     @functools.wraps(function)
     def call(*arguments: Any, **options: Any) -> Any:
-        with time_limit(seconds, error):
-            return function(*arguments, **options)
+        with time_limit(seconds, late):
+            try:
+                return function(*arguments, **options)
+            except (KeyboardInterrupt, _Late):
+                raise
+            except BaseException as error:
+                words = described(error)
+                if isinstance(error, Exception) and words != type(error).__name__:
+                    raise
+                raise type(late)(f"the function raised {words}; mend it") from None
 
     return call

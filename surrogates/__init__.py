@@ -17,10 +17,10 @@ something is fitted and not before.
 
 import sys as _sys
 
-from surrogates import starting as _starting
+from surrogates import ctrl_c as _ctrl_c
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _starting.starting()
+    _ctrl_c.starting()
 
 from surrogates import casadi_members as _casadi_members  # registers their expressions
 from surrogates.assessment import Assessment, assess
@@ -44,7 +44,7 @@ from surrogates.sparse_process import SparseProcess, fit_sparse
 from surrogates.transform import Exponential, Transform
 from surrogates.validation import Errors, cross_validate, errors
 
-del _casadi_members, _starting, _sys
+del _casadi_members, _ctrl_c, _sys
 
 __all__ = [
     "Assessment",

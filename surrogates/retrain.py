@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from surrogates.copies import copy_run
+from surrogates.ctrl_c import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.interface import SurrogateFitError
 from surrogates.retraining import Settings, retrain
 from surrogates.serialise import SurrogateFileError
-from surrogates.starting import begun
 from surrogates.truth import TruthError, TruthInterrupted, opener_of
 
 
@@ -27,6 +27,7 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+RESUMABLE = "the same command resumes from there"
 CODES = {
     "verified": ExitCode.DONE,
     "not_verified": ExitCode.NOT_VERIFIED,
@@ -109,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             folder, tolerance=options.tolerance, workers=options.workers, seed=options.seed,
             quiet=quiet, user_code=not options.no_user_code,
         )  # fmt: skip
-        with opened as truth:
+        with ctrl_c_noticed(), opened as truth:
             outcome = retrain(folder, truth, settings, quiet)
     except (TruthError, SurrogateFileError, SurrogateFitError) as error:
         print(" ".join(str(error).split()), file=sys.stderr)
@@ -120,9 +121,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError:
         print(f"{folder}: not enough memory; retrain with fewer samples", file=sys.stderr)
         return ExitCode.BAD_INPUT
-    except (KeyboardInterrupt, TruthInterrupted) as error:
-        words = f": {error}" if str(error) else ""
-        print(f"interrupted{words}; the same command resumes from there", file=sys.stderr)
+    except TruthInterrupted as error:
+        print(f"interrupted: {error}; {RESUMABLE}", file=sys.stderr)
+        return ExitCode.INTERRUPTED
+    except BaseException as error:
+        if not was_ctrl_c(error):
+            raise
+        print(f"interrupted; {RESUMABLE}", file=sys.stderr)
         return ExitCode.INTERRUPTED
     if not quiet:
         print(f"{outcome.status} ({outcome.reason}): {outcome.rounds} rounds, {outcome.spent} "

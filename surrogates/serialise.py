@@ -90,7 +90,7 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
     """
     try:
         document = json.loads(Path(path).read_bytes(), parse_constant=_refuse)
-    except ValueError as error:  # covers JSON, UTF-8 and the refused constants
+    except (ValueError, RecursionError) as error:  # covers JSON, UTF-8 and the refused constants
         raise SurrogateFileError(f"{path}: not a complete JSON file ({error})") from error
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema not in READABLE:
@@ -100,7 +100,7 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
         extra = document["extra"]
         if not isinstance(extra, dict):
             raise TypeError("extra is not an object")
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise SurrogateFileError(f"{path}: damaged record ({error!r})") from error
     return tuple(members), extra
 

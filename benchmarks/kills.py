@@ -1,0 +1,263 @@
+"""SIGKILL at random moments of sampling, solving and retraining: nothing lost, nothing doubled.
+
+`python benchmarks/kills.py [--kills 200] [--seed 0]` kills real processes, lets each story end
+undisturbed, compares it with one that never was disturbed, and writes benchmarks/kills.json.
+
+Sampling and solving must end with the same result.json (seconds aside), controller.json,
+surrogate.json, and the same rows in the store, to the last bit. Retraining decides from the samples
+that are there, so a batch cut short may lead it along another way: it must end verified at the same
+optimum (1e-6), and how many runs are equal to the last bit is told.
+"""
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+CASE = ROOT / "runs" / "two_mass.toml"
+KILLS_A_STORY = 5
+SAME = 1e-6
+FILES = ("controller.json", "surrogate.json", "case.toml")
+SAMPLING = f"""
+import sys
+import numpy as np
+from ccd_casadi.case import load_case, problem_of
+from ccd_casadi.parallel import Workers
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import Truth
+
+if __name__ == "__main__":
+    problem = problem_of(load_case({str(CASE)!r}))
+    with SampleStore(sys.argv[1] + "/samples.sqlite") as store, Workers(2) as workers:
+        truth = Truth(problem, store, workers)
+        rng = np.random.default_rng(0)
+        truth.bandwidths(rng.uniform(55.0, 70.0, (60, 2)))
+        truth.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (80, 4)))
+"""
+
+
+@dataclass
+class Tally:
+    """What one kind of work went through."""
+
+    kills: int = 0
+    workers_killed: int = 0
+    stories: int = 0
+    equal_to_the_bit: int = 0
+    lost: int = 0
+    doubled: int = 0
+    different: list[str] = field(default_factory=list)
+    rows_at_kills: list[int] = field(default_factory=list)
+
+
+def rows(folder: Path) -> list[str]:
+    """Keys in the store so far; none where it is not made yet."""
+    path = folder / "samples.sqlite"
+    if not path.exists():
+        return []
+    database = sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=60.0)
+    try:
+        return [row[0] for row in database.execute("select key from samples")]
+    except sqlite3.OperationalError:  # its tables are not made yet
+        return []
+    finally:
+        database.close()
+
+
+def table(folder: Path) -> list[tuple[Any, ...]]:
+    """Everything in the store but the seconds."""
+    database = sqlite3.connect(f"file:{folder / 'samples.sqlite'}?mode=ro", uri=True)
+    names = [row[1] for row in database.execute("pragma table_info(samples)")]
+    names.remove("seconds")
+    found = database.execute(f"select {', '.join(names)} from samples order by key").fetchall()
+    found += database.execute("select * from results order by key").fetchall()
+    database.close()
+    return found
+
+
+def result(folder: Path) -> dict[str, Any]:
+    """result.json without what no two runs share."""
+    found: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    found.pop("seconds")
+    return found
+
+
+def sampling(folder: Path, number: int) -> list[str]:
+    """Sampling on two worker processes."""
+    return [sys.executable, str(folder.parent / "sampling.py"), str(folder)]
+
+
+def solving(folder: Path, number: int) -> list[str]:
+    """The whole command, each formulation in turn."""
+    formulation = ("nested", "lifted", "direct")[number % 3]
+    words = ["-m", "ccd_casadi.solve", str(CASE), "--out", str(folder), "--quiet"]
+    workers = str(1 + number // 3 % 2)
+    return [sys.executable, *words, "--formulation", formulation, "--workers", workers]
+
+
+def retraining(folder: Path, number: int) -> list[str]:
+    """Retraining from sixteen samples."""
+    words = ["-m", "surrogates.retrain", str(folder), "--quiet", "--workers", "1"]
+    return [sys.executable, *words]
+
+
+KINDS: dict[str, Callable[[Path, int], list[str]]] = {
+    "sampling": sampling, "solving": solving, "retraining": retraining,
+}  # fmt: skip
+
+
+def begun(kind: str, folder: Path) -> None:
+    """A folder to start in."""
+    folder.mkdir()
+    (folder.parent / "sampling.py").write_text(SAMPLING)
+    if kind == "retraining":
+        from ccd_casadi.retraining import open_run
+        from surrogates import design
+
+        shutil.copy(CASE, folder / "case.toml")
+        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
+            truth.evaluate(design("sobol", truth.lower, truth.upper, 16, 0))
+
+
+def started(words: list[str]) -> subprocess.Popen[str]:
+    """A process of its own group, so that its workers may be found."""
+    return subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started and that still run."""
+    path = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(word) for word in path.read_text().split()] if path.exists() else []
+
+
+def killed(process: subprocess.Popen[str], rng: random.Random, tally: Tally, limit: float) -> bool:
+    """Kill the process, or once in three times first a worker of it; whether it was met running."""
+    time.sleep(rng.uniform(0.0, limit))
+    if rng.random() < 1.0 / 3.0:
+        spawned = [p for p in children(process.pid) if _is_worker(p)]
+        if spawned:
+            os.kill(rng.choice(spawned), signal.SIGKILL)
+            tally.workers_killed += 1
+            time.sleep(rng.uniform(0.0, 0.5 * limit))
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    return process.returncode == -signal.SIGKILL
+
+
+def _is_worker(pid: int) -> bool:
+    try:
+        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def story(
+    kind: str, place: Path, number: int, rng: random.Random, tally: Tally, plain: Path, whole: float
+) -> None:
+    """Kill and start again a few times, let it end, and compare with the undisturbed run."""
+    folder = place / f"{kind}{number}"
+    begun(kind, folder)
+    words = KINDS[kind](folder, number)
+    before: set[str] = set(rows(folder))
+    for _ in range(KILLS_A_STORY):
+        if not killed(started(words), rng, tally, whole):
+            break  # it had ended
+        tally.kills += 1
+        found = rows(folder)
+        tally.doubled += len(found) - len(set(found))
+        tally.lost += len(before - set(found))
+        tally.rows_at_kills.append(len(found))
+        before = set(found)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    tally.stories += 1
+    found = rows(folder)
+    tally.doubled += len(found) - len(set(found))
+    tally.lost += len(before - set(found))
+    if done.returncode != 0:
+        tally.different.append(f"{kind} {number}: exit {done.returncode}: {done.stderr[-300:]}")
+    elif same(kind, folder, plain):
+        tally.equal_to_the_bit += 1
+    elif kind != "retraining" or not close(folder, plain):
+        tally.different.append(f"{kind} {number}: another result")
+    shutil.rmtree(folder)
+
+
+def same(kind: str, folder: Path, plain: Path) -> bool:
+    """Equal to the last bit."""
+    if table(folder) != table(plain):
+        return False
+    if kind == "sampling":
+        return True
+    files = [name for name in FILES if (plain / name).exists()]
+    return result(folder) == result(plain) and all(
+        (folder / name).read_bytes() == (plain / name).read_bytes() for name in files
+    )
+
+
+def close(folder: Path, plain: Path) -> bool:
+    """The same optimum, verified."""
+    ours, theirs = result(folder), result(plain)
+    values = [(ours["objective"], theirs["objective"])]
+    values += [(ours["theta"][name], theirs["theta"][name]) for name in theirs["theta"]]
+    return (
+        (ours["status"], ours["active"]) == (theirs["status"], theirs["active"])
+        and all(abs(a - b) <= SAME * abs(b) for a, b in values)
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Kill so many times over the three kinds and write what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    tallies = {kind: Tally() for kind in KINDS}
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="kills_") as name:
+        place = Path(name)
+        for index, (kind, tally) in enumerate(tallies.items()):
+            rng = random.Random(f"{options.seed} {kind}")
+            share = options.kills * (index + 1) // 3 - options.kills * index // 3
+            plain: dict[int, tuple[Path, float]] = {}
+            number = 0
+            while tally.kills < share:
+                which = number % 6 if kind == "solving" else 0
+                if which not in plain:
+                    folder = place / f"plain_{kind}{which}"
+                    begun(kind, folder)
+                    start = time.perf_counter()
+                    subprocess.run(KINDS[kind](folder, which), cwd=ROOT, check=True)
+                    plain[which] = (folder, time.perf_counter() - start)
+                story(kind, place, number, rng, tally, *plain[which])
+                number += 1
+                print(kind, number, tally.kills, tally.different, flush=True)
+    figures = {
+        "seed": options.seed,
+        "kills": sum(tally.kills for tally in tallies.values()),
+        "rows_lost": sum(tally.lost for tally in tallies.values()),
+        "rows_doubled": sum(tally.doubled for tally in tallies.values()),
+        "different": sum(len(tally.different) for tally in tallies.values()),
+        "kinds": {kind: vars(tally) for kind, tally in tallies.items()},
+        "seconds": time.perf_counter() - began,
+    }
+    (ROOT / "benchmarks" / "kills.json").write_text(json.dumps(figures, indent=2) + "\n")
+    print(json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()
