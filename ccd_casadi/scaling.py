@@ -8,8 +8,7 @@ plant M_K G(jω₀ω) has no units and does not change when the user's units do.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eig
-from slycot import tb01id
+from scipy.linalg import eig, matrix_balance
 
 from ccd_casadi.channels import Channel, find_channels
 from ccd_casadi.kernels.gamma import plant_gain
@@ -141,8 +140,8 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
 
         ω₀² = M_K ‖C A B‖, the inertial compliance being C A B / s²
 
-    Coordinates are balanced (SLICOT's TB01ID); there are no derivatives and no channels. Raises
-    PlantError for a plant with feedthrough, that is not finite, or that no state drives.
+    Coordinates are balanced; there are no derivatives and no channels. Raises PlantError for a
+    plant with feedthrough, that is not finite, or that no state drives.
     """
     n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
     if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C)):
@@ -153,14 +152,26 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     if not inertial > 0.0:
         raise PlantError("C A B is zero: no force accelerates what is measured")
     omega_0 = float(np.sqrt(M_K * inertial))
-    parts = (system.A / omega_0, system.B * (M_K / omega_0), system.C)
-    _, A, B, C, _ = tb01id(n, m, p, 0.0, *(np.array(part, order="F") for part in parts))
-    A, B, C = (np.ascontiguousarray(part) for part in (A, B, C))
+    A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
     grid, gain = _gains(A, B, C)
     poles = np.linalg.eigvals(system.A)
     natural = np.sort(np.abs(poles[poles.imag >= 0.0]))
     none = (np.zeros((0, n, n)), np.zeros((0, n, m)), np.zeros((0, p, n)))
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
+
+
+def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+    """T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two that evens out the states' scales.
+
+    Inputs and outputs keep their units: balancing leaves alone what has an empty row or column.
+    """
+    n, m, p = len(A), B.shape[1], C.shape[0]
+    system = np.zeros((n + m + p, n + m + p))
+    system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
+    even, _ = matrix_balance(system, permute=False)
+    parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
+    A, B, C = (np.ascontiguousarray(part) for part in parts)
+    return A, B, C
 
 
 def _scaled_channels(
