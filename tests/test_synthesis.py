@@ -25,9 +25,9 @@ from helpers import (
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from ccd_casadi.backends.mixed import synthesise_with
 from ccd_casadi.modal import Suspension
 from ccd_casadi.plant import Mechanics, mechanics
-from ccd_casadi.sb10ad import synthesise_sb10ad
 from ccd_casadi.synthesis import Design, Outcome, StateSpace, sweep, synthesise
 from ccd_casadi.weights import Weights
 
@@ -72,7 +72,7 @@ def test_every_two_mass_design_is_certified_and_sb10ad_agrees(count: int) -> Non
         assert ours.certificate.stable
         assert ours.certificate.norm_bound == pytest.approx(1.02 * ours.gamma_opt, rel=1e-12)
         assert ours.gamma_opt >= ours.gamma_lower_bound
-        theirs = synthesise_sb10ad(plant, w, omega_low=OMEGA_LOW)
+        theirs = synthesise_with("slicot", plant, w, omega_low=OMEGA_LOW)
         if theirs.design is not None and theirs.design.figures.certified:
             compared += 1
             assert ours.gamma_opt == pytest.approx(theirs.gamma_opt, rel=2e-7)
@@ -156,7 +156,7 @@ def check_flexible(seed: int) -> bool:
     norm_error, bandwidth_error = check_handed_out(plant, design, per_decade=30)
     assert -1e-6 < norm_error < 1e-2
     assert abs(bandwidth_error) < 1e-7
-    theirs = synthesise_sb10ad(case.plant, case.weights, omega_low=OMEGA_LOW)
+    theirs = synthesise_with("slicot", case.plant, case.weights, omega_low=OMEGA_LOW)
     if figures.limited_by_bound:
         # SB10AD goes below what any controller can reach; its design may pass by the back-off
         assert not theirs.gamma_opt > figures.gamma_opt * (1.0 + 1e-6)

@@ -1,0 +1,73 @@
+"""What a back end returns: its claim, and the controller that is yet to be certified."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Protocol
+
+from ccd_casadi.backends.standard_plant import StandardPlant
+from ccd_casadi.errors import UserError
+from ccd_casadi.scaling import StateSpace
+
+
+class BackendMissing(UserError):
+    """An optional package is not installed; the line says which, and how to get it."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """γ_opt as the back end has it, and a controller that is to reach `gamma`, e or y to u.
+
+    `controller` is None where there is none; `reason` then says why.
+    """
+
+    gamma_opt: float
+    gamma: float
+    controller: StateSpace | None
+    reason: str = ""
+
+
+class Solver(Protocol):
+    """H∞ synthesis for any standard plant at gamma_backoff times its own γ_opt."""
+
+    def __call__(self, plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt: ...
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A name, what it needs, and where its solver is."""
+
+    name: str
+    title: str
+    needs: tuple[str, ...]
+    extra: str
+    module: str
+
+    def solver(self) -> Solver:
+        """Its solver. Raises BackendMissing where a package that it needs is not installed."""
+        for package in self.needs:
+            require(package, self.extra)
+        solve: Solver = import_module(self.module).solve
+        return solve
+
+    def missing(self) -> str:
+        """Why it cannot be used here; empty where it can."""
+        try:
+            self.solver()
+        except BackendMissing as error:
+            return str(error)
+        return ""
+
+
+SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot", "ccd_casadi.backends.slicot")
+LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi", "ccd_casadi.backends.lmi")
+GENERAL = (SLICOT, LMI)
+
+
+def require(package: str, extra: str) -> ModuleType:
+    """Import an optional package. Raises BackendMissing where it is not installed."""
+    try:
+        return import_module(package)
+    except ImportError:
+        words = f"is not installed; install it with pip install 'ccd-casadi[{extra}]'"
+        raise BackendMissing(f"{package}: {words}") from None
