@@ -1,0 +1,201 @@
+"""`python -m ccd_casadi.cross_check CASE.toml --theta m1=60,m2=60`: one synthesis, every back end.
+
+The certificate is the judge: a γ_opt below the bound γ_jω that no controller passes is wrong, a
+design that is not certified does not count, and among those that are the lowest γ_opt is right.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ccd_casadi.backends.mixed import RICCATI, TITLES, BackendResult, every_backend
+from ccd_casadi.case import CaseError, load_case, parse_theta, problem_of
+from ccd_casadi.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.results import clean, figures_dict, versions, write_json
+from ccd_casadi.run_folder import read_run
+
+HZ = 2.0 * math.pi
+AGREE = 1e-3  # relative: what an interior-point method is good for
+BELOW = 1e-6  # relative: a claim this far below the bound is wrong
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the certificate says of one back end, and whether its claim and design hold."""
+
+    result: BackendResult
+    holds: bool | None  # None: it made no claim
+    words: str
+
+
+def verdicts(results: Sequence[BackendResult]) -> list[Verdict]:
+    """Judge every claim by the certificates and by the bound γ_jω of the package's own design."""
+    ours = next(item for item in results if item.backend == RICCATI)
+    bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
+    proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
+    lowest = min(
+        (g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan
+    )  # fmt: skip
+    found = []
+    for item in results:
+        if item.design is None:
+            found.append(Verdict(item, None, item.reason))
+        elif item.gamma_opt < bound * (1.0 - BELOW):
+            short = 100.0 * (1.0 - item.gamma_opt / bound)
+            words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
+            found.append(Verdict(item, False, words))
+        elif not item.certified:
+            found.append(Verdict(item, False, f"not certified: {item.reason}"))
+        elif item.gamma_opt > lowest * (1.0 + AGREE):
+            over = 100.0 * (item.gamma_opt / lowest - 1.0)
+            found.append(Verdict(item, False, f"certified, but {over:.2g} % above the least"))
+        else:
+            found.append(Verdict(item, True, "certified"))
+    return found
+
+
+def _problem(
+    options: argparse.Namespace,
+) -> tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]:
+    """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
+    asked = (options.omega_S_hz, options.omega_T_hz)
+    if (asked[0] is None) != (asked[1] is None):
+        words = "give both --omega-s-hz and --omega-t-hz, or neither"
+        raise CaseError(f"{options.case}: {words}")
+    if options.case.is_dir():
+        done = read_run(options.case)
+        if options.theta is not None:
+            raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
+        point = (done.weights.omega_S, done.weights.omega_T)
+        problem, theta = done.problem, done.theta
+    else:
+        case = load_case(options.case)
+        if options.theta is None:
+            raise CaseError(f"{options.case}: give --theta, or a run folder in place of the case")
+        problem, theta = problem_of(case), parse_theta(case, options.theta)
+        point = (math.nan, math.nan)
+    if asked[0] is not None:
+        point = (HZ * asked[0], HZ * asked[1])
+    if math.isnan(point[0]):
+        found = true_inner(problem, theta)
+        if found.optimum is None:
+            raise CaseError(f"{options.case}: {found.shortfall}; give --omega-s-hz, --omega-t-hz")
+        point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
+    return problem, theta, point
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Synthesise with every back end, print the table, and say who is right."""
+    problem, theta, point = _problem(options)
+    results = every_backend(
+        scaled_plant(problem, theta),
+        problem.weights.at(*point),
+        omega_low=problem.inner.omega_low,
+        gamma_backoff=problem.inner.gamma_backoff,
+        limit=options.limit,
+    )
+    found = verdicts(results)
+    if not options.quiet:
+        names = ", ".join(f"{k} = {v:.6g}" for k, v in zip(problem.names, theta, strict=True))
+        print(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
+        print(_table(found))
+        print(_conclusion(found))
+    if options.out is not None:
+        folder = run_folder(options.case, options.out)
+        write_json(folder / "cross_check.json", _json(problem, theta, point, found))
+    own = next(item for item in found if item.result.backend == RICCATI)
+    return ExitCode.DONE if own.holds else ExitCode.NOT_VERIFIED
+
+
+def _table(found: Sequence[Verdict]) -> str:
+    lines = [
+        f"{'back end':18s} {'gamma claimed':>13s} {'certified':>11s} {'bandwidth':>12s} "
+        f"{'peak of S':>9s} {'seconds':>8s}  verdict"
+    ]
+    for item in found:
+        result, figures = item.result, item.result.design and item.result.design.figures
+        norm = figures.certificate.norm if figures and figures.certificate.passed else math.nan
+        bandwidth = figures.bandwidth / HZ if figures else math.nan
+        peak = figures.sensitivity_peak if figures else math.nan
+        lines.append(
+            f"{TITLES[result.backend]:18s} {_cell(result.gamma_opt, '.7g'):>13s} "
+            f"{_cell(norm, '.7g'):>11s} {_cell(bandwidth, '.5f', ' Hz'):>12s} "
+            f"{_cell(peak, '.5f'):>9s} {result.seconds:8.3f}  {item.words}"
+        )
+    return "\n".join(lines)
+
+
+def _cell(value: float, form: str, unit: str = "") -> str:
+    return "-" if math.isnan(value) else f"{value:{form}}{unit}"
+
+
+def _conclusion(found: Sequence[Verdict]) -> str:
+    right = [TITLES[item.result.backend] for item in found if item.holds]
+    wrong = [TITLES[item.result.backend] for item in found if item.holds is False]
+    if not right:
+        return "no back end has a certified design"
+    if not wrong:
+        return f"agree to {100 * AGREE:g} %: {', '.join(right)}"
+    return f"disagree; the certificate is with {', '.join(right)}, not with {', '.join(wrong)}"
+
+
+def _json(
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    point: tuple[float, float],
+    found: Sequence[Verdict],
+) -> dict[str, Any]:
+    return {
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "omega_S_hz": point[0] / HZ,
+        "omega_T_hz": point[1] / HZ,
+        "backends": {
+            item.result.backend: {
+                "gamma_claimed": clean(item.result.gamma_opt),
+                "holds": item.holds,
+                "verdict": item.words,
+                "seconds": item.result.seconds,
+                "figures": clean(figures_dict(item.result.design.figures))
+                if item.result.design is not None
+                else None,
+            }
+            for item in found
+        },
+        "versions": versions(),
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = parser(
+        "ccd_casadi.cross_check",
+        "One synthesis by every back end; CASE.toml may also be the folder of a finished solve.",
+    )
+    arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
+    for name in ("S", "T"):
+        arguments.add_argument(
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=_positive, metavar="X",
+            help="with the other one; without both the best pair at theta, or the run's",
+        )  # fmt: skip
+    arguments.add_argument(
+        "--limit", type=_positive, default=60.0, metavar="SECONDS",
+        help="for each optional back end (default: 60)",
+    )  # fmt: skip
+    return run(command, arguments, argv)
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
+    return value
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,205 @@
+"""Back ends against each other, with the certificate as judge; and life without them."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccd_casadi.backends.attempt import Backend, BackendMissing
+from ccd_casadi.backends.mixed import BackendResult, synthesise_with
+from ccd_casadi.backends.standard_plant import (
+    StandardPlant,
+    close,
+    mixed_sensitivity,
+    obstacles,
+    regularised,
+    with_d22,
+    without_d22,
+)
+from ccd_casadi.cross_check import main, verdicts
+from ccd_casadi.norms import hinf_norm
+from ccd_casadi.scaling import StateSpace, scale_state_space
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def random_plant(seed: int) -> tuple[StandardPlant, StateSpace]:
+    """A plant with every D, and some controller of two states."""
+    rng = np.random.default_rng(seed)
+    n, w, m, z, p = (int(k) for k in rng.integers(1, 4, 5))
+    A = rng.standard_normal((n, n))
+    parts = (rng.standard_normal(shape) for shape in ((n, w + m), (z + p, n), (z + p, w + m)))
+    plant = StandardPlant.from_parts(A, *parts, p, m)
+    K = StateSpace(*(rng.standard_normal(shape) for shape in ((2, 2), (2, p), (m, 2), (m, p))))
+    return plant, K
+
+
+def parts(system: control.StateSpace) -> StateSpace:
+    return StateSpace(*(np.asarray(M) for M in (system.A, system.B, system.C, system.D)))
+
+
+@few(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(0.1, 10.0))
+def test_loop_is_the_linear_fractional_transformation(seed: int, omega: float) -> None:
+    plant, K = random_plant(seed)
+    theirs = control.ss(*vars(plant.whole()).values()).lft(control.ss(*vars(K).values()))
+    ours = control.ss(*vars(close(plant, K)).values())
+    assert ours(1j * omega, squeeze=False) == pytest.approx(
+        theirs(1j * omega, squeeze=False), rel=1e-6, abs=1e-8
+    )
+
+
+@few(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(0.1, 10.0))
+def test_controller_for_no_d22_is_turned_into_one_for_it(seed: int, omega: float) -> None:
+    plant, K = random_plant(seed)
+    plain = control.ss(*vars(close(without_d22(plant), K)).values())
+    turned = control.ss(*vars(close(plant, with_d22(K, plant.D22))).values())
+    assert turned(1j * omega, squeeze=False) == pytest.approx(
+        plain(1j * omega, squeeze=False), rel=1e-6, abs=1e-8
+    )
+
+
+@few(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(1e-4, 1.0))
+def test_regularised_loop_bounds_the_given_one(seed: int, size: float) -> None:
+    plant, K = random_plant(seed)
+    loop, larger = close(plant, K), close(regularised(plant, size), K)
+    shift = max(np.linalg.eigvals(loop.A).real.max() + 0.1, 0.0) * np.eye(len(loop.A))
+    norm = hinf_norm(replace(loop, A=loop.A - shift))[0]
+    assert norm <= hinf_norm(replace(larger, A=larger.A - shift))[0] * (1.0 + 1e-9)
+
+
+@few(max_examples=25)
+@given(st.integers(0, 10**6), st.floats(0.0, 3.0))
+def test_hidden_unstable_mode_is_an_obstacle_and_a_reachable_one_is_not(
+    seed: int, pole: float
+) -> None:
+    plant, _ = random_plant(seed)
+    assert not obstacles(plant)
+    n = len(plant.A)
+    T = np.random.default_rng(seed).standard_normal((n + 1, n + 1)) + 3.0 * np.eye(n + 1)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n], A[n, n] = plant.A, pole
+    B2 = np.linalg.solve(T, np.vstack([plant.B2, np.zeros((1, plant.B2.shape[1]))]))
+    C2 = np.hstack([plant.C2, np.ones((plant.C2.shape[0], 1))]) @ T
+    hidden = replace(plant, A=np.linalg.solve(T, A @ T), B2=B2, C2=C2)
+    assert any("no control reaches" in words for words in obstacles(hidden))
+
+
+@pytest.mark.parametrize(("omega_S", "omega_T"), [(987.0, 25.0), (100.0, 400.0), (800.0, 40.0)])
+def test_three_back_ends_agree_on_two_masses(omega_S: float, omega_T: float) -> None:
+    pytest.importorskip("cvxpy")
+    pytest.importorskip("slycot")
+    plant, weights = two_mass(60.0, 60.0), PAPER.at(omega_S * HZ, omega_T * HZ)
+    results = [
+        synthesise_with(name, plant, weights, omega_low=OMEGA_LOW)
+        for name in ("riccati", "slicot", "lmi")
+    ]
+    assert all(item.holds for item in verdicts(results))
+    ours, slicot, lmi = (item.gamma_opt for item in results)
+    assert slicot == pytest.approx(ours, rel=1e-6)
+    assert lmi == pytest.approx(ours, rel=1e-3)
+
+
+def test_claim_below_the_bound_is_called_wrong() -> None:
+    """γ_jω limits here: SB10AD takes its rounding errors for a stabilising solution."""
+    pytest.importorskip("slycot")
+    case = flexible_case(6)
+    ours, theirs = (
+        synthesise_with(name, case.plant, case.weights, omega_low=OMEGA_LOW)
+        for name in ("riccati", "slicot")
+    )
+    judged = verdicts([ours, theirs])
+    assert judged[0].holds
+    assert judged[1].holds is False
+    assert "less than any controller reaches" in judged[1].words
+
+
+def test_verdicts_on_designs_that_fail_or_are_beaten() -> None:
+    plant, weights = two_mass(60.0, 60.0), PAPER
+    ours = synthesise_with("riccati", plant, weights, omega_low=OMEGA_LOW)
+    assert ours.design is not None
+    dear = replace(ours, backend="lmi", gamma_opt=1.01 * ours.gamma_opt)
+    none = BackendResult("slicot", np.nan, None, "no answer within 1 s", 1.0)
+    mine, beaten, silent = verdicts([ours, dear, none])
+    assert mine.holds
+    assert beaten.holds is False
+    assert "1 % above the least" in beaten.words
+    assert silent.holds is None
+    assert silent.words == "no answer within 1 s"
+
+
+def test_unstable_plant_is_refused_by_our_kernel_and_served_by_sb10ad() -> None:
+    """One Riccati equation needs a stable plant; SB10AD has two, and the same certificate."""
+    pytest.importorskip("slycot")
+    A = np.array([[0.0, 1.0], [25.0, -1.0]])
+    system = StateSpace(A, np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    plant = scale_state_space(system, 2e3)
+    weights = replace(PAPER, M_K=2e3, omega_S=1.0, omega_K=50.0, omega_T=100.0)
+    ours, theirs = (
+        synthesise_with(name, plant, weights, omega_low=1e-3) for name in ("riccati", "slicot")
+    )
+    assert not ours.certified
+    assert theirs.design is not None
+    assert theirs.design.figures.certificate.passed
+
+
+def test_mixed_sensitivity_plant_is_the_kernels_stack() -> None:
+    """The standard plant's loop against the figures that the certificate has of the same design."""
+    plant = two_mass(60.0, 60.0)
+    design = synthesise_with("riccati", plant, PAPER, omega_low=OMEGA_LOW).design
+    assert design is not None
+    w0, force = plant.omega_0, plant.force
+    K = StateSpace(
+        design.controller.A / w0, design.controller.B / w0, design.controller.C / force,
+        design.controller.D / force,
+    )  # fmt: skip
+    norm, at = hinf_norm(close(mixed_sensitivity(plant, PAPER), K))
+    assert norm == pytest.approx(design.figures.certificate.norm, rel=1e-6)
+    assert at > 0.0
+
+
+def test_missing_package_is_named_with_its_remedy() -> None:
+    backend = Backend("none", "none", ("no_such_package",), "slicot", "no.such.module")
+    with pytest.raises(BackendMissing, match=r"pip install 'ccd-casadi\[slicot\]'"):
+        backend.solver()
+
+
+def test_command_refuses_what_it_cannot_use(capsys: pytest.CaptureFixture[str]) -> None:
+    case = str(ROOT / "runs" / "two_mass.toml")
+    for arguments, words in (
+        ([case], "give --theta"),
+        ([case, "--theta", "m1=60,m2=60", "--omega-s-hz", "100"], "give both"),
+        ([case, "--theta", "m1=60,m2=60", "--limit", "-1"], "no number above 0"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+
+
+def test_everything_but_the_back_end_works_without_slycot_and_cvxpy(tmp_path: Path) -> None:
+    for package in ("slycot", "cvxpy"):
+        (tmp_path / f"{package}.py").write_text(f"raise ImportError('no {package}')\n")
+    command = [sys.executable, "-m", "ccd_casadi.cross_check", str(ROOT / "runs" / "two_mass.toml")]
+    command += ["--theta", "m1=60,m2=60", "--omega-s-hz", "800", "--omega-t-hz", "40"]
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path}, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "slycot: is not installed; install it with pip install 'ccd-casadi[slicot]'" in (
+        done.stdout
+    )
+    assert "cvxpy: is not installed; install it with pip install 'ccd-casadi[lmi]'" in done.stdout
+    assert "one Riccati (ours)" in done.stdout.splitlines()[2]
