@@ -2,16 +2,11 @@
 
 from dataclasses import dataclass
 from importlib import import_module
-from types import ModuleType
 from typing import Protocol
 
 from ccd_casadi.backends.standard_plant import StandardPlant
-from ccd_casadi.errors import UserError
+from ccd_casadi.optional import MissingPackage, require
 from ccd_casadi.scaling import StateSpace
-
-
-class BackendMissing(UserError):
-    """An optional package is not installed; the line says which, and how to get it."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +39,7 @@ class Backend:
     module: str
 
     def solver(self) -> Solver:
-        """Its solver. Raises BackendMissing where a package that it needs is not installed."""
+        """Its solver. Raises MissingPackage where a package that it needs is not installed."""
         for package in self.needs:
             require(package, self.extra)
         solve: Solver = import_module(self.module).solve
@@ -54,7 +49,7 @@ class Backend:
         """Why it cannot be used here; empty where it can."""
         try:
             self.solver()
-        except BackendMissing as error:
+        except MissingPackage as error:
             return str(error)
         return ""
 
@@ -62,12 +57,3 @@ class Backend:
 SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot", "ccd_casadi.backends.slicot")
 LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi", "ccd_casadi.backends.lmi")
 GENERAL = (SLICOT, LMI)
-
-
-def require(package: str, extra: str) -> ModuleType:
-    """Import an optional package. Raises BackendMissing where it is not installed."""
-    try:
-        return import_module(package)
-    except ImportError:
-        words = f"is not installed; install it with pip install 'ccd-casadi[{extra}]'"
-        raise BackendMissing(f"{package}: {words}") from None

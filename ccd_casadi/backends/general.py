@@ -9,7 +9,7 @@ costs added where not; each controller is certified on the plant that was given.
 import time
 from dataclasses import dataclass
 
-from ccd_casadi.backends.attempt import GENERAL, BackendMissing
+from ccd_casadi.backends.attempt import GENERAL
 from ccd_casadi.backends.standard_plant import (
     StandardPlant,
     certify,
@@ -18,6 +18,7 @@ from ccd_casadi.backends.standard_plant import (
     regularised,
 )
 from ccd_casadi.deadline import Overrun, Runner
+from ccd_casadi.optional import MissingPackage
 from ccd_casadi.scaling import StateSpace
 from ccd_casadi.synthesis import Certificate
 
@@ -63,7 +64,7 @@ def synthesise_standard(
     for backend in GENERAL:
         try:
             solve = backend.solver()
-        except BackendMissing as missing:
+        except MissingPackage as missing:
             reasons.append(str(missing))
             continue
         for size in sizes:

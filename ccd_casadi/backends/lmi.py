@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.backends.attempt import Attempt, require
+from ccd_casadi.backends.attempt import Attempt
 from ccd_casadi.backends.standard_plant import (
     StandardPlant,
     balance,
     with_d22,
     without_d22,
 )
+from ccd_casadi.optional import require
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import StateSpace
 
@@ -37,7 +38,7 @@ LARGEST = 20  # states
 def solve(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
     """Minimal γ of the LMI, then a controller at gamma_backoff times it.
 
-    Raises BackendMissing without cvxpy and clarabel.
+    Raises MissingPackage without cvxpy and clarabel.
     """
     cvxpy = require("cvxpy", "lmi")
     require("clarabel", "lmi")

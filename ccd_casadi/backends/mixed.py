@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.backends.attempt import LMI, SLICOT, Attempt, Backend, BackendMissing
+from ccd_casadi.backends.attempt import LMI, SLICOT, Attempt, Backend
 from ccd_casadi.backends.standard_plant import StandardPlant, mixed_sensitivity
 from ccd_casadi.closed_loop import measure
 from ccd_casadi.deadline import Overrun, Runner
+from ccd_casadi.optional import MissingPackage
 from ccd_casadi.scaling import ScaledPlant
 from ccd_casadi.synthesis import Design, synthesise
 from ccd_casadi.weights import Weights
@@ -50,7 +51,7 @@ def synthesise_with(
     """One synthesis by "riccati", "slicot" or "lmi", certified; ω_low in rad/s.
 
     With a `runner` the optional back ends run in its process and are killed after `limit`
-    seconds. Raises BackendMissing where a package is not installed.
+    seconds. Raises MissingPackage where a package is not installed.
     """
     began = time.perf_counter()
     if backend == RICCATI:
@@ -99,7 +100,7 @@ def every_backend(
                     backend, plant, weights, omega_low=omega_low, gamma_backoff=gamma_backoff,
                     runner=runner, limit=limit,
                 )  # fmt: skip
-            except BackendMissing as missing:
+            except MissingPackage as missing:
                 result = BackendResult(backend, np.nan, None, str(missing), 0.0)
             found.append(result)
     return found

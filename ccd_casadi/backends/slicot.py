@@ -11,8 +11,9 @@ import warnings
 
 import numpy as np
 
-from ccd_casadi.backends.attempt import Attempt, require
+from ccd_casadi.backends.attempt import Attempt
 from ccd_casadi.backends.standard_plant import StandardPlant, balance
+from ccd_casadi.optional import require
 from ccd_casadi.scaling import StateSpace
 
 STARTS = (1e3, 1e6)  # finite γ to bisect from; the second where the first is too low
@@ -22,7 +23,7 @@ BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs
 def solve(plant: StandardPlant, *, gamma_backoff: float = 1.02, tolerance: float = 0.0) -> Attempt:
     """Bisection for γ_opt (job 1), then a controller at gamma_backoff·γ_opt (job 4).
 
-    `tolerance` is absolute in γ (0: SLICOT's own, 1.5e-8). Raises BackendMissing without slycot.
+    `tolerance` is absolute in γ (0: SLICOT's own, 1.5e-8). Raises MissingPackage without slycot.
     """
     slycot = require("slycot", "slicot")
     whole = balance(plant).whole()

@@ -18,15 +18,15 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
-import slycot
 from scipy.linalg import LinAlgError, eigh, solve_continuous_are, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
-from slycot.exceptions import SlycotError, SlycotResultWarning
 
 from ccd_casadi.closed_loop import measure
 from ccd_casadi.deploy.channels import Channel
+from ccd_casadi.optional import require
 from ccd_casadi.plant import Array
 from ccd_casadi.references import UNBOUNDED
 from ccd_casadi.scaling import ScaledPlant, StateSpace
@@ -113,13 +113,13 @@ def smallest(rows: list[Reduced], limits: Limits) -> Reduced:
 
 def _truncation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
     n, m, p = _sizes(K)
-    out = _slicot(lambda: slycot.ab09md("C", "B", "S", n, m, p, K.A, K.B, K.C, nr=r))
+    out = _slicot(lambda slycot: slycot.ab09md("C", "B", "S", n, m, p, K.A, K.B, K.C, nr=r))
     return None if out is None else StateSpace(out[1], out[2], out[3], K.D)
 
 
 def _perturbation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:
     n, m, p = _sizes(K)
-    out = _slicot(lambda: slycot.ab09nd("C", "B", "S", n, m, p, K.A, K.B, K.C, K.D, nr=r))
+    out = _slicot(lambda slycot: slycot.ab09nd("C", "B", "S", n, m, p, K.A, K.B, K.C, K.D, nr=r))
     return None if out is None else StateSpace(*out[1:5])
 
 
@@ -188,13 +188,14 @@ _METHODS: dict[Reduction, Callable[[ScaledPlant, StateSpace, int], StateSpace | 
 }
 
 
-def _slicot(call: Callable[[], tuple]) -> tuple | None:
+def _slicot(call: Callable[[Any], tuple]) -> tuple | None:
     """What SLICOT returns; None where it fails or warns that the order cannot be had."""
+    slycot = require("slycot", "slicot")
     with warnings.catch_warnings():
-        warnings.simplefilter("error", SlycotResultWarning)
+        warnings.simplefilter("error", slycot.exceptions.SlycotResultWarning)
         try:
-            return call()
-        except (SlycotError, SlycotResultWarning):
+            return call(slycot)
+        except (slycot.exceptions.SlycotError, slycot.exceptions.SlycotResultWarning):
             return None
 
 

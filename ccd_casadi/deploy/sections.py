@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import slycot
 from scipy.linalg import eig
 
+from ccd_casadi.optional import require
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import StateSpace
 
@@ -103,6 +103,7 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
 
 def _zeros(K: StateSpace) -> np.ndarray:
     """Finite zeros: SLICOT's AB08ND takes what is infinite out of the balanced system matrix."""
+    slycot = require("slycot", "slicot")
     n = len(K.A)
     parts = (np.array(part, order="F") for part in (K.A, K.B, K.C))
     _, A, B, C, _ = slycot.tb01id(n, 1, 1, 0.0, *parts)

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from slycot import ab13md
 
 from ccd_casadi.closed_loop import responses
 from ccd_casadi.modal import ModalPlant
+from ccd_casadi.optional import require
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant, StateSpace
 
@@ -94,7 +94,7 @@ def _errors(modal: ModalPlant, kept: NDArray[np.intp], omega: float, K: NDArray)
 def _mu(M: NDArray) -> float:
     """Upper bound for complex scalars on the diagonal."""
     ones = np.ones(len(M), dtype=int)
-    return float(ab13md(M, ones, COMPLEX * ones)[0])
+    return float(require("slycot", "slicot").ab13md(M, ones, COMPLEX * ones)[0])
 
 
 def _stands(M: NDArray, r: float) -> bool:
