@@ -127,12 +127,17 @@ class SamplingSection:
 
 @dataclass(frozen=True)
 class OuterSection:
-    """[outer]: IPOPT starts, agreement of prediction and truth, and rounds of refinement."""
+    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
+
+    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
+    that predicts left-out samples best.
+    """
 
     starts: int = _key(count(1), 16)
     direct_starts: int = _key(count(1), 4)
     tolerance: float = _key(FRACTION, 1e-3)
     max_refinements: int = _key(count(0), 12)
+    surrogate: str = _key(choice("matern52", "rbf", "auto"), "matern52")
 
 
 @dataclass(frozen=True)

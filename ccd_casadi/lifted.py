@@ -18,6 +18,7 @@ from ccd_casadi.outer import (
 )
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of, true_design
+from ccd_casadi.processes import best_left_out, kernels_of
 from ccd_casadi.sampling import QuantitySample, Truth
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 
@@ -39,6 +40,7 @@ def solve_lifted(
     max_refinements: int,
     seed: int,
     given: Surrogates | None = None,
+    surrogate_kind: str = "matern52",
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
@@ -61,7 +63,8 @@ def solve_lifted(
     incumbent: QuantitySample | None = None
     for round_number in range(max_refinements + 1):
         if len(samples) >= REFIT * fitted:
-            processes, fitted = fit_quantities(problem, samples, seed), len(samples)
+            processes = fit_quantities(problem, samples, seed, kind=surrogate_kind)
+            fitted = len(samples)
         elif len(samples) > len(processes[0].X):
             processes = update_quantities(problem, samples, processes)
         program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
@@ -99,14 +102,22 @@ def solve_lifted(
 
 
 def fit_quantities(
-    problem: CoDesignProblem, samples: list[QuantitySample], seed: int, gradients: bool = True
+    problem: CoDesignProblem,
+    samples: list[QuantitySample],
+    seed: int,
+    gradients: bool = True,
+    kind: str = "matern52",
 ) -> tuple[GaussianProcess, ...]:
     """Processes of ω_b (rad/s), ln‖S‖∞ and ln σ_max(S(jω_low)) over x = (θ, ln ω_S, ln ω_T)."""
     lower, upper = lifted_bounds(problem)
     X = np.array([sample.x for sample in samples])
     Y = np.array([sample.values[:3] for sample in samples])
     dY = np.array([sample.gradients[:3] for sample in samples]) if gradients else None
-    return fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1)
+    found = [
+        fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
+        for kernel in kernels_of(kind)
+    ]
+    return tuple(best_left_out(each) for each in zip(*found, strict=True))
 
 
 def update_quantities(

@@ -12,6 +12,7 @@ from ccd_casadi.known import Surrogates
 from ccd_casadi.outer import OuterFailure, OuterSolution, nested_program, solve_program
 from ccd_casadi.plant import Array, constraint_values, hardware_cost
 from ccd_casadi.problem import CoDesignProblem, box, plant_of, true_design
+from ccd_casadi.processes import best_left_out, kernels_of
 from ccd_casadi.sampling import BandwidthSample, Truth
 from surrogates import GaussianProcess, design, fit, to_casadi
 
@@ -28,6 +29,7 @@ def solve_nested(
     max_refinements: int,
     seed: int,
     given: Surrogates | None = None,
+    surrogate_kind: str = "matern52",
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
 
@@ -51,7 +53,7 @@ def solve_nested(
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
-        surrogate = fit_bandwidth(problem, local, seed)
+        surrogate = fit_bandwidth(problem, local, seed, surrogate_kind)
         program = nested_program(problem, to_casadi(surrogate, std=False))
         program = type(program)(**{**vars(program), "lower": low, "upper": high})
         try:
@@ -98,13 +100,17 @@ def solve_nested(
 
 
 def fit_bandwidth(
-    problem: CoDesignProblem, samples: list[BandwidthSample], seed: int
+    problem: CoDesignProblem, samples: list[BandwidthSample], seed: int, kind: str = "matern52"
 ) -> GaussianProcess:
     """An interpolating Gaussian process of ω_b*(θ) in rad/s over the whole box."""
     X = np.array([sample.theta for sample in samples])
     Y = np.array([sample.bandwidth for sample in samples])
     lower, upper = box(problem)
-    return fit(X, Y, lower=lower, upper=upper, noise=1e-7 * float(np.abs(Y).max()), seed=seed)
+    noise = 1e-7 * float(np.abs(Y).max())
+    return best_left_out(
+        fit(X, Y, lower=lower, upper=upper, noise=noise, seed=seed, kernel=kernel)
+        for kernel in kernels_of(kind)
+    )
 
 
 def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:

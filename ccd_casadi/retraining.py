@@ -19,11 +19,12 @@ from threadpoolctl import threadpool_limits
 from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.case_sections import Case
 from ccd_casadi.case_toml import case_to_toml
+from ccd_casadi.cluster import pool
 from ccd_casadi.errors import UserError
 from ccd_casadi.iterates import FormulationResult
 from ccd_casadi.known import known_designs, known_thetas
 from ccd_casadi.outer import lifted_bounds, unmet_constraint
-from ccd_casadi.parallel import WorkerLost, Workers
+from ccd_casadi.parallel import WorkerLost
 from ccd_casadi.plant import Array, PlantError, constraint_values
 from ccd_casadi.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.samples import SampleStore, problem_hash
@@ -46,14 +47,18 @@ def open_run(
     seed: int,
     quiet: bool,
     user_code: bool = True,
+    scheduler: str | None = None,
 ) -> Iterator["CoDesignTruth"]:
     """The truth of a run folder with a case.toml. Raises TruthError."""
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
         formulation = _formulation(folder)
-        with SampleStore(folder / "samples.sqlite") as store, Workers(workers, PATIENCE) as pool:
-            truth = Truth(problem, store, pool, quiet=quiet)
+        with (
+            pool(scheduler, workers, PATIENCE) as evaluators,
+            SampleStore(folder / "samples.sqlite") as store,
+        ):
+            truth = Truth(problem, store, evaluators, quiet=quiet)
             yield CoDesignTruth(folder, case, truth, formulation, tolerance, seed)
 
 

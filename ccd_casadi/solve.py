@@ -125,6 +125,7 @@ def _formulate(
             max_refinements=outer.max_refinements,
             seed=seed,
             given=given,
+            surrogate_kind=outer.surrogate,
         )
     if formulation == "lifted":
         # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
@@ -138,6 +139,7 @@ def _formulate(
             max_refinements=outer.max_refinements,
             seed=seed,
             given=given,
+            surrogate_kind=outer.surrogate,
         )
     return solve_direct(truth, starts=outer.direct_starts, seed=seed)
 

@@ -82,6 +82,12 @@ def parser() -> argparse.ArgumentParser:
         default=len(os.sched_getaffinity(0)),
         help="worker processes (default: all cores)",
     )
+    result.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="evaluate on the cluster at tcp://host:port, if the truth knows clusters; --workers "
+        "then has no effect",
+    )
     result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
     result.add_argument(
@@ -107,8 +113,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if folder != run:
             copy_run(run, folder)
         opened = opener(
-            folder, tolerance=options.tolerance, workers=options.workers, seed=options.seed,
-            quiet=quiet, user_code=not options.no_user_code,
+            folder, tolerance=options.tolerance, workers=options.workers,
+            scheduler=options.scheduler, seed=options.seed, quiet=quiet,
+            user_code=not options.no_user_code,
         )  # fmt: skip
         with ctrl_c_noticed(), opened as truth:
             outcome = retrain(folder, truth, settings, quiet)

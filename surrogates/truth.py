@@ -94,6 +94,8 @@ class Opener(Protocol):
     """What an entry point of the group names; raises TruthError.
 
     With `user_code` False nothing may run that the folder or a file that it names holds.
+    `scheduler` is the address of a cluster to evaluate on, None for `workers` processes here; a
+    truth that knows no clusters raises TruthError where one is given.
     """
 
     def __call__(
@@ -102,6 +104,7 @@ class Opener(Protocol):
         *,
         tolerance: float | None,
         workers: int,
+        scheduler: str | None,
         seed: int,
         quiet: bool,
         user_code: bool,

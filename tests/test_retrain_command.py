@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from camel import Camel, entries
 
+import surrogates.retrain as retrain_module
 import surrogates.truth as truth_module
 from surrogates.interface import Array
 from surrogates.retrain import main
-from surrogates.truth import Observations, TruthInterrupted
+from surrogates.truth import Observations, TruthError, TruthInterrupted
 
 
 @pytest.fixture
@@ -148,3 +149,34 @@ def test_a_copy_is_retrained_and_the_run_left_alone(
     assert [e["event"] for e in entries(out)][-4:] == ["start", "end", "start", "end"]
     with sqlite3.connect(out / "samples.sqlite") as database:
         assert database.execute("select x from t").fetchall() == [(7,)]
+
+
+def test_a_scheduler_is_the_truths_own_business(
+    camel_copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = []
+
+    @contextmanager
+    def opened(folder: Path, *, scheduler: str | None, **_: Any) -> Iterator[Any]:
+        given.append(scheduler)
+        if scheduler is not None:
+            raise TruthError(f"--scheduler {scheduler}: this truth knows no clusters")
+        yield Camel(folder)
+
+    monkeypatch.setattr(retrain_module, "opener_of", lambda folder: opened)
+    assert main([str(camel_copy), "--quiet"]) == 0
+    assert main([str(camel_copy), "--quiet", "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    assert given == [None, "tcp://127.0.0.1:9"]
+    assert capsys.readouterr().err == (
+        "--scheduler tcp://127.0.0.1:9: this truth knows no clusters\n"
+    )
+
+
+def test_a_scheduler_that_is_none_is_told_in_one_line(
+    two_mass_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(two_mass_run), "--out", str(tmp_path / "run"), "--scheduler", "nowhere"]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert told.startswith("--scheduler nowhere: is no address; give what `dask scheduler`")

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccd_casadi.case import load_case, problem_of
+from ccd_casadi.known import known_designs
+from ccd_casadi.lifted import fit_quantities
+from ccd_casadi.processes import best_left_out, kernels_of
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import quantity_sample
 from ccd_casadi.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from surrogates import GaussianProcess, Roughness, design, errors, fit
 
@@ -77,3 +83,32 @@ def test_a_run_holds_its_quality(two_mass_run: Path) -> None:
     text = (two_mass_run / "report.html").read_text()
     assert re.search(r"<h2>Can the surrogate be trusted\?</h2>", text)
     assert quality["recommendation"].replace("'", "&#x27;") in text
+
+
+def test_auto_takes_the_kernel_that_predicts_left_out_samples_best() -> None:
+    u = (X - 50.0) / 20.0
+    kinds = {}
+    for name, Y in (
+        ("analytic", np.exp(-u.sum(1))),
+        ("rough", np.abs(u @ [1.0, -0.7] - 0.2)),
+    ):
+        found = [fit(X, Y, **BOX, noise=1e-7, starts=1, kernel=k) for k in kernels_of("auto")]
+        best = best_left_out(found)
+        assert best.loo.rms == min(p.loo.rms for p in found)
+        kinds[name] = best.kernel.value
+    assert kinds == {"analytic": "rbf", "rough": "matern52"}
+    assert [k.value for k in kernels_of("rbf")] == ["rbf"]
+
+
+def test_lifted_fits_the_kernel_that_the_case_names(two_mass_run: Path) -> None:
+    problem = problem_of(load_case(two_mass_run / "case.toml"))
+    with SampleStore(two_mass_run / "samples.sqlite") as store:
+        rows = known_designs(store, problem)[:20]
+    samples = [quantity_sample(tuple(x), row, len(problem.names)) for x, row in rows]
+    named = fit_quantities(problem, samples, 0, kind="rbf")
+    assert {p.kernel.value for p in named} == {"rbf"}
+    plain = fit_quantities(problem, samples, 0)
+    assert {p.kernel.value for p in plain} == {"matern52"}
+    auto = fit_quantities(problem, samples, 0, kind="auto")
+    for one, two, best in zip(named, plain, auto, strict=True):
+        assert best.loo.rms == min(one.loo.rms, two.loo.rms)
