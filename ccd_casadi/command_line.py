@@ -73,10 +73,16 @@ def _shared(result: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def run_parser(command: str, description: str) -> argparse.ArgumentParser:
+def run_parser(
+    command: str,
+    description: str,
+    *,
+    metavar: str = "RUN_DIR",
+    about: str = "the folder of a finished solve",
+) -> argparse.ArgumentParser:
     """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
     result = _Parser(prog=f"python -m {command}", description=description)
-    result.add_argument("run", metavar="RUN_DIR", type=Path, help="the folder of a finished solve")
+    result.add_argument("run", metavar=metavar, type=Path, help=about)
     _shared(result)
     return result
 

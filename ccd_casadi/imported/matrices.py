@@ -21,6 +21,7 @@ from scipy.sparse.linalg import eigsh, splu
 from ccd_casadi.imported.modal_table import ModalTable
 from ccd_casadi.plant import Array, PlantError
 
+COLUMNS = ("kind", "name", "dof", "gain")
 SHIFT = 1e-9  # of the largest stiffness over mass: K + s M is regular with rigid-body modes too
 SYMMETRIC = 1e-9
 POINTS = 2  # shape values kept for matching, as a multiple of the modes
@@ -33,7 +34,7 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     that the compliance at low frequency is that of the full model. Raises PlantError where a file
     is missing, foreign, not symmetric or of another size than its fellows.
     """
-    index, dofs = _table(folder / "index.csv"), _table(folder / "dofs.csv")
+    index, dofs = read_rows(folder / "index.csv"), read_rows(folder / "dofs.csv", COLUMNS)
     if modes < 1:
         raise PlantError(f"modes = {modes}; keep at least 1")
     known = ("mass", "stiffness", "damping", "hardware_cost")
@@ -56,14 +57,14 @@ def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> 
     shapes = _shape_values(folder, dofs, bases, sizes)
 
     def number(row: Mapping[str, str], key: str) -> float:
-        return _number(folder / "index.csv", key, row.get(key, "0"))
+        return number_in(folder / "index.csv", key, row.get(key, "0"))
 
     counts = {len(omega) for omega, _, _ in found}
     r = min(counts)
     return ModalTable(
         names=tuple(names),
-        input_names=_names(dofs, "in"),
-        output_names=_names(dofs, "out"),
+        input_names=named(folder, dofs, "in"),
+        output_names=named(folder, dofs, "out"),
         constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
         theta=np.array([[number(row, name) for name in names] for row in index]),
         omega=np.array([omega[:r] for omega, _, _ in found]),
@@ -124,23 +125,25 @@ def _shape_values(
 
 def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
     """(n, k) columns that pick the dofs of each name of this kind."""
-    names = _names(dofs, kind)
+    names = named(folder, dofs, kind)
     found = np.zeros((size, len(names)))
     for row in dofs:
         if row["kind"] == kind:
             place = folder / "dofs.csv"
-            dof, gain = _number(place, "dof", row["dof"]), _number(place, "gain", row["gain"])
+            dof, gain = number_in(place, "dof", row["dof"]), number_in(place, "gain", row["gain"])
             if dof != int(dof) or not 0 <= dof < size:
                 words = f"{dof:g} is no row of a matrix of {size}; count from 0"
                 raise PlantError(f"{place}: dof: {words}")
             found[int(dof), names.index(row["name"])] += gain
-    if kind != "shape" and not names:
-        raise PlantError(f"{folder / 'dofs.csv'}: names no {kind}; add a row of kind {kind}")
     return found
 
 
-def _names(dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
+def named(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+    """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
+    names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
+    if kind != "shape" and not names:
+        raise PlantError(f"{folder / 'dofs.csv'}: names no {kind}; add a row of kind {kind}")
+    return names
 
 
 def _matrix(path: Path) -> csc_array:
@@ -186,28 +189,31 @@ def _from_npz(path: Path) -> object:
     return load_sparse(path)
 
 
-def _table(path: Path) -> list[dict[str, str]]:
+def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The rows of a small CSV file, with these columns only if given (gain: 1 where missing).
+
+    Raises PlantError where it cannot be read or has other columns.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = [line for line in file if line.strip() and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
+        reader = csv.DictReader(lines, skipinitialspace=True)
+        rows = [{str(k).strip(): str(v).strip() for k, v in row.items()} for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise PlantError(f"{path}: cannot be read: {error}; add it") from None
-    reader = csv.DictReader(lines, skipinitialspace=True)
-    rows = [{str(k).strip(): str(v).strip() for k, v in row.items()} for row in reader]
-    if not rows or "None" in rows[0]:
-        raise PlantError(f"{path}: holds no rows, or more cells than its header; mend it")
-    if path.name == "dofs.csv":
+    if not rows or any("None" in row or "None" in row.values() for row in rows):
+        raise PlantError(f"{path}: holds no rows, or other cells than its header; mend it")
+    if columns:
         for row in rows:
             row.setdefault("gain", "1")
-            if set(row) != {"kind", "name", "dof", "gain"} or row["kind"] not in (
-                "in", "out", "shape"
-            ):  # fmt: skip
-                words = "needs the columns kind (in, out, shape), name, dof and gain"
+            if set(row) != set(columns) or row["kind"] not in ("in", "out", "shape"):
+                words = f"needs the columns {', '.join(columns)}, kind one of in, out, shape"
                 raise PlantError(f"{path}: {words}; see docs/own_finite_elements.md")
     return rows
 
 
-def _number(path: Path, key: str, text: str) -> float:
+def number_in(path: Path, key: str, text: str) -> float:
+    """A cell as a finite number. Raises PlantError."""
     try:
         value = float(text)
     except ValueError:
