@@ -212,6 +212,7 @@ def summary(solution: Solution) -> str:
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
     ]
+    lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
 
 

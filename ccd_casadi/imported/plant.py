@@ -84,13 +84,13 @@ def _notes(
     place = ", ".join(
         f"{name}={value:g}" for name, value in zip(names, modes.table.theta[index], strict=True)
     )
-    error = modes.left_out
+    frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
+    count = len(modes.table.theta)
     return (
-        f"verified means: on the model interpolated between the {len(modes.table.theta)} samples "
-        f"of {source}, for none is known between them ({modes.frame.name}); a sample left out is "
-        f"predicted to {100 * error.frequency:.2g} % in frequency and {100 * error.response:.2g} "
-        "% in response at worst",
-        f"the design lies {100 * distance:.2g} % of the samples' range from the nearest sample, "
+        f"designs are verified on the model interpolated between the {count} samples of {source}, "
+        f"as no other is known between them ({modes.frame.name}); a sample left out is predicted "
+        f"to {frequency:.2g} % in frequency and {response:.2g} % in response at worst",
+        f"this theta lies {100 * distance:.2g} % of the samples' range from the nearest sample, "
         f"{place}; analyse its own finite-element model before it is built",
     )
 
