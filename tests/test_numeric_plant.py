@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.numeric_plant import own_plant
+from ccd_casadi.outer import NonlinearProgram, solve_program
 from ccd_casadi.plant import PlantError, build_plant, constraint_values, hardware_cost
 from ccd_casadi.solve import main
 
@@ -108,6 +109,21 @@ def test_a_model_of_symbols_stays_exact_and_one_with_a_moving_ratio_is_refused()
         plant.evaluate((2.0, 3e-3))
 
 
+def test_ipopt_finds_the_least_cost_of_a_numeric_plant_as_of_the_exact_one() -> None:
+    ends = []
+    for plant in (build_plant(model, NAMES, {}), own_plant(numbers_only, NAMES, {}, LOWER, UPPER)):
+        theta = ca.MX.sym("theta", 2)
+        f, lam = plant.hardware(theta)
+        program = NonlinearProgram(
+            x=theta, f=f, g=lam, lower=np.array(LOWER), upper=np.array(UPPER), variables=NAMES,
+            constraints=("stiff",), exact_hessian=plant.exact_hessian,
+        )  # fmt: skip
+        ends.append(solve_program(program, np.array([[2.0, 3e-3]])).best)
+    np.testing.assert_allclose(ends[1].x, ends[0].x, rtol=1e-6)
+    assert ends[0].x[0] * ends[0].x[1] == pytest.approx(2.0 / 500.0)  # the constraint binds
+
+
+@pytest.mark.slow
 def test_a_numeric_plant_is_solved_as_the_exact_one_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], two_mass_run: Path
 ) -> None:
