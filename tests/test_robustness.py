@@ -318,8 +318,10 @@ def test_the_structured_bound_is_one_and_no_loose_one(run: FinishedRun) -> None:
     modal = modal_plant(system_of(run), run.problem.suspension)
     bound = structured_bound(run.plant, modal, run.controller, np.geomspace(0.2, 3000.0, 200))
     assert bound is not None
-    limit = -shift_line(run, system_of(run), 0.05, 21).stable[0]
-    assert bound.shift == pytest.approx(limit, rel=1e-4)  # by as much a grid may miss it
+    lost = shift_line(run, system_of(run), 0.05, 21).stable[0]
+    # by so much a grid may miss it
+    assert bound.stiffness == pytest.approx(1.0 - (1.0 + lost) ** 2, rel=1e-4)
+    assert bound.shift == pytest.approx(np.sqrt(1.0 + bound.stiffness) - 1.0)
     assert bound.stiffness >= 1.0 / bound.mu.max()
 
 
@@ -348,7 +350,7 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
     assert found["seed"] == 5
     assert not found["survives"]
     assert found["resonance_shift"]["stable_between"][0] == pytest.approx(-0.00758, abs=2e-5)
-    assert found["structured"]["shift"] == pytest.approx(0.00758, abs=2e-5)
+    assert found["structured"]["stiffness"] == pytest.approx(0.01511, abs=2e-5)
     assert [item["feedforward"] for item in found["move"]["runs"]] == [False, True]
     assert found["move"]["runs"][1]["settling"] == 0.0
     assert found["move"]["runs"][1]["rms_error"] < 1e-7

@@ -88,7 +88,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         bound = found.structured
         words.append(
             f"Structured singular value: stable while every modal stiffness errs by less than "
-            f"{100 * bound.stiffness:.3g} % (a fall of frequency by {100 * bound.shift:.3g} %), "
+            f"{100 * bound.stiffness:.3g} % (every frequency by {100 * bound.shift:.3g} %), "
             "each mode by itself; proven on a grid of frequencies."
         )
     words += [_moved(found, i) for i in range(len(found.moves))]

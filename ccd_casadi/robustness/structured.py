@@ -25,13 +25,16 @@ from ccd_casadi.closed_loop import responses
 from ccd_casadi.modal import ModalPlant
 from ccd_casadi.optional import require
 from ccd_casadi.plant import Array
+from ccd_casadi.robustness.signals import closed_loop
 from ccd_casadi.scaling import ScaledPlant, StateSpace
 
 KAPPA = (0.0, 10.0, 3.0, 1.0)  # a larger one asks for a finer grid
 COMPLEX = 2
 SEEN = 1e-9  # share of the strongest residue under which a mode is in no loop
-AROUND, REACH = 120, 0.15  # points around every flexible mode, and how far (relative)
-ROUNDS, FINE = 6, 8  # refinements around the worst frequency, and points a side
+LIGHT = 0.3  # damping ratio of the loop's poles around which the grid is dense
+FLANKS = np.linspace(-12.0, 12.0, 97)  # in their real parts
+SAME = 1e-6  # relative
+ROUNDS, FINE = 8, 8  # refinements around the worst frequency, and points a side
 BISECTIONS = 25
 
 
@@ -50,8 +53,8 @@ class StructuredBound:
 
     @property
     def shift(self) -> float:
-        """The same as a fall of every natural frequency (relative)."""
-        return 1.0 - float(np.sqrt(max(0.0, 1.0 - self.stiffness)))
+        """By how much every natural frequency may err then, up or down (relative)."""
+        return float(np.sqrt(1.0 + self.stiffness)) - 1.0
 
 
 def structured_bound(
@@ -62,9 +65,11 @@ def structured_bound(
     kept = np.flatnonzero(~modal.rigid & (residue > SEEN * residue.max()))
     if kept.size == 0:
         return None
-    natural = np.unique(modal.natural[kept]) / (2.0 * np.pi)
-    around = np.linspace(1.0 - REACH, 1.0 + REACH, AROUND)
-    new = np.unique(np.concatenate([hz, np.outer(natural, around).ravel()]))
+    poles = np.linalg.eigvals(closed_loop(plant.plant_si(), controller).A)
+    poles = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))]
+    around = np.abs(poles.imag + np.outer(FLANKS, poles.real)).ravel() / (2.0 * np.pi)
+    new = np.unique(np.concatenate([hz, around]))
+    new = new[np.diff(new, prepend=0.0) > SAME * new]  # twins would hide what lies beside them
     known = np.empty((0, 2))
     allowed, worst = 1.0, float(new[0])  # |δ| = 1 leaves no stiffness
     for _ in range(1 + ROUNDS):
@@ -77,7 +82,7 @@ def structured_bound(
                 allowed, worst = _largest(M[i], 1.0 / mu[i], allowed), float(new[i])
         known = known[np.argsort(known[:, 0])]
         at = int(np.searchsorted(known[:, 0], worst))
-        ends = known[max(at - 1, 0), 0], known[min(at + 1, len(known) - 1), 0]
+        ends = known[max(at - 2, 0), 0], known[min(at + 2, len(known) - 1), 0]
         sides = [np.linspace(a, b, FINE + 2)[1:-1] for a, b in ((ends[0], worst), (worst, ends[1]))]
         new = np.setdiff1d(np.concatenate(sides), known[:, 0])
     return StructuredBound(known[:, 0], known[:, 1], allowed, worst, kept.size)
