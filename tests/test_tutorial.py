@@ -1,0 +1,64 @@
+"""The tutorial followed literally: every file written, every command run, every figure compared."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "tutorial.md"
+BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?")
+
+
+def same(shown: str, printed: str) -> bool:
+    """Whether a printed line begins as the shown one, numbers to 0.2 %."""
+    if NUMBER.sub("#", printed)[: len(NUMBER.sub("#", shown))] != NUMBER.sub("#", shown):
+        return False
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=False)
+    return all(float(a) == pytest.approx(float(b), rel=2e-3, abs=1e-9) for a, b in pairs)
+
+
+def commands(block: str) -> list[tuple[str, list[str]]]:
+    """Each command of a console block with the lines shown under it."""
+    found: list[tuple[str, list[str]]] = []
+    for line in block.splitlines():
+        if line.startswith("$ "):
+            found.append((line[2:], []))
+        elif line != "...":
+            found[-1][1].append(line)
+    return found
+
+
+def test_comparison_of_lines_can_fail() -> None:
+    assert same("bandwidth     85.9878 Hz", "bandwidth     85.9 Hz   predicted 1 Hz")
+    assert not same("bandwidth     85.9878 Hz", "bandwidth     85.5 Hz")
+    assert not same("status        verified", "status        not_verified")
+
+
+def test_every_command_gives_what_the_page_shows(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    ran = 0
+    for kind, title, body in BLOCK.findall(PAGE.read_text()):
+        if title:
+            (tmp_path / title).write_text(body)
+        if kind != "console":
+            continue
+        for command, shown in commands(body):
+            name, *rest = command.split()
+            assert name == "python"
+            done = subprocess.run(
+                [sys.executable, *rest], cwd=tmp_path, env=environment, text=True,
+                capture_output=True, timeout=500,
+            )  # fmt: skip
+            assert done.returncode == 0, f"{command}: {done.stderr}"
+            printed = iter(done.stdout.splitlines())
+            for line in shown:
+                assert any(same(line, other) for other in printed), f"{command}: no line {line!r}"
+            ran += 1
+    assert ran == 7
+    for page in ("my_stage/report.html", "my_stage/insight.html", "my_robust/deploy/report.html"):
+        assert (tmp_path / page).exists()
