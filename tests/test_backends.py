@@ -1,5 +1,6 @@
 """Back ends against each other, with the certificate as judge; and life without them."""
 
+import json
 import os
 import subprocess
 import sys
@@ -186,6 +187,17 @@ def test_command_refuses_what_it_cannot_use(capsys: pytest.CaptureFixture[str]) 
         error = capsys.readouterr().err
         assert words in error
         assert error.count("\n") == 1
+
+
+def test_command_judges_a_finished_run(two_mass_run: Path, tmp_path: Path) -> None:
+    assert main([str(two_mass_run), "--quiet", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "cross_check.json").read_text())
+    result = json.loads((two_mass_run / "result.json").read_text())
+    assert found["theta"] == result["theta"]
+    ours = found["backends"]["riccati"]
+    assert ours["holds"]
+    assert ours["figures"]["bandwidth_hz"] == pytest.approx(result["bandwidth_hz"], rel=1e-6)
+    assert found["backends"]["slicot"]["holds"]
 
 
 EVERYTHING = """
