@@ -82,7 +82,7 @@ def test_closed_forms(A: object, B: object, C: object, D: object, norm: float) -
     assert hinf_norm(space(A, B, C, D))[0] == pytest.approx(norm, rel=1e-9)
 
 
-@few(max_examples=30)
+@few(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_norm_is_attained_and_nothing_on_a_grid_is_above(seed: int) -> None:
     system = random_system(seed)
@@ -93,7 +93,7 @@ def test_norm_is_attained_and_nothing_on_a_grid_is_above(seed: int) -> None:
     assert gains(system, grid).max() <= norm * (1.0 + 1e-9)
 
 
-@few(max_examples=30)
+@few(max_examples=15)
 @given(st.integers(0, 10**6))
 def test_norm_agrees_with_ab13dd(seed: int) -> None:
     slycot = pytest.importorskip("slycot")
