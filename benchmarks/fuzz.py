@@ -1,6 +1,6 @@
 """Thousands of inputs that nobody should give, each through the real command: none may break it.
 
-`python benchmarks/fuzz.py [--count 10000] [--seed 0] [--out fuzz.jsonl]` goes on from what the file
+`python benchmarks/fuzz.py [--count 10000] [--seed 0] [--out FILE]` goes on from what the file
 holds, and sums it up in benchmarks/fuzz.json. `--only N` runs one input and shows what it prints.
 The inputs are made by tests/fuzz_inputs.py. Four fifths of the solves leave their pictures out.
 """
@@ -98,6 +98,7 @@ def main() -> None:
     """Run what is missing, write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=10_000)
+    parser.add_argument("--start", type=int, default=0, help="number of the first one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("fuzz.jsonl"))
     parser.add_argument("--only", type=int)
@@ -113,7 +114,7 @@ def main() -> None:
     known = {json.loads(line)["number"] for line in options.out.read_text().splitlines()}
     process: Process | None = None
     with options.out.open("a") as stream:
-        for number in range(options.count):
+        for number in range(options.start, options.start + options.count):
             if number in known:
                 continue
             if process is None or process.done == FRESH or not process.process.is_alive():

@@ -27,8 +27,18 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 CASE = ROOT / "runs" / "two_mass.toml"
-KILLS_A_STORY = 5
+QUICK = """
+[sampling]
+points = 3
+lifted_points = 16
+[outer]
+starts = 4
+direct_starts = 2
+max_refinements = 3
+"""
+KILLS_A_STORY = 8
 SAME = 1e-6
+SHARES = {"sampling": 0.25, "solving": 0.45, "retraining": 0.3}
 FILES = ("controller.json", "surrogate.json", "case.toml")
 SAMPLING = f"""
 import sys
@@ -43,8 +53,8 @@ if __name__ == "__main__":
     with SampleStore(sys.argv[1] + "/samples.sqlite") as store, Workers(2) as workers:
         truth = Truth(problem, store, workers)
         rng = np.random.default_rng(0)
-        truth.bandwidths(rng.uniform(55.0, 70.0, (60, 2)))
-        truth.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (80, 4)))
+        truth.bandwidths(rng.uniform(55.0, 70.0, (30, 2)))
+        truth.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (40, 4)))
 """
 
 
@@ -102,7 +112,8 @@ def sampling(folder: Path, number: int) -> list[str]:
 def solving(folder: Path, number: int) -> list[str]:
     """The whole command, each formulation in turn."""
     formulation = ("nested", "lifted", "direct")[number % 3]
-    words = ["-m", "ccd_casadi.solve", str(CASE), "--out", str(folder), "--quiet"]
+    case = folder.parent / "quick.toml"
+    words = ["-m", "ccd_casadi.solve", str(case), "--out", str(folder), "--quiet"]
     workers = str(1 + number // 3 % 2)
     return [sys.executable, *words, "--formulation", formulation, "--workers", workers]
 
@@ -122,11 +133,12 @@ def begun(kind: str, folder: Path) -> None:
     """A folder to start in."""
     folder.mkdir()
     (folder.parent / "sampling.py").write_text(SAMPLING)
+    (folder.parent / "quick.toml").write_text(CASE.read_text() + QUICK)
     if kind == "retraining":
         from ccd_casadi.retraining import open_run
         from surrogates import design
 
-        shutil.copy(CASE, folder / "case.toml")
+        shutil.copy(folder.parent / "quick.toml", folder / "case.toml")
         with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
             truth.evaluate(design("sobol", truth.lower, truth.upper, 16, 0))
 
@@ -230,9 +242,9 @@ def main() -> None:
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="kills_") as name:
         place = Path(name)
-        for index, (kind, tally) in enumerate(tallies.items()):
+        for kind, tally in tallies.items():
             rng = random.Random(f"{options.seed} {kind}")
-            share = options.kills * (index + 1) // 3 - options.kills * index // 3
+            share = round(options.kills * SHARES[kind])
             plain: dict[int, tuple[Path, float]] = {}
             number = 0
             while tally.kills < share:

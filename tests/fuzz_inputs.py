@@ -244,7 +244,7 @@ def case_file(rng: random.Random, folder: Path, run: Path) -> Input:
 
 def _some_command(rng: random.Random, path: Path, family: str, note: str) -> Input:
     out = ["--out", str(path.parent / "run")]
-    kind = rng.choices(["one", "inner", "solve"], [12, 5, 1])[0]
+    kind = rng.choices(["one", "inner", "solve"], [70, 20, 1])[0]
     theta = ["--theta", "m1=60,m2=60", *out]
     if kind == "one":
         hz = ["--omega-s-hz", f"{10 ** rng.uniform(0, 4):.3g}"]
@@ -678,7 +678,7 @@ def run_folder(rng: random.Random, folder: Path, run: Path) -> Input:
     copy = Path(shutil.copytree(run, folder / "run"))
     (copy / "index.html").write_text("<html>")
     note = "; ".join(spoil_folder(rng, copy) for _ in range(rng.choice([1, 1, 1, 2])))
-    kind = rng.choices(["read", "solve", "retrain", "insight", "surrogate"], [20, 4, 2, 3, 4])[0]
+    kind = rng.choices(["read", "solve", "retrain", "insight", "surrogate"], [200, 3, 1, 2, 3])[0]
     quick = ["--workers", "1", "--quiet"]
     if kind == "read":
         return Input("folder", "read", [str(copy)], note)
@@ -754,10 +754,10 @@ def valid(rng: random.Random, folder: Path, run: Path) -> Input:
 Maker = Callable[[random.Random, Path, Path], Input]
 FAMILIES: dict[str, tuple[float, Maker]] = {
     "case": (36, case_file),
-    "theta": (12, theta),
+    "theta": (18, theta),
     "plant": (22, plant),
-    "folder": (20, run_folder),
-    "fault": (2, faulty),
-    "interrupt": (2, interrupted),
-    "valid": (6, valid),
+    "folder": (16, run_folder),
+    "fault": (0.3, faulty),
+    "interrupt": (0.3, interrupted),
+    "valid": (3, valid),
 }

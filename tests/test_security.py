@@ -2,27 +2,26 @@
 even that; nothing is stored or read as code; no name in a file leads out of the run folder."""
 
 import ast
+import importlib
 import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.compare import main as compare
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner_command import main as inner
-from ccd_casadi.insight import main as insight
 from ccd_casadi.plant import PlantError
 from ccd_casadi.problem import plant_of
 from ccd_casadi.solve import main as solve
 from ccd_casadi.user_code import permit_user_code, time_limit
 from surrogates import SurrogateFileError, load
-from surrogates.retrain import main as retrain
 from surrogates.truth import TruthError, opener_of
 
 ROOT = Path(__file__).parent.parent
@@ -61,33 +60,36 @@ def trapped_run(two_mass_run: Path, trap: Path) -> Path:
 # ---- user code -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("command", "more"),
-    [
-        (solve, ["--quiet"]),
-        (compare, ["--quiet"]),
-        (inner, ["--theta", "m1=60,m2=60"]),
-        (insight, ["--quiet"]),
-        (retrain, ["--quiet"]),
-    ],
-    ids=["solve", "compare", "inner", "insight", "retrain"],
+OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy.__main__", "ccd_casadi.robustness.__main__",
+            "surrogates.retrain"}  # fmt: skip
+COMMANDS = sorted(
+    {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts)
+        for p in SOURCES
+        if "return run(command, " in p.read_text()
+    }
+    | {"surrogates.retrain"}
 )
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_no_user_code_refuses_a_plant_function_and_runs_nothing_of_it(
-    trapped_run: Path,
-    trap: Path,
-    capsys: pytest.CaptureFixture[str],
-    command: Callable[[list[str]], int],
-    more: list[str],
+    trapped_run: Path, trap: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
-    of_a_run = command in (insight, retrain)
-    words = [str(trapped_run if of_a_run else trap), *more, "--no-user-code"]
-    assert command(words) == 2
+    module = importlib.import_module(name)
+    words = [str(trapped_run if name in OF_A_RUN else trap), "--no-user-code"]
+    words += ["--theta", "m1=60,m2=60"] if "inner" in name else ["--quiet"]
+    assert module.main(words) == 2
     output, errors = capsys.readouterr()
     assert output == ""
     assert len(errors.splitlines()) == 1
     assert "trap.py:f is code, which --no-user-code refuses" in errors
-    assert ("case.toml" if of_a_run else "trap.toml") in errors
+    assert ("case.toml" if name in OF_A_RUN else "trap.toml") in errors
     assert not list(trap.parent.rglob("executed"))
+
+
+def test_all_commands_are_found() -> None:
+    assert {"ccd_casadi.solve", "ccd_casadi.inner_command", *OF_A_RUN} <= set(COMMANDS)
 
 
 def test_models_of_the_package_are_no_user_code(capsys: pytest.CaptureFixture[str]) -> None:
@@ -243,6 +245,85 @@ def test_a_surrogate_file_of_another_kind_is_not_built(tmp_path: Path) -> None:
         path.write_text(json.dumps({"schema": "surrogates/2", "surrogates": [record], "extra": {}}))
         with pytest.raises(SurrogateFileError):
             load(path)
+
+
+# ---- pages --------------------------------------------------------------------------------------
+
+HOSTILE = "kg</td></pre><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\\\frac$ {0} %s"
+PLANT = """
+import casadi as ca
+
+def f(theta, note, table):
+    m = theta["m"]
+    return {
+        "mass": ca.diag(ca.vertcat(m, 20.0)), "stiffness": 2e7 * ca.DM([[1, -1], [-1, 1]]),
+        "damping_ratio": 0.02, "input": ca.DM([1, 0]), "output": ca.DM([[1, 0]]),
+        "hardware_cost": m, "constraints": {note: m - 19.0},
+    }
+"""
+
+
+class Page(HTMLParser):
+    """Elements and attributes of a page, for what would run or fetch something."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.active: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for key, value in attrs:
+            if key.startswith("on") or (key in ("src", "href") and not str(value).startswith("#")):
+                self.active.append(f"{tag} {key}={value}")
+        if tag in ("script", "img", "iframe", "object", "link", "embed", "form", "base"):
+            self.active.append(tag)
+
+
+@pytest.fixture(scope="module")
+def hostile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with markup in every text that a case may hold, and in the name of its folder."""
+    place = tmp_path_factory.mktemp("hostile") / "<img src=x onerror=alert(3)> & b"
+    place.mkdir()
+    (place / "plant.py").write_text(PLANT)
+    text = (ROOT / "runs" / "two_mass.toml").read_text()
+    quoted = json.dumps(HOSTILE)
+    head = f'[plant]\nfunction = "plant.py:f"\nnote = {quoted}\ntable = [{quoted}]\n'
+    theta = f"[theta.m]\nlower = 10.0\nupper = 20.0\nunit = {quoted}\n"
+    quick = "\n[sampling]\nlifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1\n"
+    case = place / "<b>case.toml"
+    rest = text[text.index("[objective]") :].replace("S_max = 1.75", "S_max = 1.9")
+    case.write_text(f"# {HOSTILE}\n{head}{theta}{rest}{quick}")
+    words = ["--out", str(place / "run"), "--quiet", "--workers", "1", "--formulation", "lifted"]
+    assert solve([str(case), *words]) in (0, 4)
+    return place / "run"
+
+
+def pages_are_inert(folder: Path, least: int) -> None:
+    pages = sorted(folder.rglob("*.html"))
+    assert len(pages) >= least
+    for page in pages:
+        text = page.read_text()
+        assert Page(text).active == [], page.name
+        assert "<script>alert" not in text
+    assert any("&lt;script&gt;alert(1)" in page.read_text() for page in pages), "shown as text"
+
+
+def test_reports_show_markup_as_text(hostile_run: Path) -> None:
+    pages_are_inert(hostile_run, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["insight", "deploy.__main__", "robustness.__main__", "compare"])
+def test_every_other_report_shows_markup_as_text(
+    hostile_run: Path, tmp_path: Path, name: str
+) -> None:
+    module = importlib.import_module(f"ccd_casadi.{name}")
+    more = {"insight": ["--points", "2"]}.get(name, [])
+    given = hostile_run / "case.toml" if name == "compare" else hostile_run
+    words = [str(given), "--out", str(tmp_path / "<i>out"), "--quiet", "--workers", "1", *more]
+    assert module.main(words) in (0, 4)
+    pages_are_inert(tmp_path, 1)
 
 
 # ---- dependencies --------------------------------------------------------------------------------
