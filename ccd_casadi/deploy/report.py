@@ -70,7 +70,7 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
 
 
 def _percent(value: float, reference: float) -> str:
-    return f"{100.0 * (value / reference - 1.0):+.2f} %"
+    return f"{round(100.0 * (value / reference - 1.0), 2) + 0.0:+.2f} %"
 
 
 def _loop(run: FinishedRun, found: Deployment) -> str:
@@ -134,8 +134,8 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
         f"up to half the sampling rate. There the controller's gain is "
-        f"{number(float(controllers[2][-1]), 3)} N/m (reduced: "
-        f"{number(float(controllers[1][-1]), 3)}, full: {number(float(controllers[0][-1]), 3)}): "
+        f"{controllers[2][-1]:.3g} N/m (reduced: {controllers[1][-1]:.3g}, full: "
+        f"{controllers[0][-1]:.3g}): "
         "that is what sensor noise and unmodelled resonances meet."
     )
     return figure_html(svg, caption, table)
@@ -146,8 +146,10 @@ def _gain(response: np.ndarray) -> Array:
 
 
 def _spread(hz: Array, low: float) -> list[int]:
-    wanted = np.geomspace(max(low, hz[0]), hz[-1], SHOWN)
-    return sorted({int(np.abs(hz - f).argmin()) for f in wanted})
+    """Places of frequencies from `low` on, evenly spread over the axis."""
+    first = int(np.searchsorted(hz, low))
+    wanted = np.geomspace(hz[first], hz[-1], SHOWN)
+    return sorted({first + int(np.abs(hz[first:] - f).argmin()) for f in wanted})
 
 
 def _facts(run: FinishedRun, found: Deployment) -> str:
