@@ -319,7 +319,9 @@ def problem_of(case: Case) -> CoDesignProblem:
         file = str((case.path.parent / name).resolve())
     options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
     problem = CoDesignProblem(
-        source=PlantSource(case.plant.model, file, function, options, case.limits.plant_seconds),
+        source=PlantSource(
+            case.plant.model, file, function, options, case.limits.plant_seconds
+        ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
         lower=tuple(p.lower for p in case.theta),

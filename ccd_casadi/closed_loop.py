@@ -1,5 +1,7 @@
 """Measure and certify any controller on any plant: the judge that all back ends share."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
@@ -8,8 +10,10 @@ from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant, StateSpace
-from ccd_casadi.synthesis import DesignFigures, figures_from_row
+from ccd_casadi.synthesis import Design, DesignFigures, Outcome, figures_from_row
 from ccd_casadi.weights import Weights
+
+ROUNDING = 1e-6  # relative: what the conversion to SI may change of a norm and of a bandwidth
 
 
 def measure(
@@ -44,6 +48,22 @@ def measure(
         row,
     )
     return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+
+
+def handed_out(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
+    """The design, no longer certified where the numbers of its controller in SI do not carry it.
+
+    What is certified in a synthesis is the controller in the plant's own units. Where the loop
+    hangs on digits that doubles do not have (a plant of gain 10¹², for instance), the controller
+    that a user gets is another one: it is certified again as it is given away.
+    """
+    if not made.figures.certified:
+        return made
+    gamma = made.figures.gamma * (1.0 + ROUNDING)
+    again = measure(plant, made.controller, made.weights, gamma=gamma, omega_low=omega_low)
+    if again.certified and abs(again.bandwidth / made.figures.bandwidth - 1.0) <= ROUNDING:
+        return made
+    return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
 
 
 def local_peaks(plant: ScaledPlant, controller: StateSpace) -> list[tuple[float, float]]:

@@ -6,10 +6,12 @@ beside the samples that it determines.
 
 import hashlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +39,21 @@ class PlantSource:
     function: str | None
     options: tuple[tuple[str, object], ...]
     seconds: float = 60.0  # that a function may take; no part of what the plant is
+    content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
+
+    def pinned(self) -> "PlantSource":
+        """The same, with the hash of its file's content: a process must not keep an older one."""
+        if self.file is None or self.content is not None:
+            return self
+        try:
+            content = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+        except OSError as error:
+            raise PlantError(f"{self.file}: cannot be read: {error.strerror}") from None
+        return replace(self, content=content)
 
     def identity(self) -> dict[str, object]:
         """What determines the plant; a file counts by its content, not by where it lies."""
-        digest = None
-        if self.file is not None:
-            digest = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+        digest = self.pinned().content
         options = dict(self.options)
         data = DATA.get(self.model or "")
         if data is not None:
@@ -143,7 +154,7 @@ def plant_of(problem: CoDesignProblem) -> Plant:
     if problem.source.model is not None:
         return _known_plant(problem.source, problem.names)
     require_user_code(f"{problem.source.file}:{problem.source.function}")
-    return _own_plant(problem.source, problem.names, problem.lower, problem.upper)
+    return _own_plant(problem.source.pinned(), problem.names, problem.lower, problem.upper)
 
 
 @lru_cache(maxsize=8)
@@ -161,20 +172,40 @@ def _own_plant(
     return own_plant(_own_function(source), names, dict(source.options), lower, upper)
 
 
+class _PlantFile(SourceFileLoader):
+    """A plant's file, read once: what runs is the text that was hashed.
+
+    Bytecode beside it is neither used nor written: it could be of an older text, or of another.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("user_plant_" + path.stem, str(path))
+        self._text = path.read_bytes()
+        self.digest = hashlib.sha256(self._text).hexdigest()
+
+    def get_data(self, path: str) -> bytes:
+        return self._text
+
+    def path_stats(self, path: str) -> Mapping[str, Any]:
+        raise OSError("no bytecode")
+
+
 def _own_function(source: PlantSource) -> ModelFunction:
     assert source.file is not None
     assert source.function is not None
     path = Path(source.file)
-    spec = importlib.util.spec_from_file_location("user_plant_" + path.stem, path)
-    if spec is None or spec.loader is None:
-        raise UserError(f"{path}: not a Python file; name a file.py")
+    loader = _PlantFile(path)
+    if loader.digest != source.content:
+        raise UserError(f"{path}: was changed since the case was read; give the command again")
+    spec = importlib.util.spec_from_loader(loader.name, loader)
+    assert spec is not None
     module = importlib.util.module_from_spec(spec)
     late = PlantError(
         f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
         "mend it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
-        limited(spec.loader.exec_module, source.seconds, late)(module)
+        limited(loader.exec_module, source.seconds, late)(module)
         function = limited(getattr, source.seconds, late)(module, source.function, None)
     except PlantError:
         raise

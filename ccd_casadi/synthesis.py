@@ -33,6 +33,7 @@ class Outcome(StrEnum):
     NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
+    LOST_IN_ROUNDING = "the controller in SI is not certified again: the loop hangs on lost digits"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.closed_loop import measure
+from ccd_casadi.closed_loop import handed_out, measure
 from ccd_casadi.direct import acceptable, polish
 from ccd_casadi.inner import active_constraints
 from ccd_casadi.kkt import KktCertificate, kkt_certificate
@@ -89,6 +89,7 @@ def verify(truth: Truth, x: Array) -> VerifiedDesign:
         omega_low=problem.inner.omega_low,
         gamma_backoff=problem.inner.gamma_backoff,
     )
+    final = handed_out(plant, final, problem.inner.omega_low)
     free = replace(problem, suspension=Suspension(0.0, 0.0))
     unsuspended = measure(
         scaled_plant(free, theta),

@@ -643,6 +643,8 @@ def spoil_folder(rng: random.Random, folder: Path) -> str:
     ]
     name = rng.choice(files)
     path = folder / name
+    if not path.is_file():
+        return f"{name}: spoilt already"
     kind = rng.choices(["inside", "bytes", "gone", "folder", "link", "other"], [10, 4, 1, 1, 1, 1])[
         0
     ]

@@ -70,11 +70,20 @@ class Ending:
 class Bench:
     """A place to run inputs in, one at a time, with a finished run to spoil copies of."""
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place: Path, run: Path | None = None) -> None:
+        """`run`: the finished run, made here where it is not given."""
         self.place = place
         place.chmod(0o755)
+        self.references: dict[str, dict[str, Any]] = {}
         self.base = place / "base" / "run"
         self.base.parent.mkdir()
+        if run is not None:
+            shutil.copytree(run, self.base)
+            versions = Versions(self.base)
+            facts = {"samples": 1, "errors": {}, "at_optimum": None, "objective": None}
+            versions.add(load(run / "surrogate.json")[0], {}, **facts, created="")  # type: ignore[arg-type]
+            (self.base / "retrain.jsonl").write_text('{"event": "start", "spent": 1}\n')
+            return
         case = self.base.parent / "case.toml"
         case.write_text(toml(case_data()))
         quick = ["--workers", "1", "--quiet"]
@@ -82,10 +91,9 @@ class Bench:
         with _without_pictures(True):
             assert captured("solve", words).code == 0
             assert captured("retrain", [str(self.base), "--budget", "4", *quick]).code in (0, 4)
-        self.references: dict[str, dict[str, Any]] = {}
 
-    def judged(self, seed: str, keep: bool = False) -> dict[str, Any]:
-        """Make the input of a seed, run it, and say what is wrong, if anything."""
+    def judged(self, seed: str, keep: bool = False, only: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Make the input of a seed, run it (if its command is among `only`), say what is wrong."""
         folder = self.place / "input"
         folder.mkdir()
         began = time.perf_counter()
@@ -93,6 +101,8 @@ class Bench:
         try:
             given = make(seed, folder, self.base)
             verdict |= {"family": given.family, "command": given.command, "note": given.note}
+            if only and given.command not in only:
+                return verdict
             if keep:
                 verdict |= {"argv": given.argv, "fault": given.fault, "amount": given.amount}
             ending = self._ended(given, folder)

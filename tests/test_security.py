@@ -3,7 +3,11 @@ even that; nothing is stored or read as code; no name in a file leads out of the
 
 import ast
 import importlib
+import importlib.util
 import json
+import os
+import pickle
+import py_compile
 import shutil
 import subprocess
 import sys
@@ -18,7 +22,7 @@ from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.errors import UserError
 from ccd_casadi.inner_command import main as inner
 from ccd_casadi.plant import PlantError
-from ccd_casadi.problem import plant_of
+from ccd_casadi.problem import _own_plant, plant_of
 from ccd_casadi.solve import main as solve
 from ccd_casadi.user_code import permit_user_code, time_limit
 from surrogates import SurrogateFileError, load
@@ -103,6 +107,38 @@ def test_a_plant_that_was_built_before_is_refused_too(trap: Path) -> None:
     with permit_user_code(allowed=False), pytest.raises(UserError, match="refuses"):
         plant_of(problem)
     plant_of(problem)  # and allowed again afterwards
+
+
+def test_an_edited_plant_is_not_the_one_kept_in_memory(trap: Path) -> None:
+    """In a notebook, or on a Dask worker that lives longer than a run."""
+    path = trap.parent / "trap.py"
+    first = problem_of(load_case(trap))
+    before = plant_of(first).hardware
+    path.write_text(TRAP.replace("0.01)", '0.01) | {"hardware_cost": 7 * theta["m1"]}'))
+    second = problem_of(load_case(trap))
+    assert first.identity() != second.identity()
+    assert float(plant_of(second).hardware([60.0, 60.0])[0]) == 420.0
+    assert plant_of(first).hardware is before
+    copied = pickle.loads(pickle.dumps(first))  # as a worker gets it
+    _own_plant.cache_clear()
+    with pytest.raises(UserError, match="was changed since the case was read"):
+        plant_of(copied)
+
+
+def test_bytecode_beside_a_plant_is_neither_run_nor_written(trap: Path) -> None:
+    """It may say something else than the file that a careful colleague reads."""
+    path = trap.parent / "trap.py"
+    evil = trap.parent / "evil.py"
+    evil.write_text("raise RuntimeError('bytecode ran')\n")
+    stamp = path.stat().st_mtime
+    evil.write_bytes(evil.read_bytes().ljust(path.stat().st_size, b"\n"))
+    os.utime(evil, (stamp, stamp))
+    cached = Path(importlib.util.cache_from_source(str(path)))
+    py_compile.compile(str(evil), cfile=str(cached), dfile=str(path), doraise=True)
+    plant_of(problem_of(load_case(trap)))
+    cached.unlink()
+    plant_of(problem_of(load_case(trap)))
+    assert not cached.exists()
 
 
 def test_checking_a_case_executes_nothing(trap: Path) -> None:

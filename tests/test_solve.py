@@ -498,6 +498,18 @@ def test_a_plant_that_fails_at_some_theta_is_refused(
     assert line.startswith(f"{path}: plant: ")
 
 
+def test_a_design_that_rounding_destroys_is_not_verified(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Found by fuzzing: a plant of gain 1e12, whose loop hangs on digits that doubles lack."""
+    plant = GOOD.replace("ca.DM([1, 0])", "ca.DM([[1e12, 0], [0, 0]])")
+    path = plant_file(tmp_path, model(plant))
+    words = ["--theta", "m1=60,m2=60", "--omega-s-hz", "56.462161732861716"]
+    assert inner([str(path), *words, "--omega-t-hz", "292.4017738213266"]) == 4
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "not_verified"
+
+
 def test_lost_workers_leave_a_run_to_be_resumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
