@@ -243,6 +243,24 @@ def test_the_summary_says_what_matters(
     assert str(folder) in found["run"]
 
 
+@pytest.mark.parametrize("formulation", ["nested", "lifted"])
+def test_the_result_does_not_depend_on_the_number_of_workers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
+) -> None:
+    """To the last bit, seconds aside; the pool is started although the work is short."""
+    monkeypatch.setattr("ccd_casadi.solve.PATIENCE", 0.0)
+    quick = "\n[sampling]\npoints = 2\nlifted_points = 12\n[outer]\nstarts = 2\n"
+    case = changed(tmp_path, more=quick + "max_refinements = 0\n")
+    for workers in ("1", "2"):
+        words = ["--out", str(tmp_path / workers), "--quiet", "--formulation", formulation]
+        assert main([str(case), *words, "--workers", workers]) in (0, 4)
+    one, two = (read(tmp_path / workers) for workers in ("1", "2"))
+    assert one.pop("seconds") > 0.0 < two.pop("seconds")
+    assert one == two
+    for name in ("controller.json", "surrogate.json", "case.toml"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
 # ---- constraints, and cases that cannot be solved ------------------------------------------------
 
 
