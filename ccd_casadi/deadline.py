@@ -4,8 +4,12 @@ Compiled code that loops cannot be interrupted from Python; its process can. Wha
 the pipe is pickled between this process and its own child, and never stored.
 """
 
+import math
 import multiprocessing
 import pickle
+import resource
+import signal
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -18,6 +22,7 @@ from ccd_casadi.parallel import answered
 P = ParamSpec("P")
 R = TypeVar("R")
 
+GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
 STARTING = 60.0  # seconds that the process itself may take to come up
 _SPAWN = multiprocessing.get_context("spawn")
 
@@ -53,7 +58,7 @@ class Runner:
         """
         pipe = self._ready()
         try:
-            pipe.send_bytes(pickle.dumps((_apply, (function, args, kwargs))))
+            pipe.send_bytes(pickle.dumps((_apply, (seconds, function, args, kwargs))))
             if not pipe.poll(seconds):
                 raise Overrun(f"no answer within {seconds:g} s")
             done, value = pickle.loads(pipe.recv_bytes())
@@ -92,16 +97,20 @@ class Runner:
 
 
 def _apply(task: tuple) -> object:
-    function, args, kwargs = task
+    """The call, and the end of this process should it go on when its parent is gone."""
+    seconds, function, args, kwargs = task
+    spent = math.ceil(time.process_time() + seconds + GRACE)
+    resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     return function(*args, **kwargs)
 
 
 def _serve(pipe: Connection) -> None:
     """Answer until the pipe ends; a first message says that the process is up."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's to deal with
     try:
         with threadpool_limits(limits=1):
             pipe.send_bytes(b"")
             while True:
                 pipe.send_bytes(answered(pipe.recv_bytes()))
-    except (EOFError, OSError, KeyboardInterrupt):
+    except (EOFError, OSError):
         return

@@ -1,7 +1,11 @@
 """Calls that never return are ended, and the next one is served."""
 
 import os
+import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -31,3 +35,39 @@ def test_results_errors_overruns_and_deaths() -> None:
         assert last not in (first, os.getpid())
     with pytest.raises(ProcessLookupError):
         os.kill(last, 0)
+
+
+LOOP = """
+import os
+import sys
+from pathlib import Path
+from ccd_casadi.deadline import Runner
+
+def forever(path):
+    Path(path).write_text(str(os.getpid()))
+    while True:
+        pass
+
+if __name__ == "__main__":
+    with Runner() as runner:
+        runner.call(5.0, forever, sys.argv[1])
+"""
+
+
+@pytest.mark.slow
+def test_what_loops_ends_after_its_parent_was_killed(tmp_path: Path) -> None:
+    script, note = tmp_path / "loop.py", tmp_path / "pid"
+    script.write_text(LOOP)
+    parent = subprocess.Popen([sys.executable, str(script), str(note)])
+    while not note.exists() or not note.read_text():
+        time.sleep(0.01)
+    child = int(note.read_text())
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    for _ in range(6000):
+        status = Path(f"/proc/{child}/stat")
+        if not status.exists() or status.read_text().rsplit(")")[1].split()[0] == "Z":
+            return
+        time.sleep(0.1)
+    os.kill(child, signal.SIGKILL)
+    pytest.fail("it still runs")
