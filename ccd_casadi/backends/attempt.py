@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Protocol
 
 from ccd_casadi.backends.standard_plant import StandardPlant
-from ccd_casadi.optional import MissingPackage, require
+from ccd_casadi.optional import require
 from ccd_casadi.scaling import StateSpace
 
 
@@ -44,14 +44,6 @@ class Backend:
             require(package, self.extra)
         solve: Solver = import_module(self.module).solve
         return solve
-
-    def missing(self) -> str:
-        """Why it cannot be used here; empty where it can."""
-        try:
-            self.solver()
-        except MissingPackage as error:
-            return str(error)
-        return ""
 
 
 SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot", "ccd_casadi.backends.slicot")
