@@ -46,10 +46,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     code, answer, controller = _design(problem, theta, point)
     answer = head | answer | {"syntheses": syntheses}
     answer["objective"] = problem.w1 * cost + problem.w2 * HZ * (answer["bandwidth_hz"] or 0.0)
-    _print(answer, rows, options, began)
-    if options.out is not None:
+    if options.out is not None:  # before anything is printed: it may be refused
         folder = run_folder(options.case, options.out)
         write_json(folder / "controller.json", controller)
+    _print(answer, rows, options, began)
     return code
 
 

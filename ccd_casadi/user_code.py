@@ -5,6 +5,7 @@ asks here first.
 """
 
 import functools
+import inspect
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -85,7 +86,7 @@ def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Ca
     def call(*arguments: Any, **options: Any) -> Any:
         with time_limit(seconds, late):
             try:
-                return function(*arguments, **options)
+                value = function(*arguments, **options)
             except (KeyboardInterrupt, _Late):
                 raise
             except BaseException as error:
@@ -93,5 +94,9 @@ def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Ca
                 if isinstance(error, Exception) and words != type(error).__name__:
                     raise
                 raise type(late)(f"the function raised {words}; mend it") from None
+        if inspect.iscoroutine(value):
+            value.close()  # else Python warns that nobody awaited it
+            raise type(late)("the function is an async one; write a plain def")
+        return value
 
     return call

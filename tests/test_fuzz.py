@@ -7,7 +7,7 @@ import pytest
 from fuzz_inputs import case_file, plant, theta
 from fuzz_judge import Bench, Ending, misbehaviour
 
-QUICK = 160  # seeds; those whose command is neither inner nor a reading of a folder are left out
+QUICK = 120  # seeds; those whose command is neither inner nor a reading of a folder are left out
 AT_A_TIME = 40
 
 

@@ -179,6 +179,12 @@ def test_a_plant_that_hangs_is_ended_in_one_line(
     assert not trap.with_suffix("").exists()
 
 
+def test_an_async_function_is_no_plant(trap: Path) -> None:
+    (trap.parent / "trap.py").write_text("async def f(theta): return {}\n")
+    with pytest.raises(UserError, match="write a plain def"):
+        problem_of(load_case(trap))
+
+
 def test_an_import_that_hangs_is_ended_too(trap: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (trap.parent / "trap.py").write_text("while True: pass\n")
     trap.write_text(trap.read_text() + "\n[limits]\nplant_seconds = 0.2\n")

@@ -243,7 +243,7 @@ def test_the_summary_says_what_matters(
     assert str(folder) in found["run"]
 
 
-@pytest.mark.parametrize("formulation", ["nested", "lifted"])
+@pytest.mark.parametrize("formulation", ["lifted", pytest.param("nested", marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
 ) -> None:
