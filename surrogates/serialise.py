@@ -94,14 +94,14 @@ def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str,
         raise SurrogateFileError(f"{path}: not a complete JSON file ({error})") from error
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema not in READABLE:
-        raise SurrogateFileError(f"{path}: expected schema {SCHEMA!r}, found {schema!r}")
+        raise SurrogateFileError(f"{path}: expected schema {SCHEMA!r}, found {schema!r:.60}")
     try:
         members = [_member(record) for record in document["surrogates"]]
         extra = document["extra"]
         if not isinstance(extra, dict):
             raise TypeError("extra is not an object")
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise SurrogateFileError(f"{path}: damaged record ({error!r})") from error
+        raise SurrogateFileError(f"{path}: damaged record ({error!r:.300})") from error
     return tuple(members), extra
 
 
