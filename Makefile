@@ -12,7 +12,7 @@ solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
 test: setup-test lint docs
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 lint: setup-test
 	$(BIN)/ruff check .

@@ -10,7 +10,6 @@ section 3.3.2; Jones, Schonlau & Welch, J. Global Optim. 13 (1998), eq. 4 to 6.
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
-from scipy.optimize import minimize
 
 from surrogates.interface import Array
 from surrogates.kernels import Hyperparameters, Kernel, radial, separations
@@ -36,6 +35,8 @@ def polished(kernel: Kernel, X: Array, targets: Array, found: Hyperparameters) -
         except LinAlgError:
             # A wall: large and flat, so that the line search backs off.
             return 1e10, np.zeros(d)
+
+    from scipy.optimize import minimize  # slow to import, and only fitting needs it
 
     limits = [tuple(np.log(LENGTH_BOUNDS))] * d
     starts = [found.length_scales, *(np.full(d, value) for value in STARTS)]

@@ -172,7 +172,7 @@ def test_mixed_sensitivity_plant_is_the_kernels_stack() -> None:
 
 
 def test_missing_package_is_named_with_its_remedy() -> None:
-    backend = Backend("none", "none", ("no_such_package",), "slicot", "no.such.module")
+    backend = Backend("none", "none", ("no_such_package",), "slicot")
     with pytest.raises(MissingPackage, match=r"pip install 'ccd-casadi\[slicot\]'"):
         backend.solver()
 

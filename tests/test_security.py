@@ -30,7 +30,9 @@ from surrogates.truth import TruthError, opener_of
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
-LIVE = {"ccd_casadi/parallel.py", "ccd_casadi/cluster.py"}  # pipes between processes of one run
+# Pipes between the processes of one run.
+LIVE = {"ccd_casadi/parallel.py", "ccd_casadi/cluster.py", "ccd_casadi/deadline.py"}
+OPTIONAL = "ccd_casadi/optional.py"  # imports optional packages by names that sources spell out
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()
@@ -72,6 +74,7 @@ COMMANDS = sorted(
         for p in SOURCES
         if "return run(command, " in p.read_text()
     }
+    - {"ccd_casadi.imported.__main__"}  # takes a folder of matrices or results, no case
     | {"surrogates.retrain"}
 )
 
@@ -82,7 +85,7 @@ def test_no_user_code_refuses_a_plant_function_and_runs_nothing_of_it(
 ) -> None:
     module = importlib.import_module(name)
     words = [str(trapped_run if name in OF_A_RUN else trap), "--no-user-code"]
-    words += ["--theta", "m1=60,m2=60"] if "inner" in name else ["--quiet"]
+    words += ["--theta", "m1=60,m2=60"] if "inner" in name or "cross" in name else ["--quiet"]
     assert module.main(words) == 2
     output, errors = capsys.readouterr()
     assert output == ""
@@ -245,7 +248,10 @@ def test_no_source_reads_code_from_data() -> None:
         name = path.relative_to(ROOT).as_posix()
         for called, node in calls(path):
             seen.append(called)
-            assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
+            if (name, called) != (OPTIONAL, "import_module"):
+                assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
+            if called == "require" and name != "ccd_casadi/backends/attempt.py":  # its constants
+                assert isinstance(node.args[0], ast.Constant), f"{name}:{node.lineno}"
             for keyword in node.keywords:
                 if keyword.arg in ("allow_pickle", "shell"):
                     assert ast.unparse(keyword.value) == "False", f"{name}:{node.lineno}"

@@ -430,9 +430,16 @@ def test_exact_samples_are_polished_about_their_own_mean() -> None:
     Y = np.exp(X @ [1.0, 0.8, 0.5, 0.0, 0.1, 0.3])
     gp = fit(X, Y, lower=[0] * 6, upper=[1] * 6, kernel="rbf", noise=0.0)
     samples = checked(X, Y, [0] * 6, [1] * 6, None, 0.0)
-    at = profile_likelihood._negative(
+    found = profile_likelihood.polished(
+        Kernel.RBF, samples.unit, samples.targets, gp.hyperparameters
+    ).length_scales
+    value, slope = profile_likelihood._negative(Kernel.RBF, samples.unit, samples.targets, found)[
+        :2
+    ]
+    before = profile_likelihood._negative(
         Kernel.RBF, samples.unit, samples.targets, gp.hyperparameters.length_scales
-    )
-    assert np.abs(at[1][gp.hyperparameters.length_scales < 900]).max() < 0.05
+    )[0]
+    assert np.abs(slope[found < 900]).max() < 0.05
+    assert value <= before + 1e-9
     repeated = fit(np.repeat(X, 1, 0), np.ones(80), lower=[0] * 6, upper=[1] * 6, noise=0.0)
     assert repeated.predict(X[:3]) == pytest.approx(1.0)

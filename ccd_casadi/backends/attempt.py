@@ -1,7 +1,6 @@
 """What a back end returns: its claim, and the controller that is yet to be certified."""
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Protocol
 
 from ccd_casadi.backends.standard_plant import StandardPlant
@@ -36,16 +35,20 @@ class Backend:
     title: str
     needs: tuple[str, ...]
     extra: str
-    module: str
 
     def solver(self) -> Solver:
         """Its solver. Raises MissingPackage where a package that it needs is not installed."""
         for package in self.needs:
             require(package, self.extra)
-        solve: Solver = import_module(self.module).solve
-        return solve
+        if self.name == "slicot":
+            from ccd_casadi.backends import slicot  # it imports this module
+
+            return slicot.solve
+        from ccd_casadi.backends import lmi
+
+        return lmi.solve
 
 
-SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot", "ccd_casadi.backends.slicot")
-LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi", "ccd_casadi.backends.lmi")
+SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot")
+LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi")
 GENERAL = (SLICOT, LMI)
