@@ -132,7 +132,7 @@ class Cluster:
                     del flying[index]
                     self._waits.append(time.monotonic() - flight.submitted)
                     flight.abandon()
-                    done, value = pickle.loads(answer)
+                    done, value = pickle.loads(answer)  # of a worker that runs our code anyway
                     if not done:
                         raise value
                     yield value

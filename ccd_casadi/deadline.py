@@ -61,7 +61,7 @@ class Runner:
             pipe.send_bytes(pickle.dumps((_apply, (seconds, function, args, kwargs))))
             if not pipe.poll(seconds):
                 raise Overrun(f"no answer within {seconds:g} s")
-            done, value = pickle.loads(pipe.recv_bytes())
+            done, value = pickle.loads(pipe.recv_bytes())  # our own child wrote it
         except (EOFError, OSError):
             self._end()
             raise Overrun("the process died") from None

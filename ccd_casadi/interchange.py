@@ -143,7 +143,7 @@ def read_mat(path: Path) -> DesignFile:
         raise UserError(f"{path}: there is no such file") from None
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except NotImplementedError:
+    except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
         words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader

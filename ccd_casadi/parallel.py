@@ -151,7 +151,7 @@ class Workers:
                     waiting.appendleft(index)
                     continue
                 self._feed(function, tasks, waiting, running)
-                done, value = pickle.loads(answer)
+                done, value = pickle.loads(answer)  # our own child wrote it, into its pipe
                 if not done:
                     raise value
                 yield value
@@ -258,7 +258,7 @@ def _serve(pipe: connection.Connection) -> None:
 def answered(message: bytes) -> bytes:
     """The pickled (True, result) or (False, exception) of a pickled (function, task)."""
     try:
-        function, task = pickle.loads(message)
+        function, task = pickle.loads(message)  # of the parent, through our pipe
         return pickle.dumps((True, function(task)))
     except BaseException as error:
         text = "".join(traceback.format_exception(error))

@@ -19,6 +19,7 @@ from ccd_casadi.deploy.sections import Section, sections_of
 from ccd_casadi.scaling import StateSpace
 
 HZ = 2.0 * np.pi
+# `make test` needs no compiler on a bare machine; where there is none only this is left out.
 compiled = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
 
