@@ -24,7 +24,9 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from fuzz_inputs import ROOT, Input, case_data, make, toml
+from fuzz_cases import case_data, toml
+from fuzz_inputs import make
+from fuzz_values import ROOT, Input
 from helpers import (
     HZ,
     dense_grid,

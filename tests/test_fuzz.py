@@ -4,8 +4,9 @@ import random
 from pathlib import Path
 
 import pytest
-from fuzz_inputs import case_file, plant, theta
+from fuzz_cases import case_file, theta
 from fuzz_judge import Bench, Ending, misbehaviour
+from fuzz_plants import plant
 
 QUICK = 120  # seeds; those whose command is neither inner nor a reading of a folder are left out
 AT_A_TIME = 40
