@@ -41,7 +41,11 @@ GRADIENT_TESTS = (
     ("tests/test_derivatives.py", "prototype or fixed_controller or sharp or drown"),
     ("tests/test_derivatives.py", "both_limits"),
 )
-STORE_TESTS = (("tests/test_samples.py", ""), ("tests/test_sampling.py", ""))
+STORE_TESTS = (
+    ("tests/test_samples.py", ""),
+    ("tests/test_damaged_stores.py", ""),
+    ("tests/test_sampling.py", ""),
+)
 PLANT_TESTS = (
     ("tests/test_plant.py", ""), ("tests/test_weights.py", ""), ("tests/test_channels.py", ""),
     ("tests/test_synthesis.py", ""), ("tests/test_certificate.py", ""),
