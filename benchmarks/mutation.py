@@ -1,11 +1,17 @@
 """Mutation testing of the numerical core: a seeded sample of mutants, and which the tests kill.
 
     python benchmarks/mutation.py --mutants 150 --seed 0
+    python benchmarks/mutation.py --survivors        # these again, after new tests
 
 Each mutant is one changed operator, comparison, constant or condition in a copy of the sources;
-the tests of its module run on it until one fails. Kernels run as plain Python (`interpreted`), as
-compiling each mutant would take minutes. Results go to benchmarks/mutation.json after every
-mutant; the same command goes on from there. Survivors are listed for reading.
+the tests of its group (`mutation_tests`) run on it until one fails, the cheapest first. Kernels
+run as plain Python (`interpreted`), as compiling each mutant would take minutes. The sources as
+they are have to pass first: tests that fail on these would kill everything. A mutant that takes
+four times the processor time of the unchanged sources, and 30 s more, is counted as timed out.
+
+Results go to benchmarks/mutation.json after every mutant; the same command goes on from there. A
+mutant is known by its function and what changes there, so that edits elsewhere leave the sample
+as it is. Survivors are for reading: what they are is written in their field "why" by hand.
 """
 
 import argparse
@@ -14,90 +20,76 @@ import copy
 import json
 import os
 import random
+import re
 import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+from mutation_tests import GROUPS, Group
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = Path(__file__).with_suffix(".json")
-LIMIT = 200  # s of processor time for one test file; an endless loop counts as killed
-
-KERNEL_TESTS = (
-    ("tests/test_weights.py", ""),
-    ("tests/test_certificate.py", ""),
-    ("tests/test_synthesis.py", "published or prototype or guess or sweep or unmeasured"),
-    ("tests/test_sensitivity.py", ""),
-    ("tests/test_synthesis.py", "units or lower_bound or coordinates"),
-    ("tests/test_channels.py", "not stage"),
-    ("tests/test_synthesis.py", "flexible_plants_are_certified and not sixty"),
-)
-GRADIENT_TESTS = (
-    ("tests/test_derivatives.py", "prototype or fixed_controller or sharp or drown"),
-    ("tests/test_derivatives.py", "both_limits"),
-)
-STORE_TESTS = (
-    ("tests/test_samples.py", ""),
-    ("tests/test_damaged_stores.py", ""),
-    ("tests/test_sampling.py", ""),
-)
-PLANT_TESTS = (
-    ("tests/test_plant.py", ""), ("tests/test_weights.py", ""), ("tests/test_channels.py", ""),
-    ("tests/test_synthesis.py", ""), ("tests/test_certificate.py", ""),
-    ("tests/test_sensitivity.py", ""), ("tests/test_derivatives.py", ""),
-)  # fmt: skip
-TARGETS: dict[str, tuple[tuple[str, str], ...]] = {
-    **{
-        f"ccd_casadi/kernels/{name}.py": KERNEL_TESTS
-        for name in (
-            "riccati", "gamma", "certificate", "closed_loop", "generalized_plant", "frequency",
-            "sensitivity", "design", "refine",
-        )
-    },
-    **{
-        f"ccd_casadi/kernels/{name}.py": GRADIENT_TESTS
-        for name in ("gradients", "pullback", "bound_peak")
-    },
-    **{
-        f"ccd_casadi/{name}.py": PLANT_TESTS
-        for name in ("modal", "scaling", "synthesis", "closed_loop", "weights", "derivatives")
-    },
-    "ccd_casadi/samples.py": STORE_TESTS,
-    "ccd_casadi/sampling.py": STORE_TESTS,
-}  # fmt: skip
+MEMORY = 6 << 30  # bytes: a mutant may ask for any array
 SWAPS: dict[type, type] = {
     ast.Lt: ast.GtE, ast.LtE: ast.Lt, ast.Gt: ast.LtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
     ast.Pow: ast.Mult, ast.And: ast.Or, ast.Or: ast.And,
 }  # fmt: skip
 CALLS = {"min": "max", "max": "min"}
+SCOPES = (ast.FunctionDef, ast.ClassDef)
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: file, line, what it was and what it became; `index` counts the file's sites."""
+    """One change: in which file and function, the how-manyth of its kind there, and the line."""
 
     path: str
-    index: int
-    line: int
+    scope: str
     before: str
     after: str
+    nth: int
+    line: int
+
+    @property
+    def key(self) -> str:
+        """What it is known by; a line may move."""
+        return f"{self.path} {self.scope} {self.before} -> {self.after} #{self.nth}"
 
 
-def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, ast.AST]]:
-    """(node, its mutated copy) of every place that can be changed, in order."""
-    skipped = _texts_and_types(tree)
-    for node in ast.walk(tree):
-        if id(node) in skipped:
-            continue
-        changed = _mutated(node)
+# ---- what can be changed -------------------------------------------------------------------------
+
+
+def sites(node: ast.AST, scope: str = "") -> Iterator[tuple[str, ast.AST, ast.AST]]:
+    """(function, node, its mutated copy) of every place that changes a number or a decision."""
+    for child in _numbers_and_decisions(node):
+        changed = _mutated(child)
         if changed is not None:
-            yield node, changed
+            yield scope, child, changed
+        inner = f"{scope}.{child.name}".lstrip(".") if isinstance(child, SCOPES) else scope
+        yield from sites(child, inner)
+
+
+def _numbers_and_decisions(node: ast.AST) -> Iterator[ast.AST]:
+    """Children without annotations, messages (raise, assert, f-strings) and `__all__`."""
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.Raise | ast.Assert | ast.JoinedStr):
+                continue
+            if isinstance(child, ast.Assign) and ast.unparse(child.targets[0]) == "__all__":
+                continue
+            if isinstance(child, ast.AST):
+                yield child
 
 
 def _mutated(node: ast.AST) -> ast.AST | None:
@@ -119,101 +111,135 @@ def _mutated(node: ast.AST) -> ast.AST | None:
     return new
 
 
-def _texts_and_types(tree: ast.Module) -> set[int]:
-    """Annotations and raised messages: what changes there changes no number."""
-    found: set[int] = set()
-    for node in ast.walk(tree):
-        parts: list[ast.AST | None] = []
-        if isinstance(node, ast.FunctionDef):
-            parts = [node.returns, *(a.annotation for a in node.args.args + node.args.kwonlyargs)]
-        elif isinstance(node, ast.AnnAssign):
-            parts = [node.annotation]
-        elif isinstance(node, ast.Raise | ast.Assert):
-            parts = [node]
-        for part in parts:
-            if part is not None:
-                found |= {id(inner) for inner in ast.walk(part)}
-    return found
+def mutants(path: str) -> list[Mutant]:
+    """Every mutant of a file."""
+    return [mutant for mutant, *_ in _numbered(path, ast.parse((ROOT / path).read_text()))]
 
 
-def mutants(path: str) -> list[tuple[Mutant, str]]:
-    """Every mutant of a file with its source text."""
-    tree = ast.parse((ROOT / path).read_text())
-    found = []
-    for index, (node, changed) in enumerate(sites(tree)):
-        place = _Replace(node, changed)
-        text = ast.unparse(ast.fix_missing_locations(place.visit(copy.copy(tree))))
-        place.undo()
-        before, after = (ast.unparse(part).split("\n")[0][:90] for part in (node, changed))
-        found.append((Mutant(path, index, getattr(node, "lineno", 0), before, after), text))
-    return found
+def _numbered(path: str, tree: ast.Module) -> Iterator[tuple[Mutant, ast.AST, ast.AST]]:
+    seen: Counter[tuple[str, str, str]] = Counter()
+    for scope, node, changed in sites(tree):
+        before, after = (ast.unparse(part).split("\n")[0] for part in (node, changed))
+        seen[scope, before, after] += 1
+        nth = seen[scope, before, after]
+        yield Mutant(path, scope, before, after, nth, getattr(node, "lineno", 0)), node, changed
 
 
 class _Replace(ast.NodeTransformer):
-    """Puts `new` where `old` stands, and back: the tree is shared by all mutants."""
-
     def __init__(self, old: ast.AST, new: ast.AST) -> None:
         self.old, self.new = old, new
-        self.places: list[tuple[ast.AST, str, int | None]] = []
 
     def visit(self, node: ast.AST) -> ast.AST:
-        for name, value in ast.iter_fields(node):
-            if value is self.old:
-                setattr(node, name, self.new)
-                self.places.append((node, name, None))
-            elif isinstance(value, list):
-                for i, item in enumerate(value):
-                    if item is self.old:
-                        value[i] = self.new
-                        self.places.append((node, name, i))
-                    elif isinstance(item, ast.AST):
-                        self.visit(item)
-            elif isinstance(value, ast.AST):
-                self.visit(value)
-        return node
-
-    def undo(self) -> None:
-        for node, name, i in self.places:
-            if i is None:
-                setattr(node, name, self.old)
-            else:
-                getattr(node, name)[i] = self.old
+        return self.new if node is self.old else self.generic_visit(node)
 
 
-def judge(mutant: Mutant, text: str, work: Path) -> tuple[str, str, float]:
-    """'killed' or 'survived', by which test file, in how many seconds."""
-    target = work / mutant.path
-    original = target.read_text()
-    began = time.perf_counter()
-    target.write_text(text)
-    try:
-        for file, words in TARGETS[mutant.path]:
-            if not _passes(work, mutant.path, file, words):
-                return "killed", file, time.perf_counter() - began
-    finally:
-        target.write_text(original)
-    return "survived", "", time.perf_counter() - began
+def text_of(mutant: Mutant) -> str:
+    """The file's source with this one change."""
+    tree = ast.parse((ROOT / mutant.path).read_text())
+    (node, changed), *_ = [
+        pair for found, *pair in _numbered(mutant.path, tree) if found.key == mutant.key
+    ]
+    return ast.unparse(ast.fix_missing_locations(_Replace(node, changed).visit(tree)))
 
 
-def _passes(work: Path, path: str, file: str, words: str) -> bool:
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", file]
-    if words:
-        command += ["-k", words]
-    if "/kernels/" in path:
-        command[3:3] = ["-p", "interpreted"]
-    environment = os.environ | {
-        "PYTHONPATH": f"{work}{os.pathsep}{work / 'benchmarks'}",
-        "OPENBLAS_NUM_THREADS": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    done = subprocess.run(
-        command,
-        cwd=work,
-        env=environment,
-        capture_output=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT)),
-    )
-    return done.returncode == 0
+def sample(count: int, seed: int) -> list[Mutant]:
+    """`count` mutants of all files, each as likely; another file's edits do not change the draw."""
+    everything = [item for group in GROUPS for path in group.files for item in mutants(path)]
+    drawn = sorted(everything, key=lambda m: random.Random(f"{seed} {m.key}").random())[:count]
+    last = GROUPS[-1].files
+    return sorted(drawn, key=lambda m: m.path in last)
+
+
+# ---- what the tests say --------------------------------------------------------------------------
+
+
+class Judge:
+    """The tests of one group in a copy of the sources, which must pass on these as they are."""
+
+    def __init__(self, group: Group, folder: Path) -> None:
+        self.group = group
+        self.order = folder / f"order{GROUPS.index(group)}.json"
+        self.work = folder / ("interpreted" if group.interpreted else "compiled")
+        self.cache = folder / "numba"
+        fresh = not self.work.exists()
+        if fresh:
+            ignored = shutil.ignore_patterns(".venv", ".git", "site", "runs/*/", ".*_cache")
+            shutil.copytree(ROOT, self.work, ignore=ignored)
+        self.texts = {
+            path: ast.unparse(ast.parse((ROOT / path).read_text())) for path in group.files
+        }
+        for path, text in self.texts.items():
+            (self.work / path).write_text(text)
+        if group.interpreted and fresh:
+            self._run(None)  # compiles the LAPACK wrappers, which is not to count
+            self.order.unlink(missing_ok=True)
+        began, used = time.perf_counter(), _children()
+        failed, said = self._run(None)
+        if failed:
+            raise SystemExit(
+                f"{', '.join(group.files)}: unchanged, {failed}; mend the test or leave it out\n"
+                + said[-3000:]
+            )
+        self.limit = int(4.0 * (_children() - used)) + 30
+        self.seconds = time.perf_counter() - began
+
+    def verdict(self, mutant: Mutant) -> tuple[str, str]:
+        """'killed', 'timed out' or 'survived', and by which test."""
+        place = self.work / mutant.path
+        place.write_text(text_of(mutant))
+        try:
+            by, _ = self._run(self.limit)
+        finally:
+            place.write_text(self.texts[mutant.path])
+        if by == "the limit of time":
+            return "timed out", ""
+        return ("killed", by) if by else ("survived", "")
+
+    def _run(self, limit: int | None) -> tuple[str, str]:
+        """What failed first ('' if nothing), and all that pytest said."""
+        plugins = ["cheapest_first", *(["interpreted"] if self.group.interpreted else [])]
+        words = [part for name in plugins for part in ("-p", name)]
+        command = [sys.executable, "-m", "pytest", *words, "-x", "-p", "no:cacheprovider"]
+        command += ["--tb=short", *self.group.tests]
+        if self.group.words:
+            command += ["-k", self.group.words]
+        environment = os.environ | {
+            "PYTHONPATH": f"{self.work}{os.pathsep}{self.work / 'benchmarks'}",
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "MUTATION_ORDER": str(self.order),
+        }
+        if self.group.interpreted:  # a cache beside the kernels is dropped when one changes
+            environment["NUMBA_CACHE_DIR"] = str(self.cache)
+
+        def limits() -> None:
+            resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+
+        process = subprocess.Popen(
+            command, cwd=self.work, env=environment, text=True, preexec_fn=limits,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+        try:
+            said, _ = process.communicate(timeout=None if limit is None else 3 * limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            said, _ = process.communicate()
+        if process.returncode == 0:
+            return "", said
+        if process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+            return "the limit of time", said
+        found = re.search(r"^(?:FAILED|ERROR) (.*?)(?: - .*)?$", said, re.MULTILINE)
+        return (found[1] if found else f"pytest ended with {process.returncode}"), said
+
+
+def _children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+# ---- the run -------------------------------------------------------------------------------------
 
 
 def main() -> None:
@@ -221,40 +247,53 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mutants", type=int, default=150)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="files with this in their path")
+    parser.add_argument("--survivors", action="store_true", help="judge these again")
     options = parser.parse_args()
-    everything = [item for path in TARGETS for item in mutants(path)]
-    rng = random.Random(options.seed)
-    sample = rng.sample(everything, min(options.mutants, len(everything)))
-    known = json.loads(RESULTS.read_text())["mutants"] if RESULTS.exists() else []
-    done = {(item["path"], item["before"], item["after"], item["line"]): item for item in known}
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"mutants": []}
+    done: dict[str, dict[str, Any]] = {item["key"]: item for item in known["mutants"]}
+    todo = [m for m in sample(options.mutants, options.seed) if options.only in m.path]
+    if options.survivors:
+        todo = [m for m in todo if done.get(m.key, {}).get("verdict") == "survived"]
+    else:
+        todo = [m for m in todo if m.key not in done]
+    judges: dict[Group, Judge] = {}
     with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder) / "work"
-        shutil.copytree(
-            ROOT, work, ignore=shutil.ignore_patterns(".venv", ".git", "site", "runs/*/")
-        )
-        began = time.perf_counter()
-        for count, (mutant, text) in enumerate(sample, 1):
-            key = (mutant.path, mutant.before, mutant.after, mutant.line)
-            if key not in done:
-                verdict, by, seconds = judge(mutant, text, work)
-                done[key] = asdict(mutant) | {"verdict": verdict, "by": by, "seconds": seconds}
-                _write(options, len(everything), [done[k] for k in done])
-                left = (time.perf_counter() - began) / count * (len(sample) - count)
-                change = f"{mutant.path}:{mutant.line} {mutant.before} -> {mutant.after}"
-                times = f"{seconds:.0f} s, {left / 60:.0f} min left"
-                print(f"{count}/{len(sample)} {verdict:8} {change} ({times})", flush=True)
-    killed = sum(item["verdict"] == "killed" for item in done.values())
-    print(f"{killed} of {len(done)} mutants killed ({100.0 * killed / len(done):.1f} %)")
+        for count, mutant in enumerate(todo, 1):
+            group = next(group for group in GROUPS if mutant.path in group.files)
+            if group not in judges:
+                judges[group] = Judge(group, Path(folder))
+                print(f"unchanged: {judges[group].seconds:.0f} s", *group.files, flush=True)
+            began = time.perf_counter()
+            verdict, by = judges[group].verdict(mutant)
+            seconds = round(time.perf_counter() - began, 1)
+            item = {"key": mutant.key} | asdict(mutant)
+            item |= {"verdict": verdict, "by": by, "seconds": seconds}
+            if mutant.key in done:
+                item["first"] = "survived"
+            if verdict == "survived" and "why" in done.get(mutant.key, {}):
+                item["why"] = done[mutant.key]["why"]
+            done[mutant.key] = item
+            _write(options.seed, list(done.values()))
+            change = f"{mutant.path}:{mutant.line} {mutant.before[:60]} -> {mutant.after[:60]}"
+            print(f"{count}/{len(todo)} {verdict:9} {change} ({seconds:.0f} s) {by}", flush=True)
+    print(json.dumps(_write(options.seed, list(done.values())), indent=1))
 
 
-def _write(options: argparse.Namespace, total: int, found: list[dict[str, object]]) -> None:
-    killed = sum(item["verdict"] == "killed" for item in found)
-    RESULTS.write_text(
-        json.dumps(
-            {"seed": options.seed, "sites": total, "killed": killed, "mutants": found}, indent=1
-        )
-        + "\n"
-    )
+def _write(seed: int, found: list[dict[str, Any]]) -> dict[str, int]:
+    verdicts = Counter(item["verdict"] for item in found)
+    before = Counter(item.get("first", item["verdict"]) for item in found)
+    figures = {
+        "seed": seed,
+        "mutants tried": len(found),
+        "killed": verdicts["killed"],
+        "timed out": verdicts["timed out"],
+        "survived": verdicts["survived"],
+        "survived, explained": sum("why" in i for i in found if i["verdict"] == "survived"),
+        "survived before the tests that they led to": before["survived"],
+    }
+    RESULTS.write_text(json.dumps(figures | {"mutants": found}, indent=1) + "\n")
+    return figures
 
 
 if __name__ == "__main__":

@@ -1,0 +1,67 @@
+"""Which tests judge the mutants of which file, and whether the kernels run as plain Python.
+
+What is left out of an interpreted group takes minutes there and does what another test of the
+group does too, on more examples.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Group:
+    """Tests of some files: pytest's arguments, words for -k, and plain Python or compiled."""
+
+    files: tuple[str, ...]
+    tests: tuple[str, ...]
+    words: str
+    interpreted: bool
+
+
+def _kernels(*names: str) -> tuple[str, ...]:
+    return tuple(f"ccd_casadi/kernels/{name}.py" for name in names)
+
+
+DESIGN_TESTS = tuple(
+    f"tests/test_{name}.py"
+    for name in ("weights", "certificate", "synthesis", "sensitivity", "channels")
+)
+DIFFERENCES = "two_mass_plant or both_limits"  # hundreds of syntheses each
+GROUPS = (
+    Group(
+        _kernels(
+            "certificate", "closed_loop", "generalized_plant", "frequency", "sensitivity",
+            "design", "refine", "small",
+        ),
+        (*DESIGN_TESTS, "tests/test_derivatives.py"),
+        f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
+        interpreted=True,
+    ),
+    Group(
+        _kernels("gradients", "pullback", "bound_peak"),
+        ("tests/test_derivatives.py", "tests/test_channels.py"),
+        "not both_limits",
+        interpreted=True,
+    ),
+    Group(
+        tuple(
+            f"ccd_casadi/{name}.py"
+            for name in ("modal", "scaling", "synthesis", "closed_loop", "weights", "derivatives")
+        ),
+        (*DESIGN_TESTS, "tests/test_plant.py", "tests/test_derivatives.py",
+         "tests/test_backends.py", "tests/test_robust_design.py", "tests/test_hard_plants.py"),
+        "",
+        interpreted=False,
+    ),
+    Group(
+        ("ccd_casadi/samples.py", "ccd_casadi/sampling.py"),
+        ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
+        "not killed and not ctrl_c",
+        interpreted=False,
+    ),
+    Group(
+        _kernels("riccati", "gamma"),
+        (*DESIGN_TESTS, "tests/test_derivatives.py"),
+        f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
+        interpreted=True,
+    ),
+)  # fmt: skip
