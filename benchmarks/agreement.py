@@ -22,7 +22,8 @@ def figures(siso: int, mimo: int, warm: bool) -> np.ndarray:
     """Rows of figures of random designs; with `warm` each starts from a γ_opt 1 % off."""
     from problems import BACKOFF, OMEGA_LOW, stage, two_masses, weights
 
-    from ccd_casadi.kernels.design import Figure, design
+    from ccd_casadi.kernels.design import design
+    from ccd_casadi.kernels.figures import Figure
 
     rng = np.random.default_rng(7)
     rows = []
@@ -45,7 +46,7 @@ def figures(siso: int, mimo: int, warm: bool) -> np.ndarray:
 
 def compare(old: np.ndarray, new: np.ndarray) -> None:
     """Print the largest relative differences over designs that both certify."""
-    from ccd_casadi.kernels.design import Code, Figure
+    from ccd_casadi.kernels.figures import Code, Figure
 
     for code in Code:
         a, b = (rows[:, Figure.CODE] == code for rows in (old, new))

@@ -19,7 +19,8 @@ from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.closed_loop import local_peaks
 from ccd_casadi.inner import sweep_inner
 from ccd_casadi.inner_search import search_inner
-from ccd_casadi.kernels.design import Code, Figure, design
+from ccd_casadi.kernels.design import design
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
 from ccd_casadi.problem import scaled_plant, true_inner

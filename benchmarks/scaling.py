@@ -7,7 +7,8 @@ import time
 
 from problems import BACKOFF, OMEGA_LOW, stage, weights
 
-from ccd_casadi.kernels.design import Code, Figure, design
+from ccd_casadi.kernels.design import design
+from ccd_casadi.kernels.figures import Code, Figure
 
 
 def main() -> None:

@@ -23,11 +23,12 @@ from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.inner import InnerProblem
 from ccd_casadi.inner_search import search_inner
-from ccd_casadi.kernels.design import Code, Figure, assess, design, sweep
+from ccd_casadi.kernels.design import assess, design, sweep
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.gamma import optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import stable_subspace
-from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 
 RESULTS = Path(__file__).with_name("results.json")
 
@@ -117,7 +118,7 @@ def floor(problem: Problem) -> float:
         plant.A, plant.B, plant.C, problem.weights.scaled(plant.omega_0)
     )
     H0 = lqr_hamiltonian(A, B2, C1, d2, C2.shape[0], B2.shape[1])
-    found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8)[0]
+    found = optimal_gamma(H0, B1, C1, d1, 0.5 * d1, 10.0, 1e-8, NOISE)[0]
     H = level_hamiltonian(H0, B1, C1, d1, (BACKOFF * found) ** 2 - d1**2)
     return best(lambda: [stable_subspace(H) for _ in range(20)], 2.0) / 20
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ccd_casadi.kernels.design import Figure, assess
+from ccd_casadi.kernels.design import assess
+from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
 from ccd_casadi.plant import Array

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.kernels.design import failed_row
 from ccd_casadi.kernels.gradients import design_with_gradients
 from ccd_casadi.off_design import Loop, off_design_gradients
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import DesignFigures, failed_row, figures_from_row, over_family
+from ccd_casadi.synthesis import DesignFigures, figures_from_row, over_family
 from ccd_casadi.weights import Weights
 
 MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple

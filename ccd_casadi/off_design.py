@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.kernels.design import Code, Figure
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.kernels.gradients import (
     _column,
@@ -54,7 +54,7 @@ def off_design_gradients(
     """
     count = dA.shape[0]
     out, fixed, gaps = np.full((4, count + 8), np.nan), np.full(count, np.nan), np.full(3, np.nan)
-    if row[Figure.CODE] != Code.CERTIFIED or len(loops) != 3:
+    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or len(loops) != 3:
         return out, fixed, gaps
     gp = generalized_plant(A, B, C, w)
     Ag, B1, B2, C1, C2, d1, d2 = gp

@@ -10,8 +10,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.design import Code, Figure, assess, design
+from ccd_casadi.kernels.design import assess, design
 from ccd_casadi.kernels.design import sweep as _sweep
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant, StateSpace
 from ccd_casadi.weights import Weights
@@ -98,10 +99,7 @@ def synthesise(
     w0 = plant.omega_0
     made_on = plant if plant.family is None else plant.family.design
     arguments = (made_on.A, made_on.B, made_on.C, weights.scaled(w0), made_on.grid, made_on.gain)
-    try:
-        row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, made_on.channels)
-    except np.linalg.LinAlgError:
-        row, Ak, Bk, Ck = failed_row(), *(np.full((1, 1), np.nan) for _ in range(3))
+    row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, made_on.channels)
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     if plant.family is not None:
         figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
@@ -122,18 +120,11 @@ def sweep(
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     w = weights.scaled(w0)
     numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels)
-
-    def one_by_one() -> list[DesignFigures]:
+    if plant.family is not None:
         points = [weights.at(float(s), float(t)) for s in S for t in T]
         options = {"omega_low": omega_low, "gamma_backoff": gamma_backoff}
         return [synthesise(plant, point, **options).figures for point in points]
-
-    if plant.family is not None:
-        return one_by_one()
-    try:
-        rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
-    except np.linalg.LinAlgError:  # one bad point must not take the others along
-        return one_by_one()
+    rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
     return [
         figures_from_row(rows[i, j], float(s), float(t), w0)
         for i, s in enumerate(S)
@@ -181,13 +172,6 @@ def over_family(
                     [Figure.PEAK, Figure.PEAK_FREQUENCY]
                 ]
     return figures_from_row(own, weights.omega_S, weights.omega_T, w0), worst
-
-
-def failed_row() -> Array:
-    """The row of a design whose linear algebra met an infinite or undefined number."""
-    row = np.full(int(Figure.COUNT), np.nan)
-    row[Figure.CODE], row[Figure.LIMITED_BY_BOUND] = float(Code.NOT_FINITE), 0.0
-    return row
 
 
 def figures_from_row(row: Array, omega_S: float, omega_T: float, omega_0: float) -> DesignFigures:

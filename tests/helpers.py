@@ -16,7 +16,8 @@ from scipy.linalg import sqrtm
 from scipy.optimize import brentq, minimize_scalar
 
 from ccd_casadi.inner import InnerProblem
-from ccd_casadi.kernels.design import Figure, assess
+from ccd_casadi.kernels.design import assess
+from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.modal import Suspension, modal_plant
 from ccd_casadi.models import MODELS
 from ccd_casadi.plant import Mechanics, Plant, build_plant, mechanics

@@ -1,9 +1,5 @@
-"""One design from end to end, compiled: γ_opt, controller, certificate, closed-loop figures.
+"""One design from end to end: γ_opt, controller, certificate, closed-loop figures; and sweeps."""
 
-The figures of a design are one row of numbers, in scaled units; `Figure` names the columns.
-"""
-
-from enum import IntEnum
 from math import exp, isnan, log, nan
 
 import numpy as np
@@ -11,65 +7,16 @@ import numpy as np
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop
 from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.kernels.lapack import eigenvalues, stable_subspace
-from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.kernels.lapack import eigenvalues
+from ccd_casadi.kernels.riccati import lqr_hamiltonian
 from ccd_casadi.kernels.sensitivity import bandwidth, peak, sensitivity_gain
-
-
-class Code(IntEnum):
-    """How a design ended; 0 is the only one that may be used."""
-
-    CERTIFIED = 0
-    GAMMA_NOT_CONVERGED = 1
-    RICCATI_FAILED = 2
-    NOT_FINITE = 3
-    UNSTABLE_LOOP = 4
-    NORM_EXCEEDED = 5
-    LEVEL_TEST_FAILED = 6
-    NO_BANDWIDTH = 7
-    EIGENVALUES_FAILED = 8
-    PEAK_NOT_CONFIRMED = 9
-
-
-class Figure(IntEnum):
-    """Columns of a row of figures; frequencies over ω₀, poles over ω₀."""
-
-    CODE = 0
-    GAMMA_OPT = 1
-    GAMMA_LOWER_BOUND = 2
-    GAMMA = 3
-    LIMITED_BY_BOUND = 4
-    SCHUR_FORMS = 5
-    BANDWIDTH = 6
-    PEAK = 7
-    PEAK_FREQUENCY = 8
-    LOW = 9
-    MAX_REAL_POLE = 10
-    NORM = 11
-    NORM_FREQUENCY = 12
-    COUNT = 13
-
+from ccd_casadi.kernels.synthesis import central_controller, synthesise
 
 _COUNT, _CODE, _GAMMA_OPT = int(Figure.COUNT), int(Figure.CODE), int(Figure.GAMMA_OPT)
-GAMMA_TOLERANCE = 1e-11
-
-
-@compiled
-def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
-    """A_K = A + B2 F - B1 C2, B_K = B1, C_K = F, F = -(B2ᵀX + D12ᵀC1)/d2², X at γ; and ok."""
-    p, m = C2.shape[0], B2.shape[1]
-    t = gamma**2 - d1**2
-    _, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
-    N = Ag.shape[0]
-    if not ok:
-        return np.zeros((N, N)), B1, np.zeros((m, N)), False
-    X = np.linalg.solve(np.ascontiguousarray(U1.T), np.ascontiguousarray(U2.T))
-    X = 0.5 * (X + X.T)
-    F = -(np.ascontiguousarray(B2.T) @ X + d2 * C1[p : p + m]) / d2**2
-    return Ag + B2 @ F - B1 @ C2, B1, F, True
+_BALANCED = int(Figure.BALANCED)
 
 
 @compiled
@@ -140,30 +87,6 @@ def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
         row[Figure.CODE] = Code.CERTIFIED.value
 
 
-@compiled
-def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
-    """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
-
-    The row's code is CERTIFIED where the controller may go on to be assessed.
-    """
-    row = np.full(_COUNT, np.nan)
-    Ag, B1, B2, C1, C2, d1, d2 = generalized_plant(A, B, C, w)
-    H0 = lqr_hamiltonian(Ag, B2, C1, d2, C.shape[0], B.shape[1])
-    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
-    gamma_opt, limited, forms, converged = optimal_gamma(
-        H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE
-    )
-    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, bound
-    row[Figure.LIMITED_BY_BOUND], row[Figure.SCHUR_FORMS] = limited, forms
-    Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, backoff * gamma_opt)
-    row[Figure.CODE] = Code.CERTIFIED.value
-    if not ok:
-        row[Figure.CODE] = Code.RICCATI_FAILED.value
-    if not converged:
-        row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
-    return row, Ak, Bk, Ck
-
-
 # Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
 # compiled kernels together: 2 % slower in Python, and half the time to compile.
 
@@ -172,20 +95,48 @@ def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=()):
     """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K.
 
     With `channels` the synthesis is done on these blocks; the certificate is the whole loop's.
+    What fails is tried once more in balanced coordinates, whole, and then counts if it passes.
     """
-    if channels:
-        row, Ak, Bk, Ck = _synthesise_channels(A, B, C, w, channels, backoff, guess)
-    else:
-        row, Ak, Bk, Ck = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
-    if row[_CODE] == 0.0:
-        Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-        assess(A, B, C, Ak, Bk, Ck, Dk, w, backoff * row[_GAMMA_OPT], omega_low, row)
+    plant = (A, B, C, w)
+    numbers = (grid, sigma, backoff, guess)
+    first = _attempt(plant, numbers, omega_low, channels, balanced=False)
+    if first[0][_CODE] in _PASSED:
+        return first
+    second = _attempt(plant, numbers, omega_low, (), balanced=True)
+    return second if second[0][_CODE] in _PASSED else first
+
+
+_PASSED = (Code.CERTIFIED, Code.NO_BANDWIDTH)  # the certificate holds; no crossing in the second
+
+
+def _attempt(plant, numbers, omega_low, channels, balanced):
+    A, B, C, w = plant
+    grid, sigma, backoff, guess = numbers
+    try:
+        if channels:
+            row, Ak, Bk, Ck = _synthesise_channels(A, B, C, w, channels, backoff, guess)
+        else:
+            row, Ak, Bk, Ck = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced)
+        row[_BALANCED] = balanced
+        if row[_CODE] == 0.0:
+            Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
+            assess(A, B, C, Ak, Bk, Ck, Dk, w, backoff * row[_GAMMA_OPT], omega_low, row)
+    except np.linalg.LinAlgError:  # an infinite or undefined number on the way
+        none = np.full((1, 1), nan)
+        return failed_row(), none, none, none
     return row, Ak, Bk, Ck
 
 
+def failed_row():
+    """The row of a design whose linear algebra met an infinite or undefined number."""
+    row = np.full(_COUNT, nan)
+    row[_CODE], row[Figure.LIMITED_BY_BOUND], row[_BALANCED] = float(Code.NOT_FINITE), 0.0, 0.0
+    return row
+
+
 def _synthesise_channels(A, B, C, w, channels, backoff, guess):
-    """As `_synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together."""
-    found = [_synthesise(c.A, c.B, c.C, w, c.grid, c.gain, backoff, guess) for c in channels]
+    """As `synthesise`, from the blocks: γ_opt is their largest, F at one γ is theirs together."""
+    found = [synthesise(c.A, c.B, c.C, w, c.grid, c.gain, backoff, guess, False) for c in channels]
     rows = np.array([item[0] for item in found])
     failed = np.flatnonzero(rows[:, Figure.CODE])
     if failed.size:

@@ -77,11 +77,11 @@ def gamma_lower_bound(G, w, grid, sigma):
 
 
 @compiled
-def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance):
+def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
     """γ_opt = max(γ_X, γ_jω) by safeguarded steps on f; at most 60 Schur forms.
 
-    `guess` starts the iteration (0: none). Returns γ_opt, whether γ_jω limits, the number of
-    Schur forms, and whether the search closed to the relative `tolerance` in γ.
+    `guess` starts the iteration (0: none), `noise` is the level's. Returns γ_opt, whether γ_jω
+    limits, the number of Schur forms, and whether it closed to the relative `tolerance` in γ.
     """
     # γ_jω itself puts eigenvalues on the axis: the test is made a hair above it.
     t_jw = max(gamma_jw**2 * (1 + 1e-7) - d1**2, 1e-12 * d1**2)
@@ -90,7 +90,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance):
     t = max(start**2 - d1**2, t_jw)
     tested = False
     for forms in range(1, 61):
-        f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t)
+        f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t, noise)
         if ok and f > 0.0:
             if t <= t_jw:
                 return gamma_jw, True, forms, True

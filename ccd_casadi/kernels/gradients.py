@@ -17,13 +17,14 @@ import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_peak
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.design import Code, Figure, design
+from ccd_casadi.kernels.design import design
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 from ccd_casadi.kernels.pullback import bound_gradient, gain_to_weights, to_plant, to_weights
-from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian, riccati_level
+from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
 
 
 @compiled
@@ -68,7 +69,7 @@ def gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency):
         A_, B_, C_, w_ = bound_gradient(A, B, C, w, bound_frequency)
         return A_, B_, C_, w_, True
     t = gamma_opt**2 - d1**2
-    _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t)
+    _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t, NOISE)
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
     Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lq, gp, t)
     A_, B_, C_ = to_plant(Ar, B2r, C1r, np.zeros((p, B1.shape[0])), f, C, m)
@@ -172,12 +173,13 @@ def design_with_gradients(
 
     Returns the row, A_K, B_K, C_K, G (4, n_θ + 8): derivatives to θ then to the scaled weight
     vector; fixed (n_θ): the paper's dω_b/dθ with K held; gaps (3) of σ_max at the frequencies.
-    The gradients are NaN where the design is not certified.
+    The gradients are NaN where the design is not certified, and where it needed balanced
+    coordinates: they are taken in the plant's own.
     """
     row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels)
     count = dA.shape[0]
     out, fixed, gaps = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
-    if row[Figure.CODE] != Code.CERTIFIED:
+    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
         return row, Ak, Bk, Ck, out, fixed, gaps
     gp = generalized_plant(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])

@@ -14,6 +14,8 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 
+NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level`
+
 
 @compiled
 def lqr_hamiltonian(A, B2, C1, d2, p, m):
@@ -50,12 +52,26 @@ def level_hamiltonian(H0, B1, C1, d1, t):
 
 
 @compiled
-def riccati_level(H0, B1, C1, d1, t):
+def projected(U1, U2):
+    """Singular vectors P, Q and values c of U1, and s_i = p_iᵀ U2 q_i: λ(X) = s/c at a root."""
+    P, c, Qt = np.linalg.svd(U1)
+    Q = np.ascontiguousarray(Qt.T)
+    M = U2 @ Q
+    s = np.zeros(c.size)
+    for i in range(c.size):
+        for j in range(c.size):
+            s[i] += P[j, i] * M[j, i]
+    return P, c, Q, s
+
+
+@compiled
+def riccati_level(H0, B1, C1, d1, t, noise):
     """f = λ_min(X⁻¹) and f' = df/dt from one ordered Schur form; ok False on the jω axis.
 
     With U1 = P c Qᵀ, q and p the singular vectors of one singular value, λ(X) = s/c,
     s = pᵀ U2 q, and f' = qᵀ Z q/(s t)² where T11ᵀ Z + Z T11 = -VᵀV, V = [Sᵀ B1ᵀ][U1; U2].
-    No inverse of U1, so the formula holds at γ_opt itself, where X is infinite.
+    No inverse of U1, so the formula holds at γ_opt itself, where X is infinite. Directions with
+    |s| up to `noise` do not count: an (almost) unobservable state has λ(X) = 0 of either sign.
     Returns f, f', ok and (H(t), T11, U1, U2, V, Z, q, p, c), the frame at t.
     """
     N, p = B1.shape
@@ -63,17 +79,12 @@ def riccati_level(H0, B1, C1, d1, t):
     T11, U1, U2, _, ok = stable_subspace(H)
     if not ok:
         return -np.inf, 0.0, False, (H, T11, U1, U2, U1, U1, np.zeros(N), np.zeros(N), 0.0)
-    P, c, Qt = np.linalg.svd(U1)
-    Q = np.ascontiguousarray(Qt.T)
-    M = U2 @ Q
+    P, c, Q, s = projected(U1, U2)
     f, s_best, index = np.inf, 1.0, N - 1
     for i in range(N):
-        s = 0.0
-        for j in range(N):
-            s += P[j, i] * M[j, i]
-        # |s| = |λ|/√(1+λ²): an (almost) unobservable state has λ(X) = 0 of either sign.
-        if abs(s) > 1e-7 and c[i] / s < f:
-            f, s_best, index = c[i] / s, s, i
+        # |s| = |λ|/√(1+λ²)
+        if abs(s[i]) > noise and c[i] / s[i] < f:
+            f, s_best, index = c[i] / s[i], s[i], i
     q, left = Q[:, index].copy(), P[:, index].copy()
     V = d1 * (C1[:p] @ U1) + np.ascontiguousarray(B1.T) @ U2
     Z = lyapunov_triangular(T11, -(V.T @ V), True)
@@ -83,14 +94,20 @@ def riccati_level(H0, B1, C1, d1, t):
 
 @compiled
 def _singularity(U1, U2, Z, q, p):
-    """g of [[U1 - U2 Z, p], [qᵀ, 0]][v; g] = [0; 1]: zero where U1 - U2 Z is singular."""
+    """g of [[U1 - U2 Z, p], [qᵀ, 0]][v; g] = [0; 1]: zero where U1 - U2 Z is singular.
+
+    NaN where it is singular in a second direction too, or not finite.
+    """
     N = U1.shape[0]
     M, right = np.zeros((N + 1, N + 1)), np.zeros(N + 1)
     M[:N, :N] = U1 - U2 @ Z
     for i in range(N):
         M[i, N], M[N, i] = p[i], q[i]
     right[N] = 1.0
-    return np.linalg.solve(M, right)[N]
+    try:
+        return np.linalg.solve(M, right)[N]
+    except Exception:  # numba names no others
+        return np.nan
 
 
 @compiled
@@ -102,7 +119,8 @@ def root_nearby(B1, C1, d1, frame, δ):
         T11ᵀ Z + Z T11 = -δ (V + W Z)ᵀ(V + W Z) - Z G Z,   W = [Sᵀ B1ᵀ][-U2; U1].
 
     Z is taken to δ³, one triangular Lyapunov equation a term, and the root of the smooth scalar
-    that vanishes with det(U1 - U2 Z) found by the secant method, from the estimate δ.
+    that vanishes with det(U1 - U2 Z) found by the secant method, from the estimate δ; NaN where
+    that scalar cannot be had.
     """
     H, T11, U1, U2, V, Z1, q, p, c = frame
     N, outputs = B1.shape
