@@ -2,7 +2,7 @@
 
 Python raises KeyboardInterrupt between two instructions of whatever runs. Three places need care:
 imports (nothing has begun: the process just ends), finalizers (the exception is printed and lost),
-and compiled code (it comes out as another exception).
+and compiled code (it comes out as another exception, with or without a trace of the first).
 """
 
 import _thread
@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 AGAIN = 0.01  # s
+_pressed = threading.Event()
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
@@ -36,10 +37,25 @@ def begun() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def _press(number: int, frame: FrameType | None) -> None:
+    _pressed.set()
+    signal.default_int_handler(number, frame)
+
+
 @contextmanager
 def ctrl_c_noticed() -> Iterator[None]:
-    """Within the block, a Ctrl-C that came where nothing can be raised is sent once more."""
+    """Within the block every Ctrl-C is remembered for `was_ctrl_c`, the last block's that is.
+
+    One that came where nothing can be raised is sent once more.
+    """
     before, active = sys.unraisablehook, True
+    _pressed.clear()
+    ours = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if ours:
+        signal.signal(signal.SIGINT, _press)
 
     def again() -> None:
         if active:
@@ -60,10 +76,17 @@ def ctrl_c_noticed() -> Iterator[None]:
     finally:
         active = False
         sys.unraisablehook = before
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def was_ctrl_c(error: BaseException | None) -> bool:
-    """Whether an exception is a KeyboardInterrupt, or was raised in place of one."""
+    """Whether an exception is a KeyboardInterrupt, or was raised in place of one.
+
+    After a Ctrl-C every one counts: libraries drop the interrupt and stumble over its traces.
+    """
+    if _pressed.is_set():
+        return True
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

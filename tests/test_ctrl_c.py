@@ -4,9 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+
+from surrogates.ctrl_c import ctrl_c_noticed, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.
@@ -37,3 +40,18 @@ def test_a_library_leaves_ctrl_c_alone() -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     assert "default_int_handler" in done.stdout
+
+
+def test_what_stumbles_over_a_dropped_ctrl_c_counts_as_one() -> None:
+    """Compiled libraries drop the interrupt, and fail later by what it left undone."""
+    with ctrl_c_noticed():
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+            raise AssertionError("not interrupted")
+        error = ValueError("what it left undone")
+    assert was_ctrl_c(error)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with ctrl_c_noticed():
+        pass
+    assert not was_ctrl_c(error), "an earlier command's Ctrl-C is no excuse for the next"
+    assert was_ctrl_c(KeyboardInterrupt())
