@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 Check = Callable[[Any], str | None]
+LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
 
 
 def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
@@ -16,8 +17,11 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
             return f"is {shown(value)}, not a number; {remedy}"
         if too_large(value) or not math.isfinite(value):
             return f"is {shown(value)}; {remedy}"
-        inside = low < value < high or (closed and value == low)
-        return None if inside else f"is {value:g}; {remedy}"
+        if not (low < value < high or (closed and value == low)):
+            return f"is {value:g}; {remedy}"
+        if abs(value) > LARGEST or (not closed and 0.0 in (low, high) and abs(value) < SMALLEST):
+            return f"is {value:g}; give a size from {SMALLEST:g} to {LARGEST:g}, in another unit"
+        return None
 
     return check
 

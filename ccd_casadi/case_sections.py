@@ -82,7 +82,9 @@ class InnerSection:
     omega_low_hz: float = _key(POSITIVE)
     omega_S_hz: tuple[float, float] = _key(interval)
     omega_T_hz: tuple[float, float] = _key(interval)
-    gamma_backoff: float = _key(ABOVE_ONE, 1.02)
+    gamma_backoff: float = _key(
+        number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"), 1.02
+    )
     sweep_points: tuple[int, int] = _key(points, (20, 20))
     method: str = _key(choice("search", "sweep"), "search")
 

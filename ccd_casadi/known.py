@@ -66,8 +66,13 @@ def known_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Ar
     slack = SAME * (upper - lower)
     found = []
     for item in keys:
-        row = known[item]
-        if len(row.theta) != len(problem.names) or len(row.gradients or ()) != 4 * len(lower):
+        row = known.get(item)
+        # an index that names what the table has not is damage too
+        if (
+            row is None
+            or len(row.theta) != len(problem.names)
+            or len(row.gradients or ()) != 4 * len(lower)
+        ):
             raise store.damaged()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
         if (x >= lower - slack).all() and (x <= upper + slack).all():

@@ -495,7 +495,7 @@ cases = st.fixed_dictionaries(
                 "omega_S_hz": ranges, "omega_T_hz": ranges,
             },
             optional={
-                "gamma_backoff": above_one,
+                "gamma_backoff": st.floats(1.001, 9.0),
                 "sweep_points": st.lists(st.integers(2, 50), min_size=2, max_size=2),
             },
         ),

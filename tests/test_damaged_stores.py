@@ -2,6 +2,8 @@
 
 import os
 import random
+import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -13,7 +15,9 @@ import pytest
 from rows import sample
 
 from ccd_casadi import samples as module
+from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.errors import UserError
+from ccd_casadi.known import known_designs
 from ccd_casadi.samples import SampleStore, SampleStoreError
 
 
@@ -178,3 +182,21 @@ def test_a_lock_that_lasts_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         store.put([sample("c")])
         assert store.count() == 3
     holder.close()
+
+
+def test_a_row_that_only_the_index_has_is_damage(two_mass_run: Path, tmp_path: Path) -> None:
+    """As after a flipped bit: SQLite asks an index or the table, never both."""
+    path = Path(shutil.copy(two_mass_run / "samples.sqlite", tmp_path))
+    problem = problem_of(load_case(two_mass_run / "case.toml"))
+    with SampleStore(path) as store:
+        key = known_designs(store, problem)[0][1].key
+    content = path.read_bytes()
+    places = [m.start() for m in re.finditer(key.encode(), content)]
+    assert len(places) >= 2, "in the table and in its index"
+    for place in places:
+        path.write_bytes(content[:place] + b"x" + content[place + 1 :])
+        with pytest.raises(SampleStoreError, match="damaged"), SampleStore(path) as store:
+            known_designs(store, problem)
+    path.write_bytes(content)
+    with SampleStore(path) as store:
+        assert known_designs(store, problem)
