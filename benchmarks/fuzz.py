@@ -25,7 +25,7 @@ MEMORY = 6 << 30  # bytes of address space of a process
 
 def serve(pipe: Connection, seed: int) -> None:
     """A process that runs inputs one after the other and sends what became of each."""
-    from fuzz_judge import Bench
+    from fuzz_bench import Bench
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     with tempfile.TemporaryDirectory(prefix="fuzz_") as place:
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--only", type=int)
     options = parser.parse_args()
     if options.only is not None:
-        from fuzz_judge import Bench
+        from fuzz_bench import Bench
 
         with tempfile.TemporaryDirectory(prefix="fuzz_") as place:
             found = Bench(Path(place)).judged(f"{options.seed}-{options.only}", keep=True)

@@ -1,12 +1,15 @@
 """Some hundred of the inputs that benchmarks/fuzz.py runs by the thousand, the quick ones."""
 
+import json
 import random
 from pathlib import Path
 
 import pytest
+from fuzz_bench import Bench
 from fuzz_cases import case_file, theta
-from fuzz_judge import Bench, Ending, misbehaviour
+from fuzz_judge import Ending, misbehaviour
 from fuzz_plants import plant
+from fuzz_refute import refuted
 
 QUICK = 120  # seeds; those whose command is neither inner nor a reading of a folder are left out
 AT_A_TIME = 40
@@ -27,6 +30,35 @@ def test_no_input_breaks_a_command(bench: Bench, tmp_path: Path, first: int) -> 
             wrong.append(verdict)
     assert wrong == []
     assert done >= AT_A_TIME // 2
+
+
+@pytest.mark.parametrize("seed", ["0-1934", "0-7613"])
+def test_what_double_precision_cannot_judge_is_judged_in_sixty_digits(
+    bench: Bench, seed: str
+) -> None:
+    """A mass that is singular to twelve digits; a stiffness so small that all modes are rigid."""
+    verdict = bench.judged(seed)
+    assert verdict["judged"]
+    assert verdict["wrong"] == []
+
+
+def test_a_false_claim_is_refuted(two_mass_run: Path) -> None:
+    answer = json.loads((two_mass_run / "result.json").read_text())
+    case = two_mass_run / "case.toml"
+    assert refuted(case, two_mass_run, answer, True) == []
+    certificate = answer["certificate"]
+    for lie in (
+        {"certificate": certificate | {"norm_bound": 0.97 * certificate["norm_bound"]}},
+        {"sensitivity_peak": 0.99 * answer["sensitivity_peak"]},
+        {"sensitivity_peak": 1.01 * 1.75},
+        {"sensitivity_low": 0.99 * answer["sensitivity_low"]},
+        {"bandwidth_hz": 1.001 * answer["bandwidth_hz"]},
+        {"omega_S_hz": 1.05 * answer["omega_S_hz"]},
+        {"theta": dict.fromkeys(answer["theta"], 54.0)},
+    ):
+        found = refuted(case, two_mass_run, answer | lie, True)
+        assert found != [], lie
+        assert all(line.startswith("refuted: ") for line in found)
 
 
 def test_the_judge_sees_what_it_looks_for(tmp_path: Path, two_mass_run: Path) -> None:
