@@ -11,9 +11,11 @@ from scipy.stats import ortho_group
 
 from ccd_casadi.channels import find_channels
 from ccd_casadi.derivatives import sensitivities
+from ccd_casadi.kernels import design
 from ccd_casadi.modal import ModalPlant, Suspension, modal_plant
 from ccd_casadi.rib_stage import COARSE, RibStage
 from ccd_casadi.scaling import scale_plant
+from ccd_casadi.synthesis import Outcome, synthesise
 from ccd_casadi.weights import Weights
 
 THETA_B = (1e-3, 3e-3, 4.2446e-3, 4.0588e-3, 11.917e-3, 74.974e-3)
@@ -80,6 +82,25 @@ def test_small_syntheses_give_the_large_one(seed: int) -> None:
     plant = scale_plant(blocks(seed, (1, 2, 1)), WEIGHTS.M_K)
     assert len(plant.channels) == 3
     compare(plant, WEIGHTS)
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_block_that_fails_is_how_the_design_ends(which: int, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    plant = scale_plant(blocks(1, (1, 2, 1)), WEIGHTS.M_K)
+    made, whole = [], design._synthesise
+
+    def failing(*arguments):  # type: ignore[no-untyped-def]
+        found = whole(*arguments)
+        if len(made) == which:
+            found[0][design.Figure.CODE] = design.Code.GAMMA_NOT_CONVERGED
+        made.append(found)
+        return found
+
+    monkeypatch.setattr(design, "_synthesise", failing)
+    figures = synthesise(plant, WEIGHTS, omega_low=HZ).figures
+    assert len(made) == 3
+    assert figures.outcome is Outcome.GAMMA_NOT_CONVERGED
+    assert figures.gamma_opt == made[which][0][design.Figure.GAMMA_OPT]
 
 
 @pytest.mark.parametrize("omega", [(15.0, 900.0), (300.0, 60.0), (1800.0, 25.0)])
