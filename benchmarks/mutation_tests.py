@@ -23,7 +23,7 @@ def _kernels(*names: str) -> tuple[str, ...]:
 
 DESIGN_TESTS = tuple(
     f"tests/test_{name}.py"
-    for name in ("weights", "certificate", "synthesis", "sensitivity", "channels")
+    for name in ("weights", "kernel_parts", "certificate", "synthesis", "sensitivity", "channels")
 )
 DIFFERENCES = "two_mass_plant or both_limits"  # hundreds of syntheses each
 GROUPS = (
@@ -48,8 +48,8 @@ GROUPS = (
             for name in ("modal", "scaling", "synthesis", "closed_loop", "weights", "derivatives")
         ),
         (*DESIGN_TESTS, "tests/test_plant.py", "tests/test_derivatives.py",
-         "tests/test_backends.py", "tests/test_robust_design.py", "tests/test_hard_plants.py"),
-        "",
+         "tests/test_backends.py", "tests/test_robust_design.py"),
+        "not robust_co_design",
         interpreted=False,
     ),
     Group(
