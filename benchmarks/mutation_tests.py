@@ -38,7 +38,7 @@ GROUPS = (
     ),
     Group(
         _kernels("gradients", "pullback", "bound_peak"),
-        ("tests/test_derivatives.py", "tests/test_channels.py"),
+        ("tests/test_gradient_parts.py", "tests/test_derivatives.py", "tests/test_channels.py"),
         "not both_limits",
         interpreted=True,
     ),

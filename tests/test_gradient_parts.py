@@ -1,0 +1,115 @@
+"""Pull-backs and the bound's gradient against adjoints and differences, at one frequency."""
+
+import numpy as np
+import pytest
+from helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccd_casadi.kernels import bound_peak, pullback
+from ccd_casadi.kernels.frequency import prepare
+from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, plant_gain
+from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
+from ccd_casadi.plant import mechanics
+from ccd_casadi.scaling import ScaledPlant
+
+
+def plain(kernel):  # type: ignore[no-untyped-def]
+    """The kernel as Python: compiled for a test alone it would take ten seconds."""
+    return getattr(kernel, "py_func", kernel)
+
+
+to_plant, bound_gradient = plain(pullback.to_plant), plain(pullback.bound_gradient)
+bound_slope = plain(bound_peak._bound_slope)
+seeds = st.integers(0, 10**6)
+sizes = st.integers(1, 3)
+
+
+def small_plant(seed: int, p: int) -> tuple[ScaledPlant, np.ndarray]:
+    """A plant of p channels and scaled weights of which each counts."""
+    model = random_plant(seed, rigid=1, flexible=2, inputs=p, outputs=p)
+    plant = scaled(mechanics(model, (0.5, 0.5)), 1e5)
+    return plant, PAPER.at(30.0 * HZ, 100.0 * HZ).scaled(plant.omega_0)
+
+
+def difference(f, h: float) -> float:  # type: ignore[no-untyped-def]
+    """df/dh at zero, of fourth order."""
+    return (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
+
+
+@few(max_examples=20)
+@given(seeds, sizes, sizes)
+def test_the_pull_back_is_the_adjoint_of_building_the_plant(seed: int, m: int, p: int) -> None:
+    """⟨Ā, dA_g⟩ + ⟨B̄2, dB2⟩ + ⟨C̄1, dC1⟩ + ⟨C̄2, dC2⟩ = ⟨pulled back, (dA, dB, dC)⟩."""
+    rng = np.random.default_rng(seed)
+    n = 4
+    A, B, C = (rng.normal(size=shape) for shape in ((n, n), (n, m), (p, n)))
+    dA, dB, dC = (rng.normal(size=matrix.shape) for matrix in (A, B, C))
+    w = PAPER.scaled(100.0 * HZ)
+    w[3] = 3.0
+    before, after = generalized_plant(A, B, C, w), generalized_plant(A + dA, B + dB, C + dC, w)
+    changes = [after[i] - before[i] for i in (0, 2, 3, 4)]
+    cotangents = [rng.normal(size=change.shape) for change in changes]
+    A_, B_, C_ = to_plant(*cotangents, first_order_weights(w), C, m)
+    there = sum(np.sum(x * y) for x, y in zip(cotangents, changes, strict=True))
+    back = np.sum(A_ * dA) + np.sum(B_ * dB) + np.sum(C_ * dC)
+    size = sum(np.abs(x * y).sum() for x, y in zip(cotangents, changes, strict=True))
+    assert there == pytest.approx(back, abs=1e-12 * size)
+
+
+@few(max_examples=25)
+@given(seeds, sizes, st.floats(-1.0, 1.0))
+def test_the_gradient_of_the_bound_at_one_frequency(seed: int, p: int, at: float) -> None:
+    """Along random directions of A, B, C together, and to the logarithm of each weight."""
+    plant, w = small_plant(seed, p)
+    rng, omega = np.random.default_rng(seed), 10.0**at
+    A, B, C = plant.A, plant.B, plant.C
+    dA, dB, dC = (matrix * rng.uniform(-1.0, 1.0, matrix.shape) for matrix in (A, B, C))
+
+    def bound(h: float, k: int = -1) -> float:
+        moved, x = w.copy(), 0.0 if k >= 0 else h
+        if k >= 0:
+            moved[k] *= np.exp(h)
+        gain = plant_gain(A + x * dA, B + x * dB, C + x * dC, omega)
+        return float(np.sqrt(lower_bound_squared(moved, gain, omega)))
+
+    A_, B_, C_, w_ = bound_gradient(A, B, C, w, omega)
+    found = np.sum(A_ * dA) + np.sum(B_ * dB) + np.sum(C_ * dC)
+    size = bound(0.0)
+    assert found == pytest.approx(difference(bound, 1e-5), rel=1e-5, abs=1e-7 * size)
+    for k in range(8):
+        expected = difference(lambda h, k=k: bound(h, k), 1e-3)
+        assert w_[k] * w[k] == pytest.approx(expected, rel=1e-7, abs=1e-9 * size)
+
+
+@few(max_examples=25)
+@given(seeds, sizes, st.floats(-1.0, 1.0))
+def test_the_slope_of_the_bound_over_frequency(seed: int, p: int, at: float) -> None:
+    plant, w = small_plant(seed, p)
+    omega = 10.0**at
+
+    def squared(h: float) -> float:
+        x = omega * np.exp(h)
+        return float(lower_bound_squared(w, plant_gain(plant.A, plant.B, plant.C, x), x))
+
+    slope = bound_slope(plant.A, plant.B, plant.C, w, omega) * omega
+    assert slope == pytest.approx(difference(squared, 1e-5), rel=1e-6, abs=1e-7 * squared(0.0))
+
+
+@pytest.mark.parametrize("off", [-3e-3, -1e-6, 1e-5, 2e-3])
+def test_the_place_of_the_bound_is_found_from_either_side(off: float) -> None:
+    """Next to a sharp transmission zero; from too far away it is left where it is."""
+    case = flexible_case(30)
+    arguments = (case.plant.A, case.plant.B, case.plant.C, case.weights.scaled(case.plant.omega_0))
+    start = gamma_lower_bound(
+        prepare(*arguments[:3]), arguments[3], case.plant.grid, case.plant.gain
+    )[1]
+    top = bound_peak.bound_peak(*arguments, start)
+    curve = (
+        bound_slope(*arguments, top * (1.0 + 1e-7)) - bound_slope(*arguments, top * (1.0 - 1e-7))
+    ) / 2e-7
+    assert curve < 0.0  # dslope/dln ω
+    assert abs(bound_slope(*arguments, top)) < 1e-10 * abs(curve)
+    near = 1e-2 * off  # the peak is some 1e-3 of its frequency wide
+    assert bound_peak.bound_peak(*arguments, top * (1.0 + near)) == pytest.approx(top, rel=1e-10)
+    assert bound_peak.bound_peak(*arguments, 0.2 * top) == 0.2 * top
