@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,3 +42,36 @@ def two_mass_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = ["--out", str(folder), "--formulation", "lifted", "--workers", "1", "--quiet"]
     assert main([str(case), *options]) == 0
     return folder
+
+
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    from dask_processes import Processes
+
+    processes = Processes(tmp_path_factory.mktemp("dask"))
+    try:
+        yield processes
+    finally:
+        processes.kill()
+
+
+@pytest.fixture
+def shared(lasting: Any) -> Any:
+    """A scheduler and two workers, started anew only where the test before has broken them."""
+    if not lasting.whole():
+        lasting.kill()
+        lasting.start()
+    return lasting
+
+
+@pytest.fixture
+def nannies(tmp_path: Path) -> Iterator[Any]:
+    """The same with nannies, which restart workers."""
+    from dask_processes import Processes
+
+    processes = Processes(tmp_path, nanny=True)
+    try:
+        processes.start()
+        yield processes
+    finally:
+        processes.kill()

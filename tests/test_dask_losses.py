@@ -1,0 +1,204 @@
+"""Workers and schedulers that straggle, freeze, die or stay away: nothing lost, nothing twice.
+
+How that goes depends on how the machine schedules the processes: marked slow.
+"""
+
+import os
+import random
+import signal
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dask_processes import Processes, both_workers
+from helpers import problem
+from test_sampling import command, rows, started, table, wait_for_rows
+
+from ccd_casadi import solve
+from ccd_casadi.cluster import Cluster
+from ccd_casadi.parallel import WorkerLost, Workers
+from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling import Truth
+
+pytestmark = pytest.mark.slow
+
+
+# ---- tasks, imported by the workers --------------------------------------------------------------
+
+
+def waits(task: tuple[int, str]) -> int:
+    """The value, once a file is there."""
+    value, path = task
+    while not os.path.exists(path):
+        time.sleep(0.01)
+    return value
+
+
+def straggles(task: tuple[int, str]) -> int:
+    """Zero's first copy ends after its second; the last value waits until both have."""
+    value, folder = task
+    begun, second, first = (Path(folder) / name for name in ("begun", "second", "first"))
+    if value == 0:
+        try:
+            begun.touch(exist_ok=False)
+        except FileExistsError:
+            second.touch()
+        else:
+            waits((0, str(second)))
+            first.touch()
+    elif value == 9:
+        waits((9, str(first)))
+    return value
+
+
+def freezes_once(task: tuple[int, str]) -> int:
+    """Zero's first copy stops its whole worker, which then says nothing more."""
+    value, folder = task
+    if value == 0 and not (Path(folder) / "frozen").exists():
+        (Path(folder) / "frozen").touch()
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return value
+
+
+def dies_at_two(value: int) -> int:
+    if value == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return value
+
+
+# ---- losses --------------------------------------------------------------------------------------
+
+
+class Counted(SampleStore):
+    """A store that keeps what was delivered to it, twice or not."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.units: list[str] = []
+
+    def put_unit(self, samples: Any, result: Any, problem: str | None = None) -> None:
+        self.units.append(result[0])
+        super().put_unit(samples, result, problem)
+
+
+def serial(path: Path, thetas: np.ndarray) -> dict[str, list[tuple[Any, ...]]]:
+    with SampleStore(path) as store:
+        Truth(problem(), store, Workers(1)).bandwidths(thetas)
+    return table(path)
+
+
+def test_a_straggler_is_overtaken_and_its_late_answer_ignored(
+    shared: Processes, tmp_path: Path
+) -> None:
+    with Cluster(shared.address, patience=0.3) as cluster:
+        both_workers(cluster)
+        found = list(cluster.map_unordered(straggles, [(i, str(tmp_path)) for i in range(10)]))
+    assert sorted(found) == list(range(10))
+    assert (tmp_path / "first").exists(), "both copies have answered"
+
+
+def test_a_frozen_worker_is_overtaken(shared: Processes, tmp_path: Path) -> None:
+    try:
+        with Cluster(shared.address, patience=0.3) as cluster:
+            both_workers(cluster)
+            tasks = [(i, str(tmp_path)) for i in range(20)]
+            found = list(cluster.map_unordered(freezes_once, tasks))
+        assert sorted(found) == list(range(20))
+    finally:
+        for pid in shared.workers():
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize("kills", [3, 30])
+def test_killed_workers_lose_no_sample_and_double_none(
+    nannies: Processes, tmp_path: Path, kills: int
+) -> None:
+    rng = random.Random(kills)
+    box = np.random.default_rng(kills)
+    path, finished = tmp_path / "dask.sqlite", threading.Event()
+    killed: list[int] = []
+
+    def kill() -> None:
+        seen = 0
+        while len(killed) < kills and not finished.is_set():
+            workers = [pid for pid in nannies.workers() if pid not in killed]
+            if workers and rows(path) > seen:  # sampling goes on
+                time.sleep(rng.uniform(0.0, 0.1))
+                seen = rows(path)
+                victim = rng.choice(workers)
+                with suppress(ProcessLookupError):
+                    os.kill(victim, signal.SIGKILL)
+                    killed.append(victim)
+            time.sleep(0.01)
+
+    batches = []
+    with Counted(path) as store, Cluster(nannies.address) as cluster:
+        both_workers(cluster)
+        killer = threading.Thread(target=kill)
+        killer.start()
+        try:
+            truth = Truth(problem(), store, cluster)
+            while killer.is_alive():
+                batches.append(box.uniform(55.0, 70.0, (20, 2)))
+                found = truth.bandwidths(batches[-1])
+                assert [sample.theta for sample in found] == [tuple(t) for t in batches[-1]]
+        finally:
+            finished.set()
+            killer.join()
+    assert len(set(killed)) == kills
+    assert len(store.units) == len(set(store.units)) == 20 * len(batches)
+    assert table(path) == serial(tmp_path / "serial.sqlite", np.vstack(batches))
+
+
+def test_a_restarted_scheduler_loses_nothing(shared: Processes, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    tasks = [(i, str(gate if i % 2 else tmp_path)) for i in range(20)]
+    with Cluster(shared.address) as cluster:
+        results = cluster.map_unordered(waits, tasks)
+        found = [next(results)]  # the odd ones in flight cannot end
+        shared.kill()
+        gate.touch()
+        shared.start()
+        found += results
+    assert sorted(found) == list(range(20))
+
+
+def test_a_cluster_that_stays_away_is_told(shared: Processes, tmp_path: Path) -> None:
+    tasks = [(i, str(tmp_path / "never")) for i in range(4)]
+    with Cluster(shared.address, absence=1.0) as cluster:
+        for process in shared.started:
+            process.kill()
+        with pytest.raises(WorkerLost, match="no worker for 1 s; start `dask worker` again"):
+            list(cluster.map_unordered(waits, tasks))
+        shared.kill()
+        with pytest.raises(WorkerLost, match="no scheduler for 1 s; start `dask scheduler` again"):
+            list(cluster.map_unordered(waits, tasks))
+
+
+def test_a_task_that_kills_every_worker_is_told(nannies: Processes) -> None:
+    with Cluster(nannies.address) as cluster, pytest.raises(WorkerLost, match="after worker died"):
+        list(cluster.map_unordered(dies_at_two, range(8)))
+
+
+def test_ctrl_c_ends_promptly_and_is_resumable(shared: Processes, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = [*command(folder), "--scheduler", shared.address]
+    process = started(words)
+    wait_for_rows(process, folder / "samples.sqlite", 20)
+    process.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    output, errors = process.communicate(timeout=20)
+    assert time.monotonic() - began < 2.0
+    assert (process.returncode, output) == (130, "")
+    assert len(errors.splitlines()) == 1, errors
+    assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")
+    kept = table(folder / "samples.sqlite")["samples"]
+    assert len(kept) >= 20
+    assert solve.main(words[3:]) == 0
+    after = table(folder / "samples.sqlite")["samples"]
+    # a row may gain its gradients later; what it says of the design stays
+    assert {row[:6] for row in kept} <= {row[:6] for row in after}
