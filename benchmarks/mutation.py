@@ -145,9 +145,7 @@ def text_of(mutant: Mutant) -> str:
 def sample(count: int, seed: int) -> list[Mutant]:
     """`count` mutants of all files, each as likely; another file's edits do not change the draw."""
     everything = [item for group in GROUPS for path in group.files for item in mutants(path)]
-    drawn = sorted(everything, key=lambda m: random.Random(f"{seed} {m.key}").random())[:count]
-    last = GROUPS[-1].files
-    return sorted(drawn, key=lambda m: m.path in last)
+    return sorted(everything, key=lambda m: random.Random(f"{seed} {m.key}").random())[:count]
 
 
 # ---- what the tests say --------------------------------------------------------------------------

@@ -23,14 +23,22 @@ def _kernels(*names: str) -> tuple[str, ...]:
 
 DESIGN_TESTS = tuple(
     f"tests/test_{name}.py"
-    for name in ("weights", "kernel_parts", "certificate", "synthesis", "sensitivity", "channels")
+    for name in (
+        "weights",
+        "kernel_parts",
+        "certificate",
+        "balance",
+        "synthesis",
+        "sensitivity",
+        "channels",
+    )
 )
 DIFFERENCES = "two_mass_plant or both_limits"  # hundreds of syntheses each
 GROUPS = (
     Group(
         _kernels(
             "certificate", "closed_loop", "generalized_plant", "frequency", "sensitivity",
-            "design", "refine", "small",
+            "design", "refine", "small", "riccati", "gamma", "synthesis", "balance", "figures",
         ),
         (*DESIGN_TESTS, "tests/test_derivatives.py"),
         f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
@@ -57,11 +65,5 @@ GROUPS = (
         ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
         "not killed and not ctrl_c",
         interpreted=False,
-    ),
-    Group(
-        _kernels("riccati", "gamma"),
-        (*DESIGN_TESTS, "tests/test_derivatives.py"),
-        f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
-        interpreted=True,
     ),
 )  # fmt: skip
