@@ -55,8 +55,8 @@ GROUPS = (
             f"ccd_casadi/{name}.py"
             for name in ("modal", "scaling", "synthesis", "closed_loop", "weights", "derivatives")
         ),
-        (*DESIGN_TESTS, "tests/test_plant.py", "tests/test_derivatives.py",
-         "tests/test_backends.py", "tests/test_robust_design.py"),
+        (*DESIGN_TESTS, "tests/test_closed_loop.py", "tests/test_plant.py",
+         "tests/test_derivatives.py", "tests/test_backends.py", "tests/test_robust_design.py"),
         "not robust_co_design",
         interpreted=False,
     ),

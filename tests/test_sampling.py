@@ -143,6 +143,42 @@ def test_an_infeasible_theta_is_a_sample_too(tmp_path: Path) -> None:
             assert sample.syntheses == store.count() > 0
 
 
+def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shortfalls = {55.0: 0.3, 62.5: 0.1, 70.0: None}  # by m1; None: feasible
+
+    def unit(task: tuple[Any, ...]) -> tuple[list[Any], tuple[Any, ...]]:
+        *_, key, theta = task
+        violation = shortfalls[theta[0]]
+        met = violation is None
+        payload = {"bandwidth": 400.0 if met else None, "gradient": None, "active": []}
+        payload |= {"omega_S": 9.0 if met else None, "omega_T": 9.0 if met else None}
+        payload |= {"shortfall": "", "violation": 0.0 if met else violation, "syntheses": 1}
+        return [], (key, theta, payload)
+
+    monkeypatch.setattr(module, "inner_unit", unit)
+    for order in ([0, 1, 2, 3], [1, 3, 0, 2], [2, 3, 1, 0]):
+        with SampleStore(tmp_path / f"{order}.sqlite") as store:
+            truth = Truth(problem(), store, Workers(1))
+            truth.bandwidths(THETAS[[2]])
+            assert truth.nearest is None, "a feasible one does not count"
+            truth.bandwidths(THETAS[order])
+            assert truth.nearest is not None
+            assert truth.nearest.theta == tuple(THETAS[1])
+
+
+def test_the_rows_of_a_unit_share_its_seconds() -> None:
+    began = time.perf_counter()
+    rows, (key, theta, payload) = module.inner_unit((problem(), "p", "k", (60.0, 60.0)))
+    elapsed = time.perf_counter() - began
+    assert (key, theta, payload["syntheses"]) == ("k", (60.0, 60.0), len(rows))
+    assert len(rows) > 5
+    assert 0.0 < sum(row.seconds for row in rows) <= elapsed
+    (row,), _ = module.design_unit((problem(), [("d", tuple(X[0]))]))
+    assert 0.0 < row.seconds <= time.perf_counter() - began
+
+
 def test_what_determines_a_synthesis_and_nothing_else_is_in_its_key(tmp_path: Path) -> None:
     def hashes(**changes: Any) -> tuple[str, str]:
         truth = Truth(problem(**changes), store, Workers(1))
