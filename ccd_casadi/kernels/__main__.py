@@ -9,6 +9,7 @@ start = time.perf_counter()
 
 import numpy as np  # noqa: E402
 
+from ccd_casadi.kernels.bound_peak import bound_peak  # noqa: E402
 from ccd_casadi.kernels.design import assess, sweep  # noqa: E402
 from ccd_casadi.kernels.gamma import plant_gain  # noqa: E402
 from ccd_casadi.kernels.generalized_plant import generalized_plant  # noqa: E402
@@ -26,6 +27,7 @@ def compile_all() -> None:
     none = (np.zeros((1, *matrix.shape)) for matrix in (A, B, C))
     row, Ak, Bk, Ck, *_ = design_with_gradients(A, B, C, w, grid, gain, 1.02, 0.01, 0.0, *none)
     generalized_plant(A, B, C, w)
+    bound_peak(A, B, C, w, 1.0)
     assess(A, B, C, Ak, Bk, Ck, np.zeros((1, 1)), w, float(row[3]), 0.01, row)
     if row[0] != 0.0:
         raise SystemExit("the compiled kernels do not certify a design that they should")
