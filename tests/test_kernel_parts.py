@@ -319,3 +319,21 @@ def test_a_sweep_needs_fewer_schur_forms_than_its_points_alone() -> None:
                 row[design.Figure.GAMMA_OPT], rel=1e-9
             )
     assert rows[:, :, design.Figure.SCHUR_FORMS].sum() < 0.7 * alone
+
+
+def test_the_search_for_gamma_takes_few_schur_forms() -> None:
+    """Newton's method in 1/t from afar, and the step of order four from a guess 1 % off."""
+    plant = two_mass(58.0, 63.0)
+    numbers = (plant.grid, plant.gain, 1.02, OMEGA_LOW / plant.omega_0)
+    cold, near = [], []
+    for S in np.geomspace(10, 2000, 8) * HZ:
+        for T in np.geomspace(20, 1000, 5) * HZ:
+            arguments = (plant.A, plant.B, plant.C, PAPER.at(S, T).scaled(plant.omega_0), *numbers)
+            row = design.design(*arguments, 0.0)[0]
+            cold.append(row[design.Figure.SCHUR_FORMS])
+            for factor in (0.99, 1.01):
+                again = design.design(*arguments, factor * row[design.Figure.GAMMA_OPT])[0]
+                near.append(again[design.Figure.SCHUR_FORMS])
+    assert np.mean(cold) < 4.0
+    assert max(cold) <= 8
+    assert np.mean(near) < 2.2

@@ -79,6 +79,18 @@ def test_every_two_mass_design_is_certified_and_sb10ad_agrees(count: int) -> Non
     assert compared > 0.9 * count
 
 
+@pytest.mark.parametrize(("S_hz", "M_K"), [(0.01, 2e9), (0.1, 2e7), (1.0, 2e7), (10.0, 2e7)])
+def test_next_to_what_no_controller_changes(S_hz: float, M_K: float) -> None:
+    """S(j∞) = 1, so γ >= 1/M_S: with weights that ask for little γ_opt is just above it."""
+    values = vars(PAPER) | {"A_l": 5.0, "M_K": M_K, "omega_S": S_hz * HZ, "omega_T": 1e3 * HZ}
+    plant, w = two_mass(60.0, 60.0, M_K), Weights(**values)
+    ours = synthesise(plant, w, omega_low=OMEGA_LOW).figures
+    theirs = synthesise_with("slicot", plant, w, omega_low=OMEGA_LOW)
+    assert ours.outcome is Outcome.CERTIFIED
+    assert 1.0 / w.M_S < ours.gamma_opt < 1.4 / w.M_S
+    assert ours.gamma_opt == pytest.approx(theirs.gamma_opt, rel=3e-8)
+
+
 @few(max_examples=12)
 @given(st.floats(55, 70), st.floats(55, 70), st.floats(1.0, 3.25), st.floats(1.3, 3.0))
 def test_two_mass_controller_holds_in_si_by_python_control(m1, m2, log_S, log_T) -> None:
