@@ -12,6 +12,7 @@ from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, pla
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.plant import mechanics
 from ccd_casadi.scaling import ScaledPlant
+from ccd_casadi.weights import Weights
 
 
 def plain(kernel):  # type: ignore[no-untyped-def]
@@ -29,7 +30,9 @@ def small_plant(seed: int, p: int) -> tuple[ScaledPlant, np.ndarray]:
     """A plant of p channels and scaled weights of which each counts."""
     model = random_plant(seed, rigid=1, flexible=2, inputs=p, outputs=p)
     plant = scaled(mechanics(model, (0.5, 0.5)), 1e5)
-    return plant, PAPER.at(30.0 * HZ, 100.0 * HZ).scaled(plant.omega_0)
+    w0 = plant.omega_0
+    weights = Weights(2.0, 0.3, 0.8 * w0, 4.0, 0.7 * w0, 1e5, 0.9, 0.3, 1.3 * w0)
+    return plant, weights.scaled(w0)
 
 
 def difference(f, h: float) -> float:  # type: ignore[no-untyped-def]

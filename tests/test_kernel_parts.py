@@ -18,8 +18,9 @@ from helpers import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.kernels import certificate, design, frequency, sensitivity, small
+from ccd_casadi.kernels import certificate, design, frequency, riccati, sensitivity, small
 from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop
+from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.refine import _vertex, narrow, next_trial
 from ccd_casadi.plant import mechanics
 from ccd_casadi.scaling import StateSpace
@@ -337,3 +338,52 @@ def test_the_search_for_gamma_takes_few_schur_forms() -> None:
     assert np.mean(cold) < 4.0
     assert max(cold) <= 8
     assert np.mean(near) < 2.2
+
+
+# ---- the Riccati level ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def level():  # type: ignore[no-untyped-def]
+    """`riccati_level` of a design as a function of t, t at γ_opt, and what `root_nearby` takes."""
+    plant = two_mass(58.0, 63.0)
+    _, B1, B2, C1, _, d1, d2 = gp = generalized_plant(
+        plant.A, plant.B, plant.C, WEIGHTS.scaled(plant.omega_0)
+    )
+    H0 = riccati.lqr_hamiltonian(gp[0], B2, C1, d2, 1, 1)
+    gamma = synthesise(plant, WEIGHTS, omega_low=OMEGA_LOW).figures.gamma_opt
+
+    def at(t: float):  # type: ignore[no-untyped-def]
+        return riccati.riccati_level(H0, B1, C1, d1, t, riccati.NOISE)
+
+    return at, gamma**2 - d1**2, (B1, C1, d1)
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.999, 1.01, 2.0, 10.0])
+def test_the_slope_of_the_riccati_level_is_that_of_its_differences(level, factor: float) -> None:
+    """Also where X is no longer positive; zero at γ_opt, increasing in t."""
+    at, top, _ = level
+    t = factor * top
+    f, slope, ok, _ = at(t)
+    assert ok
+    assert (f > 0.0) == (factor > 1.0)
+    h = 1e-4 * t
+    found = (8.0 * (at(t + h)[0] - at(t - h)[0]) - at(t + 2 * h)[0] + at(t - 2 * h)[0]) / (12.0 * h)
+    assert slope > 0.0
+    assert slope == pytest.approx(found, rel=1e-6)
+
+
+def test_the_step_to_the_root_is_of_order_four(level) -> None:  # type: ignore[no-untyped-def]
+    """Half as far away the error is a sixteenth at last, and the estimate of it is no smaller."""
+    at, top, parts = level
+    errors, estimates = [], []
+    for off in (0.08, 0.04, 0.02):
+        t = (1.0 + off) * top
+        f, slope, _, frame = at(t)
+        step, estimate = riccati.root_nearby(*parts, frame, f / (slope * t * t))
+        errors.append(abs(t / (1.0 + step * t) - top) / top)
+        estimates.append(estimate * top)
+    ratios = np.array(errors[:-1]) / np.array(errors[1:])
+    assert (ratios > 11.0).all()  # of order three they would tend to eight
+    assert (np.array(estimates) > errors).all()
+    assert (np.array(estimates) < 100.0 * np.array(errors)).all()
