@@ -168,6 +168,26 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
             assert truth.nearest.theta == tuple(THETAS[1])
 
 
+@pytest.mark.parametrize("violated", [False, True])
+def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, violated: bool
+) -> None:
+    monkeypatch.setattr(module, "constraint_values", lambda *_: np.array([-1.0, float(violated)]))
+    monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        truth = Truth(problem(w1=2.0, w2=-3.0), store, Workers(1))
+        truth._spend("a", 5, (60.0, 60.0), 10.0)
+        truth._spend("a", 5, (60.0, 60.0), 10.0)
+        truth._spend("b", 2, (61.0, 60.0), math.nan)
+    assert [entry.syntheses for entry in truth.trace] == [5, 7]
+    assert truth.trace[0].bandwidth == 10.0
+    if violated:
+        assert math.isnan(truth.trace[0].objective)
+    else:
+        assert truth.trace[0].objective == 170.0
+    assert math.isnan(truth.trace[1].objective)
+
+
 def test_the_rows_of_a_unit_share_its_seconds() -> None:
     began = time.perf_counter()
     rows, (key, theta, payload) = module.inner_unit((problem(), "p", "k", (60.0, 60.0)))
