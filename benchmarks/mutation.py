@@ -1,7 +1,7 @@
 """Mutation testing of the numerical core: a seeded sample of mutants, and which the tests kill.
 
     python benchmarks/mutation.py --mutants 150 --seed 0
-    python benchmarks/mutation.py --survivors        # these again, after new tests
+    python benchmarks/mutation.py --survivors --tests tests/test_plant.py    # these again
 
 Each mutant is one changed operator, comparison, constant or condition in a copy of the sources;
 the tests of its group (`mutation_tests`) run on it until one fails, the cheapest first. Kernels
@@ -30,7 +30,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +156,7 @@ class Judge:
 
     def __init__(self, group: Group, folder: Path) -> None:
         self.group = group
-        self.order = folder / f"order{GROUPS.index(group)}.json"
+        self.order = folder / f"{Path(group.files[0]).stem}.json"
         self.work = folder / ("interpreted" if group.interpreted else "compiled")
         self.cache = folder / "numba"
         fresh = not self.work.exists()
@@ -251,18 +251,25 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="files with this in their path")
     parser.add_argument("--survivors", action="store_true", help="judge these again")
+    parser.add_argument("--tests", nargs="*", default=[], help="by these files only")
     options = parser.parse_args()
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"mutants": []}
     done: dict[str, dict[str, Any]] = {item["key"]: item for item in known["mutants"]}
     todo = [m for m in sample(options.mutants, options.seed) if options.only in m.path]
     if options.survivors:
-        todo = [m for m in todo if done.get(m.key, {}).get("verdict") == "survived"]
+        todo = [
+            m
+            for m in todo
+            if done.get(m.key, {}).get("verdict") == "survived" and "why" not in done[m.key]
+        ]
     else:
         todo = [m for m in todo if m.key not in done]
     judges: dict[Group, Judge] = {}
     with tempfile.TemporaryDirectory() as folder:
         for count, mutant in enumerate(todo, 1):
             group = next(group for group in GROUPS if mutant.path in group.files)
+            if options.tests:
+                group = replace(group, tests=tuple(options.tests), words="")
             if group not in judges:
                 judges[group] = Judge(group, Path(folder))
                 print(f"unchanged: {judges[group].seconds:.0f} s", *group.files, flush=True)
@@ -273,8 +280,6 @@ def main() -> None:
             item |= {"verdict": verdict, "by": by, "seconds": seconds}
             if mutant.key in done:
                 item["first"] = "survived"
-            if verdict == "survived" and "why" in done.get(mutant.key, {}):
-                item["why"] = done[mutant.key]["why"]
             done[mutant.key] = item
             _write(options.seed, list(done.values()))
             change = f"{mutant.path}:{mutant.line} {mutant.before[:60]} -> {mutant.after[:60]}"

@@ -103,6 +103,32 @@ def test_balancing_takes_a_bad_scaling_back(seed: int, N: int) -> None:
             assert size(other) >= size(tau) * (1.0 - 1e-12)
 
 
+@given(st.integers(1, 5), st.data())
+def test_balancing_of_few_entries_of_few_sizes(N: int, data: st.DataObject) -> None:
+    """Ties and zeros: a scale that only shrinks, or only grows, the entries is left at one."""
+    count = 4 * N * N
+    entries = st.lists(st.sampled_from([0.0, 0.0, 1.0, 16.0]), min_size=count, max_size=count)
+    H = np.array(data.draw(entries)).reshape(2 * N, 2 * N)
+    tau = balancing(H)
+
+    def entries_of(tau: Array) -> Array:
+        both = np.concatenate([tau, 1.0 / tau])
+        M = np.abs(H * (both / both[:, None]))
+        return M - np.diag(np.diag(M))
+
+    M = entries_of(tau)
+    for i in range(N):
+        k = N + i
+        down, up = M[i].sum() + M[:, k].sum(), M[:, i].sum() + M[k].sum()
+        if down == 0.0 or up == 0.0:
+            assert tau[i] == 1.0
+            continue
+        for factor in (0.5, 2.0):
+            other = tau.copy()
+            other[i] *= factor
+            assert entries_of(other).sum() >= M.sum() * (1.0 - 1e-12)
+
+
 def test_noise_is_what_rounding_leaves_of_a_positive_matrix() -> None:
     for item in LOST:
         A, B, C, w, *_ = arguments(item)

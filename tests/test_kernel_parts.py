@@ -260,6 +260,27 @@ def test_a_first_order_gain_is_at_a_level_where_it_says(level: float, exponent: 
     assert none.size == 0
 
 
+def test_a_gain_above_the_level_at_a_candidate_is_not_passed() -> None:
+    """A resonance so narrow that the points about the candidate do not see it."""
+    omega, zeta, one = 3.0, 1e-4, np.ones((1, 1))
+    A = np.array([[0.0, omega], [-omega, -2.0 * zeta * omega]])
+    G = frequency.prepare(A, np.array([[0.0], [1.0]]), np.array([[6.0 * zeta * omega, 0.0]]))
+    K = frequency.prepare(-one, one, 0.0 * one)
+    w = np.array([2.0, 1e-3, 1e-3, 1.0, 1.0, 1.0, 1.0, 1.0])  # |W1| is 1/2 but far below
+    Dk = 0.3 * one
+    level = 0.65
+    assert certificate.stack_gain(G, K, Dk, w, omega) > 1.1 * level
+    for beside in (0.5, 0.99, 1.01, 2.0):
+        assert certificate.stack_gain(G, K, Dk, w, beside * omega) < level
+    # a loop that has its one candidate there: |a/(jω + a)| = level
+    a = omega / np.sqrt(level**-2 - 1.0) * one
+    loop = (-a, one, a, 0.0 * one)
+    assert sensitivity.axis_frequencies(*loop, level)[0] == pytest.approx([omega], rel=1e-9)
+    assert not certificate.level_test(G, K, Dk, w, loop, level)
+    flat = frequency.prepare(-one, one, 0.0 * one)
+    assert certificate.level_test(flat, K, Dk, w, loop, level)
+
+
 def test_the_loop_of_s_is_the_inverse_of_one_plus_gk() -> None:
     plant, rng = two_mass(60.0, 60.0), np.random.default_rng(1)
     K = StateSpace(

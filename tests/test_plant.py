@@ -132,6 +132,34 @@ def test_suspension_puts_the_rigid_poles_where_it_says() -> None:
         assert -pole.real / abs(pole) == pytest.approx(suspension.damping_ratio, rel=1e-8)
 
 
+def masses_on_springs(*hz: float, outputs: np.ndarray) -> Mechanics:
+    """Independent unit masses, each on a spring of its own; all are driven alike."""
+    n, p = len(hz), len(outputs)
+    square, none = np.zeros((0, n, n)), np.zeros((n, n))
+    return Mechanics(
+        np.eye(n), none, np.diag((HZ * np.array(hz)) ** 2), np.ones((n, 1)), outputs, 0.01,
+        (square, square, square, np.zeros((0, n, 1)), np.zeros((0, p, n))),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("top", [1e3, 1.0])
+def test_what_counts_as_rigid(top: float) -> None:
+    """Below 10⁻⁵ of the highest frequency, or below 10⁻³ of the suspension's."""
+    limit = max(1e-5 * top, 1e-3 * Suspension().frequency_hz)
+    for factor, rigid in ((0.9, True), (1.1, False)):
+        system = masses_on_springs(factor * limit, top, outputs=np.ones((1, 2)))
+        assert list(modal_plant(system, Suspension()).rigid) == [rigid, False]
+
+
+def test_of_two_modes_at_one_frequency_the_one_that_no_sensor_sees_stands_alone() -> None:
+    system = masses_on_springs(100.0, 100.0, 170.0, outputs=np.array([[0.6, 0.8, 1.0]]))
+    C = modal_plant(system, Suspension()).C
+    assert sorted(np.abs(C[0])) == pytest.approx([0.0, 1.0, 1.0], abs=1e-14)
+    assert (C == 0.0).sum() == 1
+    apart = masses_on_springs(100.0, 100.1, 170.0, outputs=np.array([[0.6, 0.8, 1.0]]))
+    assert sorted(np.abs(modal_plant(apart, Suspension()).C[0])) == pytest.approx([0.6, 0.8, 1.0])
+
+
 # ---- derivatives ------------------------------------------------------------------------------
 
 
