@@ -11,7 +11,8 @@ four times the processor time of the unchanged sources, and 30 s more, is counte
 
 Results go to benchmarks/mutation.json after every mutant; the same command goes on from there. A
 mutant is known by its function and what changes there, so that edits elsewhere leave the sample
-as it is. Survivors are for reading: what they are is written in their field "why" by hand.
+as it is. Survivors are for reading: what they are is written in their field "why" by hand, and
+"earlier" keeps what was said of a mutant before the tests that survivors led to.
 """
 
 import argparse
@@ -278,9 +279,7 @@ def main() -> None:
             seconds = round(time.perf_counter() - began, 1)
             item = {"key": mutant.key} | asdict(mutant)
             item |= {"verdict": verdict, "by": by, "seconds": seconds}
-            if mutant.key in done:
-                item["first"] = "survived"
-            done[mutant.key] = item
+            done[mutant.key] = done.get(mutant.key, {}) | item
             _write(options.seed, list(done.values()))
             change = f"{mutant.path}:{mutant.line} {mutant.before[:60]} -> {mutant.after[:60]}"
             print(f"{count}/{len(todo)} {verdict:9} {change} ({seconds:.0f} s) {by}", flush=True)
@@ -289,7 +288,7 @@ def main() -> None:
 
 def _write(seed: int, found: list[dict[str, Any]]) -> dict[str, int]:
     verdicts = Counter(item["verdict"] for item in found)
-    before = Counter(item.get("first", item["verdict"]) for item in found)
+    earlier = Counter(item["earlier"] for item in found if "earlier" in item)
     figures = {
         "seed": seed,
         "mutants tried": len(found),
@@ -297,7 +296,8 @@ def _write(seed: int, found: list[dict[str, Any]]) -> dict[str, int]:
         "timed out": verdicts["timed out"],
         "survived": verdicts["survived"],
         "survived, explained": sum("why" in i for i in found if i["verdict"] == "survived"),
-        "survived before the tests that they led to": before["survived"],
+        "tried before the tests that survivors led to": earlier.total(),
+        "killed before these": earlier["killed"],
     }
     RESULTS.write_text(json.dumps(figures | {"mutants": found}, indent=1) + "\n")
     return figures
