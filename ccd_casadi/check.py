@@ -13,7 +13,8 @@ import numpy as np
 from ccd_casadi.case import load_case, problem_of
 from ccd_casadi.case_sections import Case
 from ccd_casadi.command_line import ExitCode, parser, run
-from ccd_casadi.diagnosis import Finding, PlantFacts, Severity, diagnose, first_seen
+from ccd_casadi.diagnosis import Finding, Severity, diagnose, first_seen
+from ccd_casadi.plant_facts import PlantFacts
 from ccd_casadi.problem import CoDesignProblem, plant_of
 from ccd_casadi.results import clean
 

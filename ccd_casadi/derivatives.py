@@ -4,7 +4,7 @@ The controller, γ_opt and the Riccati solution move with the plant; the paper's
 with K held fixed (its equations (10) to (13)), comes along for the baseline.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ccd_casadi.kernels.gradients import design_with_gradients
 from ccd_casadi.off_design import Loop, off_design_gradients
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import DesignFigures, figures_from_row, over_family
+from ccd_casadi.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.weights import Weights
 
 MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
@@ -54,6 +54,7 @@ def sensitivities(
 ) -> Sensitivities:
     """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
 
+    What is certified here has finite gradients; where they are not, the outcome says so.
     With a family the peak is the largest on any of it, its gradient that of the plant that has it.
     """
     w0 = plant.omega_0
@@ -87,6 +88,8 @@ def sensitivities(
         fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
     if figures is None:
         figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    if figures.certified and not np.isfinite(gradient).all():
+        figures = replace(figures, outcome=Outcome.NO_DERIVATIVES)
     gradient[0] *= w0
     with np.errstate(invalid="ignore", divide="ignore"):
         values = np.array(

@@ -12,11 +12,11 @@ from itertools import product
 
 import numpy as np
 
-from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.modal import ModalPlant, Suspension, modal_plant
-from ccd_casadi.plant import Array, Plant, PlantError, mechanics, theta_words
+from ccd_casadi.plant import Plant, PlantError, mechanics, theta_words
+from ccd_casadi.plant_facts import PlantFacts, facts_of
 from ccd_casadi.problem import CoDesignProblem, plant_of
-from ccd_casadi.scaling import ScaledPlant, scale_plant, transmission_zeros
+from ccd_casadi.scaling import scale_plant
 
 HZ = 2.0 * np.pi
 MAX_CORNERS = 16
@@ -52,43 +52,6 @@ class Finding:
     topic: Topic
     words: str
     index: int
-
-
-@dataclass(frozen=True)
-class Mode:
-    """One mode of the undamped plant; driven and measured: its gains over the largest."""
-
-    frequency_hz: float
-    damping_ratio: float
-    rigid: bool
-    driven: float
-    measured: float
-
-
-@dataclass(frozen=True)
-class Zero:
-    """A transmission zero: |z| in Hz, its damping ratio (negative: right half-plane), and its dip.
-
-    `dip`: the plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
-    """
-
-    frequency_hz: float
-    damping_ratio: float
-    dip: float
-
-
-@dataclass(frozen=True)
-class PlantFacts:
-    """A plant at one θ. `effort_hz`: where M_K σ_r(G) first falls below 1; nan if nowhere.
-
-    σ_r is the r-th singular value, r the number of rigid-body modes where there are fewer of them
-    than inputs and outputs: what is held by a spring anyway needs no force at low frequency.
-    """
-
-    theta: tuple[float, ...]
-    modes: tuple[Mode, ...]
-    zeros: tuple[Zero, ...]
-    effort_hz: float
 
 
 def points_to_check(problem: CoDesignProblem) -> list[tuple[float, ...]]:
@@ -128,8 +91,7 @@ def diagnose(
             words = str(error) if "at theta" in str(error) else f"{error} {place}"
             findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
             continue
-        effort = _effort_hz(modal, scaled)
-        found = PlantFacts(theta, _modes(modal), _zeros(scaled, effort), effort)
+        found = facts_of(theta, modal, scaled)
         findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
         findings += _hidden(modal, index, place)
         findings += _about_zeros(found, problem.inner.S_max, index)
@@ -171,18 +133,6 @@ def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
             )
             found.append(Finding(Severity.ERROR, Topic.DOMAIN, words, 0))
     return found
-
-
-def _modes(modal: ModalPlant) -> tuple[Mode, ...]:
-    b = np.linalg.norm(modal.B, axis=1)
-    c = np.linalg.norm(modal.C, axis=0)
-    zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))
-    return tuple(
-        Mode(float(w) / HZ, float(z), bool(r), float(drive), float(seen))
-        for w, z, r, drive, seen in zip(
-            modal.natural, zeta, modal.rigid, b / b.max(), c / c.max(), strict=True
-        )
-    )
 
 
 def _clusters(modal: ModalPlant) -> list[np.ndarray]:
@@ -259,44 +209,6 @@ def _rigid(
         )
         return [Finding(Severity.WARNING, Topic.RIGID_MODES, words, index)]
     return []
-
-
-def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
-    """The first frequency at which M_K σ_r(G) falls through 1."""
-    order = min(plant.B.shape[1], plant.C.shape[0])
-    order = min(order, int(modal.rigid.sum()) or order)
-    G = prepare(plant.A, plant.B, plant.C)
-    grid = plant.grid[plant.grid > 1e-4]
-    gain = np.array(
-        [np.linalg.svd(response(G, w), compute_uv=False)[order - 1] for w in grid]
-    ).clip(1e-300)
-    below = np.flatnonzero((gain[1:] < 1.0) & (gain[:-1] >= 1.0))
-    if not below.size:
-        return float("nan")
-    i = int(below[0])
-    x, y = np.log(grid[i : i + 2]), np.log(gain[i : i + 2])
-    return float(np.exp(x[0] - y[0] * (x[1] - x[0]) / (y[1] - y[0])) * plant.omega_0 / HZ)
-
-
-def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
-    """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
-    limit = 3.0 * effort_hz * HZ / plant.omega_0
-    found = []
-    for zero in transmission_zeros(plant.A, plant.B, plant.C):
-        size = abs(zero)
-        if zero.imag < 0.0 or not 1e-3 * limit < size < limit:
-            continue
-        gain = np.exp(
-            np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), np.log(plant.grid), _log(plant))
-        )
-        dip = gain[1] / np.sqrt(gain[0] * gain[2])
-        damping = -zero.real / size
-        found.append(Zero(float(size * plant.omega_0 / HZ), float(damping), float(dip)))
-    return tuple(sorted(found, key=lambda zero: zero.frequency_hz))
-
-
-def _log(plant: ScaledPlant) -> Array:
-    return np.asarray(np.log(np.maximum(plant.gain, 1e-300)))
 
 
 def _about_zeros(facts: PlantFacts, S_max: float, index: int) -> list[Finding]:

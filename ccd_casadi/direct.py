@@ -37,9 +37,13 @@ def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:
     if starts > 1:
         points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
     certified = [x for x in points if quantities.at(x).figures.certified]
+    if not certified:
+        reason = quantities.at(first).figures.outcome.value
+        message = f"none of {len(points)} starting designs is certified; the first: {reason}"
+        return FormulationResult(None, None, (), (), None, False, message)
     try:
         solution = solve_program(program, np.array(certified))
-    except (OuterFailure, IndexError) as error:
+    except OuterFailure as error:
         return FormulationResult(None, None, (), (), None, False, str(error))
     for optimum in solution.optima:
         if acceptable(problem, optimum.x, quantities.at(optimum.x)):

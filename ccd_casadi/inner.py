@@ -116,11 +116,15 @@ def refine(
                 best is None or step.figures.bandwidth > best.figures.bandwidth
             ):
                 best = step
-    swept = [row for row in rows if problem.feasible(row)]
-    top = max(swept, key=lambda row: row.bandwidth, default=None)
-    if top is not None and (best is None or top.bandwidth > best.figures.bandwidth):
-        best = evaluate(plant, weights, problem, (top.omega_S, top.omega_T))
-        tried.append(best.figures)
+    swept = (row for row in rows if problem.feasible(row))
+    for row in sorted(swept, key=lambda row: -row.bandwidth):
+        if best is not None and best.figures.bandwidth >= row.bandwidth:
+            break
+        other = evaluate(plant, weights, problem, (row.omega_S, row.omega_T))
+        tried.append(other.figures)
+        if problem.feasible(other.figures):  # not where its derivatives are lost
+            best = other
+            break
     if best is None:
         least = min((_violation(problem, row) for row in tried if row.certified), default=np.inf)
         words = shortfall(problem, tried)

@@ -35,6 +35,7 @@ class Outcome(StrEnum):
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
     LOST_IN_ROUNDING = "the controller in SI is not certified again: the loop hangs on lost digits"
+    NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 
 

@@ -1,0 +1,62 @@
+"""Designs that are certified while their derivatives are lost: passed over, never a traceback."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccd_casadi import derivatives as module
+from ccd_casadi.inner_command import main as inner
+from ccd_casadi.solve import main as solve
+
+CASE = Path(__file__).parent.parent / "runs" / "two_mass.toml"
+whole = module.design_with_gradients
+
+
+def lose(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """A share of all designs, chosen by their weights, without derivatives."""
+
+    def losing(A: Any, B: Any, C: Any, w: Any, *more: Any) -> Any:
+        row, Ak, Bk, Ck, gradient, fixed, gaps = whole(A, B, C, w, *more)
+        if (w[2] * w[7] * A.sum() * 1e6) % 1.0 < share:
+            gradient, fixed = np.full_like(gradient, np.nan), np.full_like(fixed, np.nan)
+        return row, Ak, Bk, Ck, gradient, fixed, gaps
+
+    monkeypatch.setattr(module, "design_with_gradients", losing)
+
+
+@pytest.mark.parametrize("formulation", ["direct", "lifted"])
+def test_the_optimum_is_found_past_designs_without_derivatives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
+) -> None:
+    lose(monkeypatch, 0.2)
+    words = [str(CASE), "--out", str(tmp_path), "--quiet", "--workers", "1"]
+    assert solve([*words, "--formulation", formulation]) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "verified"
+    assert result["objective"] == pytest.approx(-439.46482, abs=2e-5)
+
+
+@pytest.mark.parametrize("formulation", ["direct", "lifted", "nested"])
+def test_without_any_derivatives_nothing_is_claimed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    formulation: str,
+) -> None:
+    lose(monkeypatch, 1.0)
+    words = [str(CASE), "--out", str(tmp_path), "--quiet", "--workers", "1"]
+    assert solve([*words, "--formulation", formulation]) in (3, 4)
+    assert "certified" in capsys.readouterr().err
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] in ("infeasible", "not_verified")
+
+
+def test_the_inner_problem_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lose(monkeypatch, 1.0)
+    assert inner([str(CASE), "--theta", "m1=60,m2=60"]) == 3
+    assert "its derivatives are lost in rounding" in capsys.readouterr().out
