@@ -17,8 +17,9 @@ from helpers import (
 )
 
 from ccd_casadi.closed_loop import handed_out, local_peaks, measure, responses
+from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.scaling import ScaledPlant, StateSpace
-from ccd_casadi.synthesis import Design, Outcome, synthesise
+from ccd_casadi.synthesis import Design, Outcome, figures_from_row, synthesise
 
 
 @pytest.fixture(scope="module", params=["two masses", "flexible"])
@@ -94,6 +95,18 @@ def test_a_loop_that_hangs_on_last_digits_is_lost() -> None:
 
 def replace_A(system: StateSpace, A: np.ndarray) -> StateSpace:
     return StateSpace(A, system.B, system.C, system.D)
+
+
+@pytest.mark.parametrize("name", Code.__members__)
+def test_each_code_of_the_kernels_is_one_outcome(name: str) -> None:
+    """No two codes and no two columns are the same number."""
+    assert len(Code) == len(Code.__members__)
+    assert [int(column) for column in Figure] == list(range(int(Figure.COUNT) + 1))
+    row = np.zeros(int(Figure.COUNT))
+    row[Figure.CODE] = Code[name]
+    figures = figures_from_row(row, 1.0, 1.0, 1.0)
+    assert figures.outcome is Outcome[name]
+    assert figures.certificate.passed == (name in ("CERTIFIED", "NO_BANDWIDTH"))
 
 
 def test_every_peak_of_s_above_one_is_listed(made: tuple[ScaledPlant, Design]) -> None:
