@@ -123,7 +123,7 @@ def test_gradients_that_the_blocks_do_not_give_are_the_whole_plants(monkeypatch)
     tries.clear()
     found = sensitivities(alone, WEIGHTS, omega_low=HZ)
     assert len(tries) == 1
-    assert found.figures.certified
+    assert found.figures.certificate.passed
     assert np.isnan(found.to_theta).all()
 
 
