@@ -23,6 +23,7 @@ ModelFunction = Callable[..., Mapping[str, Any]]
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 # Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
 LARGEST = {"mass": 1000, "input": 100, "output": 100}
+LARGEST_ENTRY = 1e100  # its square is still a double
 _KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
 
 
@@ -158,6 +159,10 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
     values = (M, system.D, K, system.B, system.C, *system.derivatives)
     if not all(np.isfinite(value).all() for value in values):
         raise PlantError(f"the plant is not finite at theta = {theta_words(plant, theta)}")
+    if max(np.abs(value).max(initial=0.0) for value in values) > LARGEST_ENTRY:
+        place = f"at theta = {theta_words(plant, theta)}"
+        words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}; choose other units"
+        raise PlantError(words)
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():

@@ -6,6 +6,7 @@ import random
 import shutil
 import sqlite3
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -160,10 +161,11 @@ def spoil_folder(rng: random.Random, folder: Path) -> str:
         if name.endswith(".sqlite"):
             return f"{name}: {spoil_store(rng, path)}"
         if name == "case.toml":
-            data = tomllib.loads(path.read_text())
-            note = mutate(rng, data)
-            path.write_bytes(toml(data).encode("utf-8", "surrogatepass"))
-            return f"{name}: {note}"
+            with suppress(ValueError):  # what was spoilt before may be no TOML any more
+                data = tomllib.loads(path.read_text())
+                note = mutate(rng, data)
+                path.write_bytes(toml(data).encode("utf-8", "surrogatepass"))
+                return f"{name}: {note}"
         kind = "bytes"
     if kind == "bytes":
         content, note = spoil(rng, path.read_bytes())

@@ -173,6 +173,7 @@ def test_a_users_plant_that_is_none_is_refused(
         (GOOD + " | {'mass': ca.diag(ca.vertcat(60 - t['m1'], 1))}", "mass is not positive def"),
         (GOOD + " | {'stiffness': math.nan * ca.DM.ones(2, 2)}", "is not finite at theta = m1="),
         (GOOD + " | {'stiffness': ca.DM([[1, 2], [3, 4]])}", "stiffness is not symmetric"),
+        (GOOD + " | {'output': 1e200 * ca.DM([[1, 0]])}", "an entry beyond 1e+100 at theta"),
     ],
 )
 def test_a_plant_that_fails_at_some_theta_is_refused(
