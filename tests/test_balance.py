@@ -129,6 +129,13 @@ def test_balancing_of_few_entries_of_few_sizes(N: int, data: st.DataObject) -> N
             assert entries_of(other).sum() >= M.sum() * (1.0 - 1e-12)
 
 
+def test_balancing_by_hand() -> None:
+    """The sum is 1/τ + 16 τ + 16 τ²: 33, 14, 9, 10.25 for τ = 1, 1/2, 1/4, 1/8."""
+    H = np.zeros((4, 4))
+    H[0, 3], H[1, 0], H[2, 0] = 1.0, -16.0, 16.0
+    assert balancing(H).tolist() == [0.25, 1.0]  # the second state's entries would only shrink
+
+
 def test_noise_is_what_rounding_leaves_of_a_positive_matrix() -> None:
     for item in LOST:
         A, B, C, w, *_ = arguments(item)

@@ -408,3 +408,19 @@ def test_the_step_to_the_root_is_of_order_four(level) -> None:  # type: ignore[n
     assert (ratios > 11.0).all()  # of order three they would tend to eight
     assert (np.array(estimates) > errors).all()
     assert (np.array(estimates) < 100.0 * np.array(errors)).all()
+
+
+@pytest.mark.parametrize("seed", [0, 15, 27])
+def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> None:
+    """From either side, where the root is well conditioned."""
+    case = flexible_case(seed)
+    plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
+    gp = generalized_plant(plant.A, plant.B, plant.C, w)
+    H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
+    gamma = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
+    top = gamma**2 - gp[5] ** 2
+    for off in (-0.1, -0.03, 0.03, 0.1):
+        t = (1.0 + off) * top
+        f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, riccati.NOISE)
+        step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t))
+        assert abs(t / (1.0 + step * t) - top) < top * estimate * top

@@ -1,6 +1,7 @@
 """Plant, modal form and scaling against responses formed directly from the SI matrices."""
 
 import re
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.modal import Suspension, modal_plant
 from ccd_casadi.plant import Mechanics, PlantError, build_plant, mechanics
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant, transmission_zeros
 
 GRID = np.geomspace(0.05, 1000.0, 200) * HZ
 shapes = st.fixed_dictionaries(
@@ -101,6 +102,20 @@ def test_grid_resolves_every_resonance_and_zero(seed: int, rigid: int) -> None:
     for i in interior:
         near = np.abs(np.log(plant.grid / fine[i])) < 0.15
         assert plant.gain[near].min() < 1.5 * gain[i]
+
+
+@pytest.mark.parametrize("damping_ratio", [0.0, 1e-6, 0.01])
+def test_the_grid_has_nine_points_about_each_root(damping_ratio: float) -> None:
+    """Within 4.5 times the distance to the axis, or 1e-9 of the frequency for a root on it."""
+    system = masses_on_springs(20.0, 70.0, 300.0, outputs=np.ones((1, 3)))
+    plant = scaled(replace(system, damping_ratio=damping_ratio), 1e5)
+    poles = np.linalg.eigvals(plant.A)
+    roots = np.concatenate([poles, transmission_zeros(plant.A, plant.B, plant.C)])
+    roots = roots[(roots.imag > 0.0) & (np.abs(roots) < 1e5)]
+    assert len(roots) > len(poles) / 2
+    for root in roots:
+        half = max(abs(root.real), 1e-9 * root.imag)
+        assert (np.abs(plant.grid - root.imag) <= 4.5 * half).sum() >= 9
 
 
 @pytest.mark.parametrize(
