@@ -1,6 +1,6 @@
 """Whole solves for hours in one process: does memory grow, do files or threads stay open?
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/endurance.py [--hours 2] [--seed 0] [--out FILE]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/endurance.py [--hours 2] [--trim] [--out FILE]
 
 Every round is the command `solve` on a case that was not there before (bounds, weights, objective
 drawn anew, formulations in turn, own plant file every fourth), in a folder of its own that is
@@ -11,6 +11,7 @@ quarters have a slope that is worth its scatter.
 
 import argparse
 import contextlib
+import ctypes
 import gc
 import io
 import json
@@ -58,9 +59,11 @@ def case_of(rng: random.Random, own_plant: bool, folder: Path) -> str:
     return text + QUICK
 
 
-def measured() -> dict[str, float]:
-    """Memory of this process alone in MB, open files, threads."""
+def measured(trim: bool) -> dict[str, float]:
+    """Memory of this process alone in MB, open files, threads; `trim`: freed pages given back."""
     gc.collect()
+    if trim:
+        ctypes.CDLL(None).malloc_trim(0)
     process = psutil.Process()
     return {
         "mb": process.memory_full_info().uss / 1e6,
@@ -95,6 +98,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--trim", action="store_true", help="without what malloc keeps (glibc)")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     rng, rounds, began = random.Random(options.seed), [], time.monotonic()
@@ -109,7 +113,7 @@ def main() -> None:
                 code = solve(words)
         if code not in (0, 4):
             sys.exit(f"round {number} ended with {code}: {errors.getvalue()[-500:]}")
-        rounds.append({"code": code} | measured())
+        rounds.append({"code": code} | measured(options.trim))
         if number >= 20 and number % 20 == 0:
             figures = summed(rounds, options.seed, spent)
             options.out.write_text(json.dumps(figures, indent=2) + "\n")
