@@ -26,6 +26,8 @@ DESIGN_TESTS = tuple(
     for name in (
         "weights",
         "kernel_parts",
+        "loop_gains",
+        "gamma_search",
         "certificate",
         "balance",
         "synthesis",

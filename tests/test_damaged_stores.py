@@ -1,6 +1,5 @@
 """Stores that are damaged, foreign, locked or out of place: one line, and left alone."""
 
-import os
 import random
 import re
 import shutil
@@ -137,7 +136,6 @@ def test_a_place_that_holds_no_file_is_told(tmp_path: Path, name: str) -> None:
     assert "give a writable folder with --out" in refusal(places[name])
 
 
-@pytest.mark.skipif(not hasattr(os, "setuid"), reason="needs POSIX users")
 def test_a_read_only_store_is_told() -> None:
     """Root ignores permissions, so a child that gave them up tries it."""
     code = (

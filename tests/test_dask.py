@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import sys
 from pathlib import Path
 
@@ -84,8 +83,8 @@ def test_a_worker_with_other_numerics_is_refused(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")
 def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The certificate is made with the command `openssl`."""
     import dask
     import distributed  # noqa: F401  # its settings must be there before they are changed
 

@@ -1,0 +1,78 @@
+"""One smooth function of three inputs of different units, and a surrogate of each kind."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from surrogates import (
+    Hyperparameters,
+    Surrogate,
+    checked,
+    condition,
+    design,
+    fit,
+    fit_network,
+    fit_radial_basis,
+    fit_sparse,
+)
+from surrogates.transform import exponential, logarithms
+
+LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
+SPAN = HIGH - LOW
+W = np.array([1.0, 2.0, 1.5])
+
+
+def f(X: np.ndarray) -> np.ndarray:
+    return 50.0 * np.exp(np.sin((X - LOW) / SPAN @ W))
+
+
+def slopes(X: np.ndarray) -> np.ndarray:
+    return f(X)[:, None] * np.cos((X - LOW) / SPAN @ W)[:, None] * W / SPAN
+
+
+X = design("sobol", LOW, HIGH, 48, seed=1)
+Y, DY = f(X), slopes(X)
+T = design("lhs", LOW, HIGH, 60, seed=2)
+BOX = {"lower": LOW, "upper": HIGH}
+
+
+def process(kernel: str, gradients: bool) -> Surrogate:
+    p = Hyperparameters(np.array([0.7, 0.5, 0.6]), 2.0, 1e-5, 1e-4)
+    return condition(p, X, Y, **BOX, kernel=kernel, dY=DY if gradients else None)
+
+
+def logarithmic() -> Surrogate:
+    samples = checked(X, Y, **BOX, dY=DY)
+    logs = logarithms(samples)
+    p = Hyperparameters(np.array([0.7, 0.5, 0.6]), 2.0, 1e-5, 1e-4)
+    return exponential(condition(p, X, logs.Y, **BOX, dY=logs.dY), samples)
+
+
+MAKERS = {
+    "matern52": lambda: process("matern52", False),
+    "rbf": lambda: process("rbf", False),
+    "matern52+gradients": lambda: process("matern52", True),
+    "rbf+gradients": lambda: process("rbf", True),
+    "polynomial": lambda: fit(X, Y, **BOX, kind="polynomial"),
+    "polynomial+gradients": lambda: fit(X, Y, DY, **BOX, kind="polynomial"),
+    "cubic": lambda: fit_radial_basis(checked(X, Y, **BOX), "cubic", smoothing=0.0),
+    "quintic": lambda: fit_radial_basis(checked(X, Y, **BOX), "quintic", smoothing=1e-6),
+    "multiquadric": lambda: fit_radial_basis(checked(X, Y, **BOX), "multiquadric", 2.0),
+    "gaussian": lambda: fit_radial_basis(checked(X, Y, **BOX), "gaussian", 2.0),
+    "network": lambda: fit_network(checked(X, Y, **BOX), (8, 6), seed=3),
+    "sparse": lambda: fit_sparse(checked(X, Y, **BOX, noise=0.01), inducing=30, starts=1),
+    "log(process)": lambda: logarithmic(),
+    "log(radial)": lambda: fit(X, Y, **BOX, kind="radial_basis", transform="log"),
+}
+MADE: dict[str, Surrogate] = {}
+MEMBERS = pytest.mark.parametrize("name", list(MAKERS))
+
+
+def member(name: str) -> Surrogate:
+    if name not in MADE:  # the same surrogate serves several tests; it is immutable
+        MADE[name] = MAKERS[name]()
+    return MADE[name]
+
+
+def flat(value: ca.DM) -> np.ndarray:
+    return np.array(value).ravel()

@@ -1,0 +1,142 @@
+"""The search for γ_opt: guesses in sweeps, the Riccati level, the step to its root."""
+
+import numpy as np
+import pytest
+from helpers import (
+    HZ,
+    OMEGA_LOW,
+    PAPER,
+    flexible_case,
+    two_mass,
+)
+from kernel_draws import WEIGHTS
+
+from ccd_casadi.kernels import design, riccati
+from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.synthesis import synthesise
+
+
+def test_the_guess_is_exact_where_gamma_is_a_product_of_powers() -> None:
+    """ln γ = a ln ω_S + b ln ω_T: every point but the first and those beside it is foretold."""
+    x, y = [0.0, 0.7, 1.1, 2.0], [0.3, 0.9, 1.0, 1.6]
+    found = np.full((4, 4), np.nan)
+    for j in range(4):
+        side = 1 if j % 2 == 0 else -1
+        for step in range(4):
+            i = step if side == 1 else 3 - step
+            guess = design._guess(found, x, y, i, j, side, step)
+            found[i, j] = 0.8 * x[i] - 0.5 * y[j]
+            if (step, j) == (0, 0):
+                assert guess == 0.0
+            elif (step, j) == (1, 0):
+                assert guess == pytest.approx(np.exp(found[0, 0]))
+            elif (step, j) != (0, 1):
+                assert guess == pytest.approx(np.exp(found[i, j]), rel=1e-12)
+
+
+def test_a_guess_from_what_was_not_certified_is_the_last_one_or_none() -> None:
+    x = y = [0.0, 1.0, 2.0]
+    found = np.full((3, 3), np.nan)
+    found[1, 0] = 0.4
+    assert design._guess(found, x, y, 2, 0, 1, 2) == pytest.approx(np.exp(0.4))
+    found[1, 0] = np.nan
+    assert design._guess(found, x, y, 2, 0, 1, 2) == 0.0
+
+
+def test_a_sweep_needs_fewer_schur_forms_than_its_points_alone() -> None:
+    plant = two_mass(58.0, 63.0)
+    omega_S = np.geomspace(10, 2000, 6) * HZ / plant.omega_0
+    omega_T = np.geomspace(20, 1000, 5) * HZ / plant.omega_0
+    w = PAPER.scaled(plant.omega_0)
+    numbers = (plant.grid, plant.gain, 1.02, OMEGA_LOW / plant.omega_0)
+    rows = design.sweep(plant.A, plant.B, plant.C, w, omega_S, omega_T, *numbers)
+    alone = 0.0
+    for i, S in enumerate(omega_S):
+        for j, T in enumerate(omega_T):
+            w[2], w[7] = S, T
+            row = design.design(plant.A, plant.B, plant.C, w, *numbers, 0.0)[0]
+            alone += row[design.Figure.SCHUR_FORMS]
+            assert rows[i, j, design.Figure.GAMMA_OPT] == pytest.approx(
+                row[design.Figure.GAMMA_OPT], rel=1e-9
+            )
+    assert rows[:, :, design.Figure.SCHUR_FORMS].sum() < 0.7 * alone
+
+
+def test_the_search_for_gamma_takes_few_schur_forms() -> None:
+    """Newton's method in 1/t from afar, and the step of order four from a guess 1 % off."""
+    plant = two_mass(58.0, 63.0)
+    numbers = (plant.grid, plant.gain, 1.02, OMEGA_LOW / plant.omega_0)
+    cold, near = [], []
+    for S in np.geomspace(10, 2000, 8) * HZ:
+        for T in np.geomspace(20, 1000, 5) * HZ:
+            arguments = (plant.A, plant.B, plant.C, PAPER.at(S, T).scaled(plant.omega_0), *numbers)
+            row = design.design(*arguments, 0.0)[0]
+            cold.append(row[design.Figure.SCHUR_FORMS])
+            for factor in (0.99, 1.01):
+                again = design.design(*arguments, factor * row[design.Figure.GAMMA_OPT])[0]
+                near.append(again[design.Figure.SCHUR_FORMS])
+    assert np.mean(cold) < 4.0
+    assert max(cold) <= 8
+    assert np.mean(near) < 2.2
+
+
+@pytest.fixture(scope="module")
+def level():  # type: ignore[no-untyped-def]
+    """`riccati_level` of a design as a function of t, t at γ_opt, and what `root_nearby` takes."""
+    plant = two_mass(58.0, 63.0)
+    _, B1, B2, C1, _, d1, d2 = gp = generalized_plant(
+        plant.A, plant.B, plant.C, WEIGHTS.scaled(plant.omega_0)
+    )
+    H0 = riccati.lqr_hamiltonian(gp[0], B2, C1, d2, 1, 1)
+    gamma = synthesise(plant, WEIGHTS, omega_low=OMEGA_LOW).figures.gamma_opt
+
+    def at(t: float):  # type: ignore[no-untyped-def]
+        return riccati.riccati_level(H0, B1, C1, d1, t, riccati.NOISE)
+
+    return at, gamma**2 - d1**2, (B1, C1, d1)
+
+
+@pytest.mark.parametrize("factor", [0.9, 0.999, 1.01, 2.0, 10.0])
+def test_the_slope_of_the_riccati_level_is_that_of_its_differences(level, factor: float) -> None:
+    """Also where X is no longer positive; zero at γ_opt, increasing in t."""
+    at, top, _ = level
+    t = factor * top
+    f, slope, ok, _ = at(t)
+    assert ok
+    assert (f > 0.0) == (factor > 1.0)
+    h = 1e-4 * t
+    found = (8.0 * (at(t + h)[0] - at(t - h)[0]) - at(t + 2 * h)[0] + at(t - 2 * h)[0]) / (12.0 * h)
+    assert slope > 0.0
+    assert slope == pytest.approx(found, rel=1e-6)
+
+
+def test_the_step_to_the_root_is_of_order_four(level) -> None:  # type: ignore[no-untyped-def]
+    """Half as far away the error is a sixteenth at last, and the estimate of it is no smaller."""
+    at, top, parts = level
+    errors, estimates = [], []
+    for off in (0.08, 0.04, 0.02):
+        t = (1.0 + off) * top
+        f, slope, _, frame = at(t)
+        step, estimate = riccati.root_nearby(*parts, frame, f / (slope * t * t))
+        errors.append(abs(t / (1.0 + step * t) - top) / top)
+        estimates.append(estimate * top)
+    ratios = np.array(errors[:-1]) / np.array(errors[1:])
+    assert (ratios > 11.0).all()  # of order three they would tend to eight
+    assert (np.array(estimates) > errors).all()
+    assert (np.array(estimates) < 100.0 * np.array(errors)).all()
+
+
+@pytest.mark.parametrize("seed", [0, 15, 27])
+def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> None:
+    """From either side, where the root is well conditioned."""
+    case = flexible_case(seed)
+    plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
+    gp = generalized_plant(plant.A, plant.B, plant.C, w)
+    H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
+    gamma = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
+    top = gamma**2 - gp[5] ** 2
+    for off in (-0.1, -0.03, 0.03, 0.1):
+        t = (1.0 + off) * top
+        f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, riccati.NOISE)
+        step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t))
+        assert abs(t / (1.0 + step * t) - top) < top * estimate * top
