@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.known import known_designs
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore, problem_hash, sample_key
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parent.parent
 UNIT = 20  # rows a transaction, as many as an inner problem takes

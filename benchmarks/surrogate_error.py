@@ -14,11 +14,12 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.case import HZ, load_case, problem_of
-from ccd_casadi.outer import lifted_bounds
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.units import HZ
 from surrogates import Surrogate, design, fit_maximum, fit_outputs, pieces_of
 from surrogates.maximum import least_of_a_piece
 

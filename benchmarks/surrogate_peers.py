@@ -141,11 +141,11 @@ def _smt(model, T):
 
 def lifted(designs):
     """The lifted data of case study 1: 128 samples, 1,000 unseen, with the issue's limits."""
-    from ccd_casadi.case import load_case, problem_of
-    from ccd_casadi.outer import lifted_bounds
-    from ccd_casadi.parallel import Workers
-    from ccd_casadi.samples import SampleStore
-    from ccd_casadi.sampling import Truth
+    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.codesign.outer_problem import lifted_bounds
+    from ccd_casadi.sampling.sampler import Truth
+    from ccd_casadi.sampling.store import SampleStore
+    from ccd_casadi.support.process_pool import Workers
 
     problem = problem_of(load_case(HERE.parent / "runs" / "two_mass.toml"))
     lower, upper = lifted_bounds(problem)

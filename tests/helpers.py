@@ -15,16 +15,16 @@ from hypothesis import settings
 from scipy.linalg import sqrtm
 from scipy.optimize import brentq, minimize_scalar
 
-from ccd_casadi.inner import InnerProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.kernels.design import assess
 from ccd_casadi.kernels.figures import Figure
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.models import MODELS
-from ccd_casadi.plant import Mechanics, Plant, build_plant, mechanics
-from ccd_casadi.problem import CoDesignProblem, PlantSource
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant
-from ccd_casadi.synthesis import DesignFigures, figures_from_row
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
+from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row
+from ccd_casadi.synthesis.weights import Weights
 
 Array = np.ndarray
 HZ = 2.0 * np.pi

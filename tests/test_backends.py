@@ -15,9 +15,13 @@ from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.backends.attempt import Backend
-from ccd_casadi.backends.mixed import BackendResult, synthesise_with
-from ccd_casadi.backends.standard_plant import (
+from ccd_casadi.cross_check import main
+from ccd_casadi.plants.scaling import StateSpace, scale_state_space
+from ccd_casadi.support.optional_packages import MissingPackage
+from ccd_casadi.synthesis.backends.attempt import Backend
+from ccd_casadi.synthesis.backends.judgement import verdicts
+from ccd_casadi.synthesis.backends.mixed import BackendResult, synthesise_with
+from ccd_casadi.synthesis.backends.standard_plant import (
     StandardPlant,
     close,
     mixed_sensitivity,
@@ -26,10 +30,7 @@ from ccd_casadi.backends.standard_plant import (
     with_d22,
     without_d22,
 )
-from ccd_casadi.cross_check import main, verdicts
-from ccd_casadi.norms import hinf_norm
-from ccd_casadi.optional import MissingPackage
-from ccd_casadi.scaling import StateSpace, scale_state_space
+from ccd_casadi.synthesis.norms import hinf_norm
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -18,9 +18,9 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati import NOISE, lqr_hamiltonian
 from ccd_casadi.kernels.synthesis import synthesise
-from ccd_casadi.plant import Array
-from ccd_casadi.scaling import StateSpace
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.weights import Weights
 
 LOST: list[dict[str, Any]] = json.loads(
     (Path(__file__).parent / "data" / "badly_scaled.json").read_text()

@@ -16,10 +16,10 @@ from helpers import (
     two_mass,
 )
 
-from ccd_casadi.closed_loop import handed_out, local_peaks, measure, responses
 from ccd_casadi.kernels.figures import Code, Figure
-from ccd_casadi.scaling import ScaledPlant, StateSpace
-from ccd_casadi.synthesis import Design, Outcome, figures_from_row, synthesise
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks, measure, responses
+from ccd_casadi.synthesis.synthesis import Design, Outcome, figures_from_row, synthesise
 
 
 @pytest.fixture(scope="module", params=["two masses", "flexible"])

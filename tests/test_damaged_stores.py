@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from rows import sample
 
-from ccd_casadi import samples as module
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.errors import UserError
-from ccd_casadi.known import known_designs
-from ccd_casadi.samples import SampleStore, SampleStoreError
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.sampling import store as module
+from ccd_casadi.sampling.store import SampleStore, SampleStoreError
+from ccd_casadi.support.errors import UserError
 
 
 def use(path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_read_only_store_is_told() -> None:
     """Root ignores permissions, so a child that gave them up tries it."""
     code = (
         "import os, sys\n"
-        "from ccd_casadi.samples import *\n"
+        "from ccd_casadi.sampling.store import *\n"
         "if os.getuid() == 0: os.setgid(65534); os.setuid(65534)\n"
         "try:\n"
         "    with SampleStore(sys.argv[1]) as store: store.put_problem('p', {})\n"

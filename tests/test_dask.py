@@ -12,13 +12,13 @@ from helpers import problem
 from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 
-from ccd_casadi import cluster as module
 from ccd_casadi import solve
-from ccd_casadi.cluster import Cluster
-from ccd_casadi.errors import UserError
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling import cluster as module
+from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 
 
 def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ from helpers import problem
 from test_sampling import command, rows, started, table, wait_for_rows
 
 from ccd_casadi import solve
-from ccd_casadi.cluster import Cluster
-from ccd_casadi.parallel import WorkerLost, Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import WorkerLost, Workers
 
 pytestmark = pytest.mark.slow
 

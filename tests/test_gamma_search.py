@@ -13,7 +13,7 @@ from kernel_draws import WEIGHTS
 
 from ccd_casadi.kernels import design, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant
-from ccd_casadi.synthesis import synthesise
+from ccd_casadi.synthesis.synthesis import synthesise
 
 
 def test_the_guess_is_exact_where_gamma_is_a_product_of_powers() -> None:

@@ -10,9 +10,9 @@ from ccd_casadi.kernels import bound_peak, pullback
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, plant_gain
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
-from ccd_casadi.plant import mechanics
-from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.synthesis.weights import Weights
 
 
 def plain(kernel):  # type: ignore[no-untyped-def]

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.direct import polish
-from ccd_casadi.errors import UserError
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.pareto import Front, pareto_front
+from ccd_casadi.codesign.post_optimal import post_optimal
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.insight import main
-from ccd_casadi.parallel import Workers
-from ccd_casadi.pareto import Front, pareto_front
-from ccd_casadi.plant import Array
-from ccd_casadi.post_optimal import post_optimal
-from ccd_casadi.problem import CoDesignProblem, true_inner
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.models import MODELS
+from ccd_casadi.plants.registry import MODELS
 
 def model(theta):
     bowl = (theta["m1"] - 58.0) ** 2 + (theta["m2"] - 59.0) ** 2
@@ -87,7 +87,7 @@ def _objective(problem: CoDesignProblem, x: Array) -> float:
     inner = problem.inner
     omega = np.clip(np.exp(x[2:]), [inner.omega_S[0], inner.omega_T[0]],
                     [inner.omega_S[1], inner.omega_T[1]])  # fmt: skip
-    from ccd_casadi.problem import true_design
+    from ccd_casadi.inner_problem.problem import true_design
 
     design = true_design(problem, tuple(x[:2]), float(omega[0]), float(omega[1]))
     return float(problem.w1 * bowl + problem.w2 * design.figures.bandwidth)

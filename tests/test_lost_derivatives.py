@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccd_casadi import derivatives as module
-from ccd_casadi.inner_command import main as inner
+from ccd_casadi.inner import main as inner
 from ccd_casadi.solve import main as solve
+from ccd_casadi.synthesis import derivatives as module
 
 CASE = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 whole = module.design_with_gradients

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.parallel import _THREADS, WorkerLost, Workers, usable_cores
+from ccd_casadi.support.process_pool import _THREADS, WorkerLost, Workers, usable_cores
 
 HERE = Path(__file__).parent
 
@@ -188,8 +188,8 @@ PARENT = f"""
 import sys
 sys.path.insert(0, {str(HERE)!r})
 import ccd_casadi.solve  # as the command does: workers import it as they start
-from ccd_casadi.command_line import parser, run
-from ccd_casadi.parallel import Workers
+from ccd_casadi.support.command_line import parser, run
+from ccd_casadi.support.process_pool import Workers
 from test_parallel import pid_and_sleep
 
 def main(options):

@@ -10,18 +10,18 @@ from tempfile import mkdtemp
 import numpy as np
 import pytest
 
-from ccd_casadi.case import Case, load_case, problem_of
-from ccd_casadi.iterates import FormulationResult
-from ccd_casadi.parallel import Workers
-from ccd_casadi.problem import CoDesignProblem, true_inner
-from ccd_casadi.report import report_html, write_report
+from ccd_casadi.cases.case import Case, load_case, problem_of
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.run import Solution, solve
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.lifted_maximum import inner_maximum, mean
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
 from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
 from ccd_casadi.reporting.page import Section, Table, number, page, table_html
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
-from ccd_casadi.solve import Solution, solve
+from ccd_casadi.reporting.solve_page import report_html, write_report
+from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
 
 HZ = 2.0 * np.pi
 VOID = {"meta", "br", "img", "link", "input", "hr"}

@@ -17,8 +17,8 @@ import pytest
 from camel import entries
 
 import surrogates.truth as truth_module
-from ccd_casadi import sampling
-from ccd_casadi.retraining import open_run
+from ccd_casadi.reporting.retrained_run import open_run
+from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main as solve
 from surrogates import load, sobol
 from surrogates.acquisition import NEAR, distances
@@ -162,7 +162,7 @@ def test_a_damaged_case_is_told_in_one_line(
 JOB = """
 import sys
 from pathlib import Path
-from ccd_casadi.retraining import open_run
+from ccd_casadi.codesign.retraining import open_run
 import surrogates.truth as module
 
 class Point:

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from helpers import HZ, INNER, problem
 
-from ccd_casadi import sampling as module
-from ccd_casadi.parallel import Workers
-from ccd_casadi.problem import PlantSource
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import CHUNK, Truth
+from ccd_casadi.inner_problem.problem import PlantSource
+from ccd_casadi.sampling import sampler as module
+from ccd_casadi.sampling.sampler import CHUNK, Truth
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parent.parent
 TWO_MASS = ROOT / "runs" / "two_mass.toml"
@@ -330,10 +330,10 @@ def test_killed_and_resumed_ends_as_if_undisturbed(
 POOL = f"""
 import sys
 import numpy as np
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.sampler import Truth
 
 if __name__ == "__main__":
     problem = problem_of(load_case({str(TWO_MASS)!r}))

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.known import known_designs
-from ccd_casadi.lifted import fit_quantities
-from ccd_casadi.processes import best_left_out, kernels_of
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.lifted import fit_quantities
+from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import quantity_sample
-from ccd_casadi.surrogate_quality import quality_dict, recommendation, surrogate_quality
+from ccd_casadi.sampling.sampler import quantity_sample
+from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, Roughness, design, errors, fit
 
 HZ = 2.0 * np.pi

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.outer import lifted_bounds
-from ccd_casadi.plant import Array
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess
 from surrogates.kernels import radial
 
