@@ -140,8 +140,8 @@ def begun(kind: str, folder: Path) -> None:
         from surrogates import design
 
         shutil.copy(folder.parent / "quick.toml", folder / "case.toml")
-        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
-            truth.evaluate(design("sobol", truth.lower, truth.upper, 16, 0))
+        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as sampler:
+            sampler.evaluate(design("sobol", sampler.lower, sampler.upper, 16, 0))
 
 
 def started(words: list[str]) -> subprocess.Popen[str]:

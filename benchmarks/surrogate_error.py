@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.units import HZ
@@ -41,13 +41,13 @@ def main() -> None:
         Workers(1) as workers,
         threadpool_limits(limits=1),
     ):
-        truth = Truth(problem, store, workers)
-        unseen = truth.quantities(design("lhs", lower, upper, UNSEEN, seed=99))
+        sampler = Sampler(problem, store, workers)
+        unseen = sampler.quantities(design("lhs", lower, upper, UNSEEN, seed=99))
         X = np.array([sample.x for sample in unseen])
         Y = np.array([sample.values[:3] for sample in unseen])
         print(" syntheses      kind   ω_b, Hz   ‖S‖∞, % |S_low|, %  fit, s  cover")
         for count in COUNTS:
-            samples = truth.quantities(design("sobol", lower, upper, count, seed=0))
+            samples = sampler.quantities(design("sobol", lower, upper, count, seed=0))
             for kind in KINDS:
                 if kind != "plain" and count > 128:
                     continue  # 5 x 256 observations add nothing to the comparison

@@ -48,18 +48,18 @@ def main() -> None:
                 continue
             low, high, d = function.lower, function.upper, function.inputs
             T = design("lhs", low, high, UNSEEN, seed=99)
-            truth = function.sample(T)[0]
+            sampler = function.sample(T)[0]
             for seed, gradients in product(range(1, arguments.designs + 1), (False, True)):
                 X = design("lhs", low, high, (10 if gradients else 20) * d, seed=seed)
                 Y, dY = function.sample(X)
-                data = (X, Y, dY if gradients else None, low, high, T, truth)
+                data = (X, Y, dY if gradients else None, low, high, T, sampler)
                 rows += contest(function.name, *data)
     worse = verdict(rows)
     (HERE / "surrogate_peers.json").write_text(json.dumps(rows, indent=1) + "\n")
     raise SystemExit(bool(worse))
 
 
-def contest(name, X, Y, dY, low, high, T, truth):
+def contest(name, X, Y, dY, low, high, T, sampler):
     """Rows of ours and of SMT's on one set of samples."""
     rows = []
     contestants = [ours, krg if dY is None else gekpls]
@@ -69,7 +69,7 @@ def contest(name, X, Y, dY, low, high, T, truth):
         fitted = perf_counter()
         mean, std = predict(T)
         seconds = perf_counter() - fitted
-        error = mean - truth
+        error = mean - sampler
         rows.append(
             {
                 "function": name,
@@ -79,7 +79,7 @@ def contest(name, X, Y, dY, low, high, T, truth):
                 "method": method,
                 "ours": contestant is ours,
                 "rms": float(np.sqrt(np.mean(error**2))),
-                "relative": float(np.sqrt(np.mean(error**2)) / truth.std()),
+                "relative": float(np.sqrt(np.mean(error**2)) / sampler.std()),
                 "coverage": None if std is None else float(np.mean(np.abs(error) <= Z95 * std)),
                 "fit_seconds": fitted - began,
                 "microseconds": 1e6 * seconds / len(T),
@@ -143,7 +143,7 @@ def lifted(designs):
     """The lifted data of case study 1: 128 samples, 1,000 unseen, with the issue's limits."""
     from ccd_casadi.cases.case import load_case, problem_of
     from ccd_casadi.codesign.outer_problem import lifted_bounds
-    from ccd_casadi.sampling.sampler import Truth
+    from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
     from ccd_casadi.support.process_pool import Workers
 
@@ -154,10 +154,10 @@ def lifted(designs):
         SampleStore(Path(folder) / "samples.sqlite") as store,
         Workers(1) as workers,
     ):
-        truth = Truth(problem, store, workers)
-        unseen = truth.quantities(design("lhs", lower, upper, UNSEEN, seed=99))
+        sampler = Sampler(problem, store, workers)
+        unseen = sampler.quantities(design("lhs", lower, upper, UNSEEN, seed=99))
         sets = [
-            truth.quantities(design("sobol", lower, upper, 128, seed=seed))
+            sampler.quantities(design("sobol", lower, upper, 128, seed=seed))
             for seed in range(designs)
         ]
     T = np.array([s.x for s in unseen])
@@ -180,13 +180,13 @@ def lifted(designs):
     return rows
 
 
-def acceptance(X, Y, dY, lower, upper, T, truth, scale, unit):
+def acceptance(X, Y, dY, lower, upper, T, sampler, scale, unit):
     """What the case study itself fits (a Matérn process, noise estimated): error and bands."""
     began = perf_counter()
     s = fit(X, Y, dY, lower=lower, upper=upper, starts=1)
     seconds = perf_counter() - began
     mean, std = s.predict(T, return_std=True)
-    error = np.abs(mean - truth)
+    error = np.abs(mean - sampler)
     squares = np.sort(error**2)
     print(
         f"{'':24} as fitted by `lifted`{'' if dY is None else ' + gradients'}: rms "

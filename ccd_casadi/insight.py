@@ -17,7 +17,7 @@ from ccd_casadi.codesign.pareto import pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal
 from ccd_casadi.codesign.result import write_json
 from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
 from ccd_casadi.support.process_pool import PATIENCE
@@ -33,9 +33,9 @@ def command(options: argparse.Namespace) -> ExitCode:
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(done.folder / "samples.sqlite") as samples,
     ):
-        truth = Truth(done.problem, samples, workers, quiet=options.quiet)
+        sampler = Sampler(done.problem, samples, workers, quiet=options.quiet)
         front = pareto_front(
-            truth,
+            sampler,
             points=options.points,
             samples=done.case.sampling.lifted_points,
             tolerance=done.case.outer.tolerance,

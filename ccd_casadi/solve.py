@@ -12,7 +12,7 @@ from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.registry import SHIPPED
 from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
@@ -80,8 +80,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(store) as samples,
     ):
-        truth = Truth(problem, samples, workers, quiet=options.quiet)
-        solution = solve(case, truth, options.formulation, options.seed, given)
+        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+        solution = solve(case, sampler, options.formulation, options.seed, given)
         write_run(folder, case, solution)
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 

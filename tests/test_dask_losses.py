@@ -20,7 +20,7 @@ from test_sampling import command, rows, started, table, wait_for_rows
 
 from ccd_casadi import solve
 from ccd_casadi.sampling.cluster import Cluster
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import WorkerLost, Workers
 
@@ -87,7 +87,7 @@ class Counted(SampleStore):
 
 def serial(path: Path, thetas: np.ndarray) -> dict[str, list[tuple[Any, ...]]]:
     with SampleStore(path) as store:
-        Truth(problem(), store, Workers(1)).bandwidths(thetas)
+        Sampler(problem(), store, Workers(1)).bandwidths(thetas)
     return table(path)
 
 
@@ -141,10 +141,10 @@ def test_killed_workers_lose_no_sample_and_double_none(
         killer = threading.Thread(target=kill)
         killer.start()
         try:
-            truth = Truth(problem(), store, cluster)
+            sampler = Sampler(problem(), store, cluster)
             while killer.is_alive():
                 batches.append(box.uniform(55.0, 70.0, (20, 2)))
-                found = truth.bandwidths(batches[-1])
+                found = sampler.bandwidths(batches[-1])
                 assert [sample.theta for sample in found] == [tuple(t) for t in batches[-1]]
         finally:
             finished.set()

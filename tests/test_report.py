@@ -19,7 +19,7 @@ from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
 from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
 from ccd_casadi.reporting.page import Section, Table, number, page, table_html
 from ccd_casadi.reporting.solve_page import report_html, write_report
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
@@ -122,7 +122,7 @@ def run(name: str) -> tuple[Path, Case, CoDesignProblem, Solution, str]:
     case = load_case(path)
     problem = problem_of(case)
     with SampleStore(folder / "samples.sqlite") as store, Workers(1, 2.0) as workers:
-        solution = solve(case, Truth(problem, store, workers), formulation, 0)
+        solution = solve(case, Sampler(problem, store, workers), formulation, 0)
     written = write_report(folder, case, problem, solution)
     return folder, case, problem, solution, written.read_text(encoding="utf-8")
 

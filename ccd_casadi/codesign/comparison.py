@@ -18,7 +18,7 @@ from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_des
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import TraceEntry, Truth
+from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
@@ -81,9 +81,9 @@ def _formulation(
 ) -> Method:
     began = perf_counter()
     with SampleStore(folder / f"samples_{name}.sqlite") as store:
-        truth = Truth(problem, store, workers, quiet=quiet)
-        solution = solve(case, truth, name, seed)
-        trace = tuple(truth.trace)
+        sampler = Sampler(problem, store, workers, quiet=quiet)
+        solution = solve(case, sampler, name, seed)
+        trace = tuple(sampler.trace)
     figures = solution.result | {"seconds": perf_counter() - began}
     path = tuple(iterate.theta for iterate in solution.outcome.iterates)
     if solution.verified is not None:
@@ -172,15 +172,15 @@ def _sequential(
         problem, resonance, starts=starts, seed=seed, workers=workers
     )
     with SampleStore(folder / f"samples_{name}.sqlite") as store:
-        truth = Truth(problem, store, workers)
-        sample = truth.bandwidths(np.array(hardware.theta))[0]
-        trace = tuple(truth.trace)
-        spent = truth.syntheses
+        sampler = Sampler(problem, store, workers)
+        sample = sampler.bandwidths(np.array(hardware.theta))[0]
+        trace = tuple(sampler.trace)
+        spent = sampler.syntheses
         if not sample.feasible:
             figures = {"status": "infeasible", "reason": sample.shortfall, "syntheses": spent}
             return Method(name, figures, (hardware.theta,), trace)
         x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-        design = truth.design(x)
+        design = sampler.design(x)
     figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
     figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
     return Method(name, clean(figures), (hardware.theta,), trace)

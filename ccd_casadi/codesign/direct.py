@@ -18,7 +18,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import design
@@ -26,10 +26,10 @@ from surrogates import design
 STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 
 
-def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:
+def solve_direct(sampler: Sampler, *, starts: int, seed: int) -> FormulationResult:
     """IPOPT on the true problem from the case's start and a Sobol set of starts."""
-    problem = truth.problem
-    quantities = TrueQuantities(problem, truth.record)
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
     program = lifted_program(problem, quantities, exact_hessian=False)
     lower, upper = lifted_bounds(problem)
     middle = 0.5 * (lower + upper)
@@ -54,13 +54,13 @@ def solve_direct(truth: Truth, *, starts: int, seed: int) -> FormulationResult:
     return FormulationResult(None, None, (), (), solution, False, message)
 
 
-def polish(truth: Truth, x: Array) -> tuple[Array, Sensitivities, OuterSolution | None]:
+def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolution | None]:
     """From a design nearly optimal to the nearest stationary point of the true problem.
 
     Returns the start itself where IPOPT finds nothing better that is certified and feasible.
     """
-    problem = truth.problem
-    quantities = TrueQuantities(problem, truth.record)
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
     program = lifted_program(problem, quantities, exact_hessian=False)
     start = quantities.at(x)
     if acceptable(problem, x, start) and _stationary(problem, x, start):

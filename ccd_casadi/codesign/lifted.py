@@ -19,7 +19,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
-from ccd_casadi.sampling.sampler import QuantitySample, Truth
+from ccd_casadi.sampling.sampler import QuantitySample, Sampler
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 
@@ -33,7 +33,7 @@ FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polis
 
 
 def solve_lifted(
-    truth: Truth,
+    sampler: Sampler,
     *,
     points: int,
     starts: int,
@@ -47,11 +47,11 @@ def solve_lifted(
 
     With `given` surrogates the rounds start from those and what they were fitted to.
     """
-    problem = truth.problem
+    problem = sampler.problem
     lower, upper = lifted_bounds(problem)
     if given is None:
         X = design("sobol", lower, upper, points, seed)
-        samples = [s for s in truth.quantities(X) if s.certified]
+        samples = [s for s in sampler.quantities(X) if s.certified]
     else:
         samples = list(given.samples)
     if len(samples) < len(lower) + 1:
@@ -80,7 +80,7 @@ def solve_lifted(
             )
         x = solution.best.x
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
-        sample = truth.quantities(x, f"verifying round {round_number + 1}")[0]
+        sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, incumbent, sample, predicted)
         iterates.append(iterate)
         settled = incumbent is not None and abs(

@@ -18,7 +18,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Truth
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit, to_casadi
 
@@ -26,7 +26,7 @@ STEP = 1e-3  # share of the box below which a step counts as small
 
 
 def solve_nested(
-    truth: Truth,
+    sampler: Sampler,
     *,
     kind: str,
     points: int,
@@ -41,14 +41,14 @@ def solve_nested(
 
     With a `given` surrogate the design is what that was fitted to.
     """
-    problem = truth.problem
+    problem = sampler.problem
     lower, upper = box(problem)
     if given is None:
         thetas = np.vstack([design(kind, lower, upper, points, seed), np.array(problem.start)])
         thetas = _allowed(problem, np.unique(thetas, axis=0))
     else:
         thetas = given.thetas
-    samples = truth.bandwidths(thetas)
+    samples = sampler.bandwidths(thetas)
     if not any(sample.feasible for sample in samples):
         return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
     iterates: list[Iterate] = []
@@ -71,7 +71,7 @@ def solve_nested(
             continue
         theta = solution.best.x
         predicted = float(surrogate.predict(theta[None, :])[0])
-        sample = truth.bandwidths(theta, f"verifying round {round_number + 1}")[0]
+        sample = sampler.bandwidths(theta, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
@@ -90,7 +90,7 @@ def solve_nested(
                 2 * len(theta) + 1,
                 seed + round_number,
             )
-            samples += truth.bandwidths(
+            samples += sampler.bandwidths(
                 _allowed(problem, new), f"refining round {round_number + 1}"
             )
         elif not improved:

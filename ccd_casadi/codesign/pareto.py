@@ -23,7 +23,7 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Truth
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, design, to_casadi
@@ -63,7 +63,7 @@ class Front:
 
 
 def pareto_front(
-    truth: Truth,
+    sampler: Sampler,
     *,
     points: int = 20,
     samples: int = 0,
@@ -78,10 +78,10 @@ def pareto_front(
     `samples` designs are sampled first (0: six per variable). Raises UserError where the
     hardware cost is constant, or where too few designs are certified to learn from.
     """
-    problem = truth.problem
+    problem = sampler.problem
     lower, upper = lifted_bounds(problem)
     count = samples or 6 * len(lower)
-    found = truth.quantities(design("sobol", lower, upper, count, seed))
+    found = sampler.quantities(design("sobol", lower, upper, count, seed))
     known = [sample for sample in found if sample.certified]
     if len(known) <= len(lower):
         words = f"only {len(known)} of {count} designs in the box were certified"
@@ -102,7 +102,7 @@ def pareto_front(
         rounds += 1
         x = _walk(program, problem, costs, todo, starts, x)
         learn = []
-        inner = truth.bandwidths(x[todo, :-2], f"verifying round {rounds}")
+        inner = sampler.bandwidths(x[todo, :-2], f"verifying round {rounds}")
         for k, sample in zip(todo, inner, strict=True):
             predicted = float(processes[0].predict(x[k][None, :])[0])
             result[k] = _point(problem, sample, predicted, tolerance)
@@ -110,14 +110,14 @@ def pareto_front(
                 learn.append(x[k])
         todo = [k for k in todo if not result[k].verified]
         if todo and rounds < max_rounds:
-            new = [s for s in truth.quantities(np.array(learn), "learning") if s.certified]
+            new = [s for s in sampler.quantities(np.array(learn), "learning") if s.certified]
             known = list({sample.x: sample for sample in (*known, *new)}.values())
             if len(known) >= REFIT * fitted:
                 processes, fitted = fit_quantities(problem, known, seed), len(known)
             else:
                 processes = update_quantities(problem, known, processes)
             program = _program(problem, processes)
-    return Front(_efficient([result[k] for k in range(points)]), rounds, truth.syntheses)
+    return Front(_efficient([result[k] for k in range(points)]), rounds, sampler.syntheses)
 
 
 def _program(problem: CoDesignProblem, processes: tuple[GaussianProcess, ...]) -> NonlinearProgram:

@@ -26,7 +26,7 @@ from ccd_casadi.codesign.stored import known_designs, known_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import BandwidthSample, QuantitySample, Truth, quantity_sample
+from ccd_casadi.sampling.sampler import BandwidthSample, QuantitySample, Sampler, quantity_sample
 from ccd_casadi.sampling.store import SampleStore, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
@@ -61,8 +61,8 @@ def open_run(
             pool(scheduler, workers, PATIENCE) as evaluators,
             SampleStore(folder / "samples.sqlite") as store,
         ):
-            truth = Truth(problem, store, evaluators, quiet=quiet)
-            yield CoDesignTruth(folder, case, truth, formulation, write_page, tolerance, seed)
+            sampler = Sampler(problem, store, evaluators, quiet=quiet)
+            yield CoDesignTruth(folder, case, sampler, formulation, write_page, tolerance, seed)
 
 
 class CoDesignTruth:
@@ -72,14 +72,14 @@ class CoDesignTruth:
         self,
         folder: Path,
         case: Case,
-        truth: Truth,
+        sampler: Sampler,
         formulation: str,
         write_page: PageWriter,
         tolerance: float | None = None,
         seed: int = 0,
     ) -> None:
-        problem = truth.problem
-        self.folder, self.case, self.truth, self.seed = folder, case, truth, seed
+        problem = sampler.problem
+        self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
         self.write_page = write_page
         self.nested = formulation == "nested"
         self.formulation = "nested" if self.nested else "lifted"
@@ -93,23 +93,23 @@ class CoDesignTruth:
     @property
     def spent(self) -> int:
         """Syntheses in the store, of whatever job."""
-        return self.truth.store.count(self.truth.hash)
+        return self.sampler.store.count(self.sampler.hash)
 
     def samples(self) -> Observations:
         """What the store holds inside the box, oldest first."""
-        problem = self.truth.problem
+        problem = self.sampler.problem
         if self.nested:
-            known = known_thetas(self.truth.store, problem)
-            return self._bandwidths(self.truth.bandwidths(known) if len(known) else [])
+            known = known_thetas(self.sampler.store, problem)
+            return self._bandwidths(self.sampler.bandwidths(known) if len(known) else [])
         count = len(problem.names)
-        designs = known_designs(self.truth.store, problem)
+        designs = known_designs(self.sampler.store, problem)
         return self._quantities([quantity_sample(tuple(x), row, count) for x, row in designs])
 
     def evaluate(self, X: Array) -> Observations:
         """New syntheses, through the store."""
         if self.nested:
-            return self._bandwidths(self.truth.bandwidths(X, "retraining"))
-        return self._quantities(self.truth.quantities(X, "retraining"))
+            return self._bandwidths(self.sampler.bandwidths(X, "retraining"))
+        return self._quantities(self.sampler.quantities(X, "retraining"))
 
     def finish(
         self, x: Array | None, surrogates: Sequence[GaussianProcess], version: str | None
@@ -125,17 +125,19 @@ class CoDesignTruth:
         processes = tuple(surrogates)
         outcome = FormulationResult(start, None, (), processes, None, True, "")
         if start is None:
-            words = unmet_constraint(self.truth.problem, self.case.outer.starts, self.seed)
+            words = unmet_constraint(self.sampler.problem, self.case.outer.starts, self.seed)
             outcome = replace(outcome, message=words)
             if not words:
-                outcome = rescue(self.truth, outcome, self.seed)
-        solution = conclude(self.truth, self.formulation, outcome, self.tolerance, self.seed, began)
+                outcome = rescue(self.sampler, outcome, self.seed)
+        solution = conclude(
+            self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
+        )
         result = solution.result
         verified = solution.verified
         result["syntheses"] = self.spent
         result["retraining"] = mark | {"x": None if verified is None else verified.x.tolist()}
         write_run(self.folder, self.case, solution)
-        self.write_page(self.folder, self.case, self.truth.problem, solution)
+        self.write_page(self.folder, self.case, self.sampler.problem, solution)
         return str(result["status"])
 
     def _before(self, mark: dict[str, Any]) -> dict[str, Any] | None:
@@ -149,9 +151,9 @@ class CoDesignTruth:
 
     def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
         """Where to verify: x with its break frequencies, or the verified design that is by it."""
-        problem = self.truth.problem
+        problem = self.sampler.problem
         if self.nested:
-            inner = self.truth.bandwidths(x, "verifying")[0]
+            inner = self.sampler.bandwidths(x, "verifying")[0]
             if not inner.feasible:
                 lower, upper = lifted_bounds(problem)
                 return np.array([*x, *(0.5 * (lower + upper))[-2:]])

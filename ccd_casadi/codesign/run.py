@@ -26,7 +26,7 @@ from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.surrogate_quality import Quality, quality_dict, surrogate_quality
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from surrogates import design, save
 
 FORMULATIONS = ("nested", "lifted", "direct")
@@ -43,22 +43,22 @@ class Solution:
 
 
 def solve(
-    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None = None
+    case: Case, sampler: Sampler, formulation: str, seed: int, given: Surrogates | None = None
 ) -> Solution:
     """Run one formulation, verify and polish its design on the truth."""
     began = perf_counter()
-    forbidden = unmet_constraint(truth.problem, case.outer.starts, seed)
+    forbidden = unmet_constraint(sampler.problem, case.outer.starts, seed)
     if forbidden:
         outcome = FormulationResult(None, None, (), (), None, False, forbidden)
     else:
-        outcome = _formulate(case, truth, formulation, seed, given)
+        outcome = _formulate(case, sampler, formulation, seed, given)
         if outcome.x is None:
-            outcome = rescue(truth, outcome, seed)
-    return conclude(truth, formulation, outcome, case.outer.tolerance, seed, began)
+            outcome = rescue(sampler, outcome, seed)
+    return conclude(sampler, formulation, outcome, case.outer.tolerance, seed, began)
 
 
 def conclude(
-    truth: Truth,
+    sampler: Sampler,
     formulation: str,
     outcome: FormulationResult,
     tolerance: float,
@@ -70,20 +70,20 @@ def conclude(
         result = infeasible_dict(
             formulation,
             outcome.message,
-            syntheses=truth.syntheses,
+            syntheses=sampler.syntheses,
             seconds=perf_counter() - began,
             seed=seed,
         )
         return Solution(result, outcome, None)
-    verified = verify(truth, outcome.x)
+    verified = verify(sampler, outcome.x)
     quality = surrogate_quality(outcome.surrogates, verified.x, seed)
     result = result_dict(
-        truth.problem,
+        sampler.problem,
         formulation,
         outcome,
         verified,
         tolerance=tolerance,
-        syntheses=truth.syntheses,
+        syntheses=sampler.syntheses,
         seconds=perf_counter() - began,
         seed=seed,
     )
@@ -92,12 +92,12 @@ def conclude(
 
 
 def _formulate(
-    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None
+    case: Case, sampler: Sampler, formulation: str, seed: int, given: Surrogates | None
 ) -> FormulationResult:
     outer, sampling = case.outer, case.sampling
     if formulation == "nested":
         return solve_nested(
-            truth,
+            sampler,
             kind=sampling.design,
             points=sampling.points,
             starts=outer.starts,
@@ -112,7 +112,7 @@ def _formulate(
         # gives n+1 numbers: 6n samples are twelve times what it needs at n = 4, six times at n = 8.
         points = sampling.lifted_points or 6 * (len(case.theta) + 2)
         return solve_lifted(
-            truth,
+            sampler,
             points=points,
             starts=outer.starts,
             tolerance=outer.tolerance,
@@ -121,18 +121,18 @@ def _formulate(
             given=given,
             surrogate_kind=outer.surrogate,
         )
-    return solve_direct(truth, starts=outer.direct_starts, seed=seed)
+    return solve_direct(sampler, starts=outer.direct_starts, seed=seed)
 
 
-def rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationResult:
+def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> FormulationResult:
     """Ask the true inner problem at a few θ: is the case infeasible, or did a formulation fail?"""
-    lower, upper = box(truth.problem)
+    lower, upper = box(sampler.problem)
     points = design("sobol", lower, upper, 8, seed)
-    samples = truth.bandwidths(points, "looking for a feasible design")
+    samples = sampler.bandwidths(points, "looking for a feasible design")
     feasible = [sample for sample in samples if sample.feasible]
     if not feasible:
-        assert truth.nearest is not None
-        words = truth.nearest.shortfall
+        assert sampler.nearest is not None
+        words = sampler.nearest.shortfall
         return FormulationResult(None, None, outcome.iterates, (), None, False, words)
     best = max(feasible, key=lambda sample: sample.bandwidth)
     x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])

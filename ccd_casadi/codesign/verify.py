@@ -14,7 +14,7 @@ from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import handed_out, measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
@@ -62,19 +62,19 @@ class RobustCheck:
     passed: bool
 
 
-def verify(truth: Truth, x: Array) -> VerifiedDesign:
+def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     """Polish x on the true problem, ask the global inner problem there, certify what results."""
-    problem = truth.problem
+    problem = sampler.problem
     count = len(problem.names)
-    quantities = TrueQuantities(problem, truth.record)
+    quantities = TrueQuantities(problem, sampler.record)
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
-        x, design, _ = polish(truth, x)
+        x, design, _ = polish(sampler, x)
         at_bounds = _snapped(problem, x)
         if acceptable(problem, at_bounds, quantities.at(at_bounds)):
             x, design = at_bounds, quantities.at(at_bounds)
-        inner = truth.bandwidths(x[:count], "verifying")[0]
+        inner = sampler.bandwidths(x[:count], "verifying")[0]
         gap = inner.bandwidth / design.figures.bandwidth - 1.0 if inner.feasible else 0.0
         if gap <= INNER_GAP:
             break

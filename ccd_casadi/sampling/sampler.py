@@ -70,7 +70,7 @@ class TraceEntry:
     objective: float
 
 
-class Truth:
+class Sampler:
     """The true synthesis behind a store and a pool of workers, counting what a run spends.
 
     `syntheses` counts every distinct design that the run asked for, whether it was computed now
