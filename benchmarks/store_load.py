@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
 from ccd_casadi.support.process_pool import Workers
@@ -122,7 +122,7 @@ def main() -> None:
             assert len(found) == 500
             seconds["select_one_problem"], found = timed(lambda: store.select(hashed))
             assert len(found) == len(keys) + 1
-            seconds["resume_known_designs"], found = timed(lambda: known_designs(store, problem))
+            seconds["resume_known_designs"], found = timed(lambda: stored_designs(store, problem))
             assert len(found) == len(keys) + 1
         figures["eight_processes"] = eight(Path(name), path)
     figures["peak_megabytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

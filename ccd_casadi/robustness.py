@@ -7,17 +7,18 @@ from time import perf_counter
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.result import versions, write_json
 from ccd_casadi.robust.setpoint import Limits
-from ccd_casadi.robust.study import Demands, study, study_dict
+from ccd_casadi.robust.study import Demands, robustness, study_dict
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 
+_DEFAULT = Demands()
 _MOVE = (
-    ("stroke", 0.01, "m"),
-    ("velocity", 0.1, "m/s"),
-    ("acceleration", 2.0, "m/s²"),
-    ("jerk", 100.0, "m/s³"),
-    ("snap", 1e4, "m/s⁴"),
-    ("window", 1e-6, "m; settled when the error stays within"),
+    ("stroke", _DEFAULT.limits.stroke, "m"),
+    ("velocity", _DEFAULT.limits.velocity, "m/s"),
+    ("acceleration", _DEFAULT.limits.acceleration, "m/s²"),
+    ("jerk", _DEFAULT.limits.jerk, "m/s³"),
+    ("snap", _DEFAULT.limits.snap, "m/s⁴"),
+    ("window", _DEFAULT.window, "m; settled when the error stays within"),
 )
 
 
@@ -43,7 +44,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         window=options.window,
         axis=options.axis - 1,
     )
-    found = study(finished, demands, options.seed, options.quiet)
+    found = robustness(finished, demands, options.seed, options.quiet)
     answer = study_dict(finished, found)
     answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
     write_json(folder / "robustness.json", answer)

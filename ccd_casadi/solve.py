@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.run import FORMULATIONS, Solution, solve, write_run
+from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of, write_run
 from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.registry import SHIPPED
@@ -52,7 +52,7 @@ def summary(solution: Solution) -> str:
     return "\n".join(lines)
 
 
-def tell(case: Case, problem: CoDesignProblem) -> None:
+def show_findings(case: Case, problem: CoDesignProblem) -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     if case.plant.model in SHIPPED:
         return
@@ -71,7 +71,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
     if not options.quiet:
-        tell(case, problem)
+        show_findings(case, problem)
     given = None
     if options.surrogate is not None:
         given = named_surrogate(folder, options.surrogate, options.formulation, problem)
@@ -81,7 +81,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         SampleStore(store) as samples,
     ):
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        solution = solve(case, sampler, options.formulation, options.seed, given)
+        formulation = formulation_of(case, options.formulation)
+        solution = co_design(sampler, formulation, options.seed, given)
         write_run(folder, case, solution)
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 

@@ -26,7 +26,7 @@ from fuzz_values import ROOT, Input
 import ccd_casadi.reporting.solve_page
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
 from ccd_casadi.sampling.store import SampleStore
@@ -221,7 +221,7 @@ def read(argv: list[str]) -> int:
         with SampleStore(folder / "samples.sqlite") as opened:
             opened.select()
             problem = problem_of(load_case(folder / "case.toml"))
-            known_designs(opened, problem)
+            stored_designs(opened, problem)
 
     readers: list[tuple[Any, tuple[type[Exception], ...]]] = [
         (lambda: read_run(folder), (UserError,)),

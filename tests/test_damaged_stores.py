@@ -14,7 +14,7 @@ import pytest
 from rows import sample
 
 from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.sampling import store as module
 from ccd_casadi.sampling.store import SampleStore, SampleStoreError
 from ccd_casadi.support.errors import UserError
@@ -187,14 +187,14 @@ def test_a_row_that_only_the_index_has_is_damage(two_mass_run: Path, tmp_path: P
     path = Path(shutil.copy(two_mass_run / "samples.sqlite", tmp_path))
     problem = problem_of(load_case(two_mass_run / "case.toml"))
     with SampleStore(path) as store:
-        key = known_designs(store, problem)[0][1].key
+        key = stored_designs(store, problem)[0][1].key
     content = path.read_bytes()
     places = [m.start() for m in re.finditer(key.encode(), content)]
     assert len(places) >= 2, "in the table and in its index"
     for place in places:
         path.write_bytes(content[:place] + b"x" + content[place + 1 :])
         with pytest.raises(SampleStoreError, match="damaged"), SampleStore(path) as store:
-            known_designs(store, problem)
+            stored_designs(store, problem)
     path.write_bytes(content)
     with SampleStore(path) as store:
-        assert known_designs(store, problem)
+        assert stored_designs(store, problem)

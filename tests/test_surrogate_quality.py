@@ -11,7 +11,7 @@ import pytest
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.lifted import fit_quantities
-from ccd_casadi.codesign.stored import known_designs
+from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
 from ccd_casadi.sampling.sampler import quantity_sample
@@ -103,7 +103,7 @@ def test_auto_takes_the_kernel_that_predicts_left_out_samples_best() -> None:
 def test_lifted_fits_the_kernel_that_the_case_names(two_mass_run: Path) -> None:
     problem = problem_of(load_case(two_mass_run / "case.toml"))
     with SampleStore(two_mass_run / "samples.sqlite") as store:
-        rows = known_designs(store, problem)[:20]
+        rows = stored_designs(store, problem)[:20]
     samples = [quantity_sample(tuple(x), row, len(problem.names)) for x, row in rows]
     named = fit_quantities(problem, samples, 0, kind="rbf")
     assert {p.kernel.value for p in named} == {"rbf"}

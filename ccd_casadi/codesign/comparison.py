@@ -12,7 +12,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.conclusions import conclusions
 from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.codesign.result import clean, figures_dict, versions
-from ccd_casadi.codesign.run import FORMULATIONS, Solution, solve
+from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -82,7 +82,7 @@ def _formulation(
     began = perf_counter()
     with SampleStore(folder / f"samples_{name}.sqlite") as store:
         sampler = Sampler(problem, store, workers, quiet=quiet)
-        solution = solve(case, sampler, name, seed)
+        solution = co_design(sampler, formulation_of(case, name), seed)
         trace = tuple(sampler.trace)
     figures = solution.result | {"seconds": perf_counter() - began}
     path = tuple(iterate.theta for iterate in solution.outcome.iterates)

@@ -3,6 +3,8 @@
 Nothing is approximated: each iteration is a certified synthesis with its total derivatives.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -26,7 +28,15 @@ from surrogates import design
 STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 
 
-def solve_direct(sampler: Sampler, *, starts: int, seed: int) -> FormulationResult:
+@dataclass(frozen=True)
+class Direct:
+    """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem."""
+
+    starts: int = 4
+    tolerance: float = 1e-3
+
+
+def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
     """IPOPT on the true problem from the case's start and a Sobol set of starts."""
     problem = sampler.problem
     quantities = TrueQuantities(problem, sampler.record)
@@ -35,8 +45,8 @@ def solve_direct(sampler: Sampler, *, starts: int, seed: int) -> FormulationResu
     middle = 0.5 * (lower + upper)
     first = np.array([*problem.start, *middle[-2:]])
     points = first[None, :]
-    if starts > 1:
-        points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
+    if options.starts > 1:
+        points = np.vstack([points, design("sobol", lower, upper, options.starts - 1, seed)])
     certified = [x for x in points if quantities.at(x).figures.certified]
     if not certified:
         reason = quantities.at(first).figures.outcome.value

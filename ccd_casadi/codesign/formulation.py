@@ -31,7 +31,8 @@ class FormulationResult:
     """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
 
     `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
-    none for direct; `agreed` tells whether prediction and truth met the tolerance at the end.
+    none for direct, which has a `design` of its own instead; `agreed` tells whether prediction and
+    truth met the tolerance at the end.
     """
 
     x: Array | None

@@ -5,6 +5,8 @@ to: each round fits the samples in a trust region around the best verified desig
 where the surrogate promised too much, until prediction and truth agree there.
 """
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult, Iterate
@@ -16,7 +18,7 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_design
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
@@ -25,17 +27,26 @@ from surrogates import GaussianProcess, design, fit, to_casadi
 STEP = 1e-3  # share of the box below which a step counts as small
 
 
+@dataclass(frozen=True)
+class Nested:
+    """Options of the nested formulation; the defaults are those of a case file.
+
+    `plan`: "grid" (`points` an axis), "sobol" or "lhs" (`points` in all) over θ. `starts` of IPOPT
+    a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
+    rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
+    best.
+    """
+
+    plan: str = "grid"
+    points: int = 5
+    starts: int = 16
+    tolerance: float = 1e-3
+    max_refinements: int = 12
+    kernel: str = "matern52"
+
+
 def solve_nested(
-    sampler: Sampler,
-    *,
-    kind: str,
-    points: int,
-    starts: int,
-    tolerance: float,
-    max_refinements: int,
-    seed: int,
-    given: Surrogates | None = None,
-    surrogate_kind: str = "matern52",
+    sampler: Sampler, options: Nested, *, seed: int, given: Surrogates | None = None
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
 
@@ -44,7 +55,9 @@ def solve_nested(
     problem = sampler.problem
     lower, upper = box(problem)
     if given is None:
-        thetas = np.vstack([design(kind, lower, upper, points, seed), np.array(problem.start)])
+        thetas = np.vstack(
+            [design(options.plan, lower, upper, options.points, seed), np.array(problem.start)]
+        )
         thetas = _allowed(problem, np.unique(thetas, axis=0))
     else:
         thetas = given.thetas
@@ -55,16 +68,16 @@ def solve_nested(
     radius, agreed = 1.0, False
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
-    for round_number in range(max_refinements + 1):
+    for round_number in range(options.max_refinements + 1):
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
-        surrogate = fit_bandwidth(problem, local, seed, surrogate_kind)
+        surrogate = fit_bandwidth(problem, local, seed, options.kernel)
         program = nested_program(problem, to_casadi(surrogate, std=False))
-        program = type(program)(**{**vars(program), "lower": low, "upper": high})
+        program = replace(program, lower=low, upper=high)
         try:
             solution = solve_program(
-                program, _starts(local, low, high, starts, seed + round_number)
+                program, _starts(local, low, high, options.starts, seed + round_number)
             )
         except OuterFailure:
             radius *= 0.5
@@ -76,8 +89,8 @@ def solve_nested(
         iterates.append(iterate)
         samples.append(sample)
         improved = iterate.objective < _objective(problem, best)
-        agreed = iterate.error <= tolerance
-        settled = abs(iterate.objective - _objective(problem, best)) <= tolerance * abs(
+        agreed = iterate.error <= options.tolerance
+        settled = abs(iterate.objective - _objective(problem, best)) <= options.tolerance * abs(
             iterate.objective
         )
         if agreed and (iterate.step <= STEP or settled):
@@ -99,10 +112,9 @@ def solve_nested(
             radius = min(1.0, 2.0 * radius)
     best = _best(problem, samples)
     x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
-    final = true_design(problem, best.theta, best.omega_S, best.omega_T)
     message = "" if agreed else "prediction and truth did not agree within the budget"
     assert surrogate is not None
-    return FormulationResult(x, final, tuple(iterates), (surrogate,), solution, agreed, message)
+    return FormulationResult(x, None, tuple(iterates), (surrogate,), solution, agreed, message)
 
 
 def fit_bandwidth(

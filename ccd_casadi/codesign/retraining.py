@@ -22,7 +22,7 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
 from ccd_casadi.codesign.run import Solution, conclude, rescue, write_run
-from ccd_casadi.codesign.stored import known_designs, known_thetas
+from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
@@ -99,10 +99,10 @@ class CoDesignTruth:
         """What the store holds inside the box, oldest first."""
         problem = self.sampler.problem
         if self.nested:
-            known = known_thetas(self.sampler.store, problem)
+            known = stored_thetas(self.sampler.store, problem)
             return self._bandwidths(self.sampler.bandwidths(known) if len(known) else [])
         count = len(problem.names)
-        designs = known_designs(self.sampler.store, problem)
+        designs = stored_designs(self.sampler.store, problem)
         return self._quantities([quantity_sample(tuple(x), row, count) for x, row in designs])
 
     def evaluate(self, X: Array) -> Observations:

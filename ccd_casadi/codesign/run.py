@@ -3,17 +3,19 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.direct import solve_direct
+from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.lifted import solve_lifted
-from ccd_casadi.codesign.nested import solve_nested
+from ccd_casadi.codesign.lifted import Lifted, solve_lifted
+from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import (
     clean,
@@ -25,11 +27,14 @@ from ccd_casadi.codesign.result import (
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.surrogate_quality import Quality, quality_dict, surrogate_quality
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
-from ccd_casadi.inner_problem.problem import box
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import design, save
 
 FORMULATIONS = ("nested", "lifted", "direct")
+Formulation = Nested | Lifted | Direct
 
 
 @dataclass(frozen=True)
@@ -42,19 +47,72 @@ class Solution:
     quality: tuple[Quality, ...] = ()
 
 
+def formulation_of(case: Case, name: str) -> Formulation:
+    """The formulation of that name with the options of a case file."""
+    outer, sampling = case.outer, case.sampling
+    rounds = (outer.starts, outer.tolerance, outer.max_refinements, outer.surrogate)
+    if name == "nested":
+        return Nested(sampling.design, sampling.points, *rounds)
+    if name == "lifted":
+        return Lifted(sampling.lifted_points, *rounds)
+    return Direct(starts=outer.direct_starts, tolerance=outer.tolerance)
+
+
 def solve(
-    case: Case, sampler: Sampler, formulation: str, seed: int, given: Surrogates | None = None
+    problem: CoDesignProblem,
+    formulation: Formulation | None = None,
+    *,
+    seed: int = 0,
+    workers: int = 1,
+    store: str | Path | None = None,
+    quiet: bool = True,
 ) -> Solution:
-    """Run one formulation, verify and polish its design on the truth."""
+    """Co-design the plant and its controller, verified on the true synthesis.
+
+        min w1 f(θ) + w2 ω_b*(θ),  θ_min <= θ <= θ_max,  λ(θ) <= 0      (paper, equation (9))
+
+    `formulation` is `Nested(...)`, `Lifted(...)` (default) or `Direct(...)`; samples are kept in
+    the file `store`, which a later call resumes from, or nowhere. More than one of `workers` needs
+    the caller's script behind `if __name__ == "__main__":`, as any use of processes does.
+
+    Raises UserError where the plant or the store cannot be used; an infeasible problem is a
+    Solution with `verified` None.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> solution = ccd.solve(problem, ccd.Lifted(points=24))
+    >>> solution.result["status"], [round(v, 3) for v in solution.verified.theta]
+    ('verified', [55.0, 55.0])
+    """
+    with (
+        TemporaryDirectory() as folder,
+        threadpool_limits(limits=1),  # the matrices are small
+        Workers(workers, PATIENCE) as pool,
+        SampleStore(store or Path(folder) / "samples.sqlite") as samples,
+    ):
+        sampler = Sampler(problem, samples, pool, quiet=quiet)
+        return co_design(sampler, formulation or Lifted(), seed)
+
+
+def co_design(
+    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
+) -> Solution:
+    """Run one formulation on a sampler, verify and polish its design on the truth."""
     began = perf_counter()
-    forbidden = unmet_constraint(sampler.problem, case.outer.starts, seed)
+    name = type(formulation).__name__.lower()
+    forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         outcome = FormulationResult(None, None, (), (), None, False, forbidden)
     else:
-        outcome = _formulate(case, sampler, formulation, seed, given)
+        if isinstance(formulation, Nested):
+            outcome = solve_nested(sampler, formulation, seed=seed, given=given)
+        elif isinstance(formulation, Lifted):
+            outcome = solve_lifted(sampler, formulation, seed=seed, given=given)
+        else:
+            outcome = solve_direct(sampler, formulation, seed=seed)
         if outcome.x is None:
             outcome = rescue(sampler, outcome, seed)
-    return conclude(sampler, formulation, outcome, case.outer.tolerance, seed, began)
+    return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
 
 
 def conclude(
@@ -89,39 +147,6 @@ def conclude(
     )
     result["surrogate_quality"] = clean(quality_dict(quality))
     return Solution(result, outcome, verified, quality)
-
-
-def _formulate(
-    case: Case, sampler: Sampler, formulation: str, seed: int, given: Surrogates | None
-) -> FormulationResult:
-    outer, sampling = case.outer, case.sampling
-    if formulation == "nested":
-        return solve_nested(
-            sampler,
-            kind=sampling.design,
-            points=sampling.points,
-            starts=outer.starts,
-            tolerance=outer.tolerance,
-            max_refinements=outer.max_refinements,
-            seed=seed,
-            given=given,
-            surrogate_kind=outer.surrogate,
-        )
-    if formulation == "lifted":
-        # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
-        # gives n+1 numbers: 6n samples are twelve times what it needs at n = 4, six times at n = 8.
-        points = sampling.lifted_points or 6 * (len(case.theta) + 2)
-        return solve_lifted(
-            sampler,
-            points=points,
-            starts=outer.starts,
-            tolerance=outer.tolerance,
-            max_refinements=outer.max_refinements,
-            seed=seed,
-            given=given,
-            surrogate_kind=outer.surrogate,
-        )
-    return solve_direct(sampler, starts=outer.direct_starts, seed=seed)
 
 
 def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> FormulationResult:

@@ -1,4 +1,4 @@
-"""What a run folder knows already: its true samples, and the versions of its surrogates."""
+"""What a run folder holds already: its true samples, and the versions of its surrogates."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,12 +49,12 @@ def named_surrogate(
     X = lower + processes[0].X * (upper - lower)
     if formulation == "nested":
         with SampleStore(folder / "samples.sqlite") as store:
-            known = known_thetas(store, problem)
+            known = stored_thetas(store, problem)
         return Surrogates(processes, _exact(X, known, upper - lower), ())
     return Surrogates(processes, X[:, :-2], _quantities(processes, X))
 
 
-def known_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
+def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
     """Designs with derivatives inside the box as (x, row), x = (θ, ln ω_S, ln ω_T), oldest first.
 
     Designs that were not certified are among them.
@@ -80,7 +80,7 @@ def known_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Ar
     return found
 
 
-def known_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
+def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
     """Every θ (n, n_θ) inside the box whose inner problem was solved, oldest first."""
     lower, upper = box(problem)
     designs = problem_hash(problem.identity())

@@ -153,13 +153,13 @@ def plant_of(problem: CoDesignProblem) -> Plant:
     Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
     """
     if problem.source.model is not None:
-        return _known_plant(problem.source, problem.names)
+        return _shipped_plant(problem.source, problem.names)
     require_user_code(f"{problem.source.file}:{problem.source.function}")
     return _own_plant(problem.source.pinned(), problem.names, problem.lower, problem.upper)
 
 
 @lru_cache(maxsize=8)
-def _known_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
     if source.model in BUILDERS:
         return BUILDERS[source.model](names, **dict(source.options))
     assert source.model is not None

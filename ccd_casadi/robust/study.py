@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,17 +31,20 @@ from ccd_casadi.synthesis.loop_responses import loop_data
 
 @dataclass(frozen=True)
 class Demands:
-    """What to try: relative shift and tolerance, damping factors, densities, the move."""
+    """What to try: relative shift and tolerance, damping factors, densities, the move.
 
-    shift: float
-    damping: tuple[float, float]
-    tolerance: float
-    samples: int
-    sensor: float
-    disturbance: float
-    limits: Limits
-    window: float
-    axis: int
+    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
+    """
+
+    shift: float = 0.05
+    damping: tuple[float, float] = (0.5, 2.0)
+    tolerance: float = 0.01
+    samples: int = 200
+    sensor: float = 1.0
+    disturbance: float = 1.0
+    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    window: float = 1e-6
+    axis: int = 0
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,11 @@ class Study:
         return all(item.stable for item in (*lines, self.tolerances.worst))
 
 
-def study(run: FinishedRun, demands: Demands, seed: int, quiet: bool) -> Study:
-    """Put the run's controller through all of it; nothing is designed anew."""
+def robustness(
+    run: FinishedRun, demands: Demands | None = None, seed: int = 0, quiet: bool = True
+) -> Study:
+    """Put a run's controller through all that is demanded; nothing is designed anew."""
+    demands = demands or Demands()
     bandwidth_hz = run.figures.bandwidth / HZ
     loop = loop_data(
         run.plant, run.controller, run.weights, gamma=run.figures.gamma,
