@@ -17,6 +17,7 @@ test: setup-test lint docs
 lint: setup-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 # The documentation site, in site/: a broken link or reference is an error.
 docs: setup-test

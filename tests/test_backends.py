@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from ccd_casadi.cross_check import main
 from ccd_casadi.plants.scaling import StateSpace, scale_state_space
 from ccd_casadi.support.optional_packages import MissingPackage
-from ccd_casadi.synthesis.backends.attempt import Backend
 from ccd_casadi.synthesis.backends.judgement import verdicts
 from ccd_casadi.synthesis.backends.mixed import BackendResult, synthesise_with
+from ccd_casadi.synthesis.backends.registry import Backend
 from ccd_casadi.synthesis.backends.standard_plant import (
     StandardPlant,
     close,

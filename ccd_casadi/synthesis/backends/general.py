@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.optional_packages import MissingPackage
-from ccd_casadi.synthesis.backends.attempt import GENERAL
+from ccd_casadi.synthesis.backends.registry import GENERAL
 from ccd_casadi.synthesis.backends.standard_plant import (
     StandardPlant,
     certify,

@@ -8,7 +8,8 @@ import numpy as np
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.optional_packages import MissingPackage
-from ccd_casadi.synthesis.backends.attempt import LMI, SLICOT, Attempt, Backend
+from ccd_casadi.synthesis.backends.attempt import Attempt
+from ccd_casadi.synthesis.backends.registry import LMI, SLICOT, Backend
 from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, mixed_sensitivity
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
