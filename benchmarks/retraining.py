@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from ccd_casadi.retraining import CoDesignTruth, open_run
 from surrogates import sobol
 from surrogates.acquisition import objective_and_violation
-from surrogates.judgement import STARTS, fit_all
+from surrogates.iteration import STARTS, fit_all
 from surrogates.optimum import predicted_optimum
 from surrogates.retraining import Settings, retrain, thinned
 

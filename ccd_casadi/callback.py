@@ -6,8 +6,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.interrupts import pending
 from ccd_casadi.plant import Array
+from surrogates.interrupts import pending
 
 
 class VectorCallback(ca.Callback):

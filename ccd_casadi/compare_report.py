@@ -1,6 +1,5 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,7 @@ from ccd_casadi.reporting.truths import read_truths
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.steepest_descent import Descent
+from surrogates.files import write_whole
 
 
 def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Path:
@@ -88,10 +88,8 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         found["sentences"][0],
     )
     path = folder / "report.html"
-    temporary = folder / "report.html.part"
     text = with_turntables(page(f"Comparison: {comparison.case.path.name}", sections, head))
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
     return path
 
 

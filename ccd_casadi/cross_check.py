@@ -16,6 +16,7 @@ from ccd_casadi.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.results import clean, figures_dict, versions, write_json
 from ccd_casadi.run_folder import read_run
+from surrogates.options import positive
 
 HZ = 2.0 * math.pi
 AGREE = 1e-3  # relative: what an interior-point method is good for
@@ -177,24 +178,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
     for name in ("S", "T"):
         arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=_positive, metavar="X",
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
             help="with the other one; without both the best pair at theta, or the run's",
         )  # fmt: skip
     arguments.add_argument(
-        "--limit", type=_positive, default=60.0, metavar="SECONDS",
+        "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="for each optional back end (default: 60)",
     )  # fmt: skip
     return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from ccd_casadi.plant import hardware_cost
 from ccd_casadi.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
 from ccd_casadi.results import clean, controller_dict, figures_dict, versions, write_json
 from ccd_casadi.synthesis import DesignFigures, synthesise
+from surrogates.options import positive
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -109,18 +110,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.add_argument(
             f"--omega-{name.lower()}-hz",
             dest=f"omega_{name}_hz",
-            type=_frequency,
+            type=positive,
             metavar="X",
             help=f"with the other one: a single synthesis at this omega_{name}",
         )
     return run(command, arguments, argv)
 
 
-def _frequency(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frequency above 0")
-    return value

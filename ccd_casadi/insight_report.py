@@ -1,6 +1,5 @@
 """insight.html: the trade-off around a design, and what it answers to."""
 
-import os
 from pathlib import Path
 
 from ccd_casadi.insight import HZ, natural_hz
@@ -27,14 +26,13 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.run_folder import FinishedRun
+from surrogates.files import write_whole
 
 
 def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostOptimal) -> Path:
     """Write insight.html, atomically."""
     path = folder / "insight.html"
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(insight_html(run, front, responses), encoding="utf-8")
-    os.replace(draft, path)
+    write_whole(path, insight_html(run, front, responses))
     return path
 
 

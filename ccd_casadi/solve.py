@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.solve CASE.toml`: sample, fit, IPOPT, verify; writes the run folder."""
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,9 +33,10 @@ from ccd_casadi.results import (
 )
 from ccd_casadi.samples import SampleStore
 from ccd_casadi.sampling import Truth
-from ccd_casadi.surrogate_quality import Quality, quality_dict, surrogate_quality
+from ccd_casadi.surrogate_quality import quality_dict, surrogate_quality
 from ccd_casadi.verify import VerifiedDesign, verify
-from surrogates import design, save
+from surrogates import Quality, design, save
+from surrogates.files import write_whole
 
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 FORMULATIONS = ("nested", "lifted", "direct")
@@ -166,9 +166,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(case)
-    draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, folder / "case.toml")
+    write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

@@ -22,10 +22,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from surrogates.designs import sobol
+from surrogates.covariance import ROOT5, Hyperparameters, Kernel
 from surrogates.interface import Array
-from surrogates.kernels import ROOT5, Hyperparameters, Kernel
 from surrogates.polynomial import products, total_degree
+from surrogates.sampling_plan import sobol
 
 # Cancellation that is left as it is, and what the degree of T is chosen for.
 HARMLESS, AIM = 1e-10, 1e-12

@@ -1,6 +1,5 @@
 """robustness.html: what the design survives, in figures with the numbers behind them."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from ccd_casadi.robustness.margins import DiskMargin
 from ccd_casadi.robustness.perturbed import Judged, Line
 from ccd_casadi.robustness.study import Study
 from ccd_casadi.run_folder import FinishedRun
+from surrogates.files import write_whole
 
 HZ = 2.0 * np.pi
 
@@ -29,9 +29,7 @@ HZ = 2.0 * np.pi
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
     """Write robustness.html, atomically."""
     path = folder / "robustness.html"
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(robustness_html(run, found, seed), encoding="utf-8")
-    os.replace(draft, path)
+    write_whole(path, robustness_html(run, found, seed))
     return path
 
 
