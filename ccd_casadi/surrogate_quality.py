@@ -52,8 +52,8 @@ def recommendation(qualities: Sequence[Quality]) -> str:
                 "Solve with --formulation lifted, whose outputs are smooth where the best "
                 "bandwidth is not."
                 if len(qualities) == 1
-                else "The larger of two local peaks is kinked where they are equal; a surrogate "
-                "of each (surrogates.fit_maximum) would not be."
+                else "The larger of two local peaks is kinked where they are equal; the rounds "
+                "refit by the design, where one of them is the larger."
             )
         )
     beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]

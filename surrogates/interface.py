@@ -1,6 +1,6 @@
 """What every surrogate of this package offers, and nothing more.
 
-A new member is a frozen dataclass with the attributes below, one
+A new kind is a frozen dataclass with the attributes below, one
 `casadi_export.expression` registration, one entry in `serialise.KINDS` and one in
 `fitting`; no other module has to know about it.
 """

@@ -67,7 +67,7 @@ def test_equals_scikit_learns_prediction(kernel: Kernel, seed: int) -> None:
     noise=st.sampled_from([1e-12, 1e-9, 1e-5]),
     seed=st.integers(0, 100),
 )
-def test_equals_predict_to_nine_digits_however_smooth(
+def test_equals_predict_to_nine_digits_or_to_rounding(
     kernel: Kernel, gradients: bool, exponents: list[float], signal: float, noise: float, seed: int
 ) -> None:
     # Length scales of 0.5 to 1000 boxes under signal variances up to a million: the weights of
@@ -82,10 +82,10 @@ def test_equals_predict_to_nine_digits_however_smooth(
     gp = condition(p, X, Y, **box, kernel=kernel, dY=dY if gradients else None)
     T = np.vstack([design("lhs", **box, n=30, seed=seed + 1), X[:5]])
     ours = flat(to_casadi(gp, std=False).map(len(T))(T.T))
-    bound = 1e-9 * float(np.ptp(gp.predict(X)))
-    if gp.flat is None:
-        # Short in one input and flat in another: the plain sum, and no better than its rounding.
-        bound = max(bound, 4.0 * gp.output_scale * cancellation(p, gp.weights, len(X)))
+    # Of gradients under a Matérn kernel that is short in one input and flat in another the sum
+    # keeps its rounding, and is at least several times better where it takes the flat form.
+    rounding = gp.output_scale * cancellation(p, gp.weights, len(X))
+    bound = max(1e-9 * float(np.ptp(gp.predict(X))), (4.0 if gp.flat is None else 0.25) * rounding)
     np.testing.assert_allclose(ours, gp.predict(T), atol=bound, rtol=0)
 
 
