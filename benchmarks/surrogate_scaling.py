@@ -1,8 +1,8 @@
 """Fit and evaluation time of a process against samples (100 to 2,500) and inputs (2 to 20).
 
-The evaluation is what an NLP solver calls: the value with its gradient, and the Hessian. Prints a table
-and writes surrogate_scaling.json beside this file; leaves with 1 if 1,000 samples of 8 inputs take more
-than 2 ms with derivatives.
+The evaluation is what an NLP solver calls: the value with its gradient, and the Hessian. Prints a
+table and writes surrogate_scaling.json beside this file; leaves with 1 if 1,000 samples of 8
+inputs take more than 2 ms with derivatives.
 """
 
 import argparse

@@ -27,14 +27,14 @@ from surrogates.covariance import Hyperparameters, Kernel
 from surrogates.extrapolation import Extrapolation, extrapolation
 from surrogates.fitting import Kind, fit, fit_outputs
 from surrogates.gaussian_process import GaussianProcess, condition, loo_errors
-from surrogates.interface import Surrogate, SurrogateFitError
+from surrogates.interface import Errors, Surrogate, SurrogateFitError
 from surrogates.polynomial import Polynomial, fit_polynomial
 from surrogates.quality import Quality, Roughness, quality_of
 from surrogates.radial_basis import Basis, RadialBasis, fit_radial_basis
 from surrogates.samples import Samples, checked
 from surrogates.sampling_plan import DesignKind, corners, design, grid, latin_hypercube, sobol
 from surrogates.serialise import SurrogateFileError, load, save
-from surrogates.validation import Errors, errors
+from surrogates.validation import errors
 
 del _interrupts, _sys
 

@@ -8,10 +8,10 @@ in the part of the kernel that is of finite rank and known in closed form,
 Matérn 5/2, e = 1: T = 1 - 5/6 s + 25/24 s², R = O(s^(5/2)), s the scaled squared distance;
 RBF, e = exp(-‖x̃‖²/2): T = Σ_{k<=q} u^k / k!, R = O(u^(q+1)), u = x̃·ỹ, x̃ = (x - middle) / lengths.
 
-Kept after a study (16 pairs of smooth functions of 2 to 5 inputs, 128 IPOPT solves): without it 54
-(Matérn) and 102 (RBF) end at IPOPT's "acceptable" level and up to 9 more than with it find no
-feasible point; length scales up to 10 boxes mend Matérn alone; a jitter of 1e-10 mends both, but moves J
-of the case studies by up to 4e-9, and the error at the optimum from 8e-9 to 3e-5.
+Kept after a study (docs/surrogates.md): without it, of 128 IPOPT solves on smooth functions 54
+(Matérn) and 102 (RBF) end at the "acceptable" level and up to 9 more find no feasible point; length
+scales up to 10 boxes mend Matérn alone; a jitter of 1e-10 mends both, but moves J of the case
+studies by up to 4e-9, and the error at the optimum from 8e-9 to 3e-5.
 
 So Σ_i α_i T(x, X_i) is one polynomial, whose coefficients are summed once in extended precision,
 and what is left to sum at every look is small. The same arithmetic serves arrays and symbols.

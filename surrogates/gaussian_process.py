@@ -14,10 +14,10 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from surrogates.covariance import Hyperparameters, Kernel, covariance, radial
 from surrogates.flat_limit import FlatLimit, flat_limit
-from surrogates.interface import Array, box, freeze, points_in
+from surrogates.interface import Array, Errors, box, freeze, points_in
 from surrogates.likelihood import factorise, symmetric_inverse
 from surrogates.samples import Samples, checked
-from surrogates.validation import Errors, errors
+from surrogates.validation import errors
 
 # Rounding leaves the predictive variance at noise-free samples anywhere within a
 # few eps of zero, of either sign; below this share of σ² it is taken as the floor.

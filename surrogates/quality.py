@@ -13,10 +13,10 @@ import numpy as np
 
 from surrogates.extrapolation import extrapolation
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
-from surrogates.interface import Array
+from surrogates.interface import Array, Errors
 from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS
 from surrogates.samples import Samples
-from surrogates.validation import Errors, errors, held_out
+from surrogates.validation import errors, held_out
 
 FOLDS = 10
 # Samples without which likelihoods of roughness say nothing, and those that enter the four

@@ -18,10 +18,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogates.covariance import separations
-from surrogates.interface import Array, SurrogateFitError, box, freeze, no_deviation, points_in
+from surrogates.interface import (
+    Array,
+    Errors,
+    SurrogateFitError,
+    box,
+    freeze,
+    no_deviation,
+    points_in,
+)
 from surrogates.polynomial import total_degree
 from surrogates.samples import Samples
-from surrogates.validation import Errors, errors
+from surrogates.validation import errors
 
 # Samples that enter the choice of kernel and smoothing, which cost O(n³) each, and
 # samples that a dense system holds.

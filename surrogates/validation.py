@@ -1,26 +1,12 @@
 """How wrong a surrogate is on samples it has not seen."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from surrogates.interface import Array, Surrogate
+from surrogates.interface import Array, Errors, Surrogate
 from surrogates.samples import Samples
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Prediction errors on samples left out: rms and max in output units, Q² ≤ 1.
-
-    Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. For
-    samples that do not vary it is 1 if they are predicted exactly and 0 otherwise.
-    """
-
-    rms: float
-    max: float
-    q2: float
 
 
 def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
