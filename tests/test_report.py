@@ -12,7 +12,7 @@ import pytest
 
 from ccd_casadi.cases.case import Case, load_case, problem_of
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.run import Solution, solve
+from ccd_casadi.codesign.run import Solution, co_design, formulation_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
@@ -123,7 +123,8 @@ def run(name: str) -> tuple[Path, Case, CoDesignProblem, Solution, str]:
     case = load_case(path)
     problem = problem_of(case)
     with SampleStore(folder / "samples.sqlite") as store, Workers(1, 2.0) as workers:
-        solution = solve(case, Sampler(problem, store, workers), formulation, 0)
+        sampler = Sampler(problem, store, workers)
+        solution = co_design(sampler, formulation_of(case, formulation), 0)
     written = write_report(folder, case, problem, solution)
     return folder, case, problem, solution, written.read_text(encoding="utf-8")
 
