@@ -68,7 +68,7 @@ def test_a_maximum_survives_its_file_and_has_the_slope_of_its_largest(tmp_path: 
     np.testing.assert_array_equal(np.array(slope(at)), np.array(own(at)))
 
 
-@settings(max_examples=50, derandomize=True, deadline=None)
+@settings(max_examples=50)
 @given(
     centres=st.lists(st.integers(0, 12), min_size=1, max_size=4, unique=True),
     sizes=st.lists(st.integers(1, 9), min_size=4, max_size=4),
