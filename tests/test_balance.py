@@ -14,10 +14,10 @@ from ccd_casadi.kernels import design as module
 from ccd_casadi.kernels.balance import balancing, rounding_noise
 from ccd_casadi.kernels.design import design
 from ccd_casadi.kernels.figures import Code, Figure
-from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.kernels.gamma import optimal_gamma, plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati import NOISE, lqr_hamiltonian
-from ccd_casadi.kernels.synthesis import synthesise
+from ccd_casadi.kernels.synthesis import GAMMA_TOLERANCE, synthesise
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import StateSpace
 from ccd_casadi.weights import Weights
@@ -88,7 +88,7 @@ def test_the_optimum_is_the_same_in_any_coordinates(seed: int, log_S: float, log
     """γ_opt and K(s) do not know in which coordinates they were found, but for the errors told."""
     plant = flexible_case(seed).plant if seed % 2 else two_mass(55.0 + 0.05 * seed, 60.0)
     w = PAPER.at(plant.omega_0 * 10.0 ** (log_S - 2.0), plant.omega_0 * 10.0 ** (log_T - 1.5))
-    data = (plant.A, plant.B, plant.C, w.scaled(plant.omega_0), plant.grid, plant.gain, 1.02, 0.0)
+    data = (plant.A, plant.B, plant.C, w.scaled(plant.omega_0), plant.grid, plant.gain, BACKOFF, 0.0)
     (row, *own), (other, *balanced) = (synthesise(*data, flag) for flag in (False, True))
     assume(row[Figure.CODE] == Code.CERTIFIED)
     assert other[Figure.CODE] == Code.CERTIFIED
@@ -100,7 +100,13 @@ def test_the_optimum_is_the_same_in_any_coordinates(seed: int, log_S: float, log
         C @ np.linalg.solve(s * np.eye(len(A)) - A, B.astype(complex))
         for A, B, C in (own, balanced)
     )
-    assert np.abs(K - L).max() <= 1e-6 * np.abs(K).max()
+    # the first controller is made in the plant's own coordinates, and X has a pole at γ_opt: what
+    # they leave in γ_opt counts 1/(back-off - 1) times. Seed 81: 9e-6 found where 1.2e-4 is told
+    gp = generalized_plant(*data[:4])
+    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], len(plant.C), plant.B.shape[1])
+    bound = row[Figure.GAMMA_LOWER_BOUND]
+    left = optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, GAMMA_TOLERANCE, NOISE)[4]
+    assert np.abs(K - L).max() <= max(1e-6, left / (BACKOFF - 1.0)) * np.abs(K).max()
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12))
