@@ -4,10 +4,7 @@ import argparse
 from collections.abc import Sequence
 from time import perf_counter
 
-from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.result import versions, write_json
-from ccd_casadi.robust.setpoint import Limits
-from ccd_casadi.robust.study import Demands, robustness, study_dict
+from ccd_casadi.robust.demands import Demands, Limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 
@@ -24,6 +21,10 @@ _MOVE = (
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.result import versions, write_json
+    from ccd_casadi.robust.study import robustness, study_dict
+
     began = perf_counter()
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
@@ -79,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, default, unit in _MOVE:
         add(f"--{name}", type=_positive, default=default, metavar="X",
             help=f"of the move, {unit}; default {default:g}")  # fmt: skip
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 
 def _positive(text: str) -> float:

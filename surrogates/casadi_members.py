@@ -12,6 +12,7 @@ from surrogates.casadi_export import (
     radial_expression,
     squared_distances,
 )
+from surrogates.casadi_export import to_casadi as to_casadi
 from surrogates.flat_limit import UNDER_ROOT
 from surrogates.interface import Surrogate, no_deviation
 from surrogates.maximum import Maximum

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -33,7 +34,6 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import design, save
 
-FORMULATIONS = ("nested", "lifted", "direct")
 Formulation = Nested | Lifted | Direct
 
 

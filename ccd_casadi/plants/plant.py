@@ -49,10 +49,10 @@ class Plant:
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
-    plant modelled more closely, by name: a design is certified on them again, not optimised.
-    `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
-    result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
-    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
+    plant modelled more closely, by name, without derivatives: a design is certified on them again,
+    not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
+    reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
+    known. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
     """
 
     names: tuple[str, ...]

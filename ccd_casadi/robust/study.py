@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.robust.demands import Demands as Demands
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate
 from ccd_casadi.robust.perturbed import (
@@ -21,30 +22,12 @@ from ccd_casadi.robust.perturbed import (
     tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robust.setpoint import Setpoint, setpoint
 from ccd_casadi.robust.signals import Noise, closed_loop, gains, noise
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
-
-
-@dataclass(frozen=True)
-class Demands:
-    """What to try: relative shift and tolerance, damping factors, densities, the move.
-
-    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
-    """
-
-    shift: float = 0.05
-    damping: tuple[float, float] = (0.5, 2.0)
-    tolerance: float = 0.01
-    samples: int = 200
-    sensor: float = 1.0
-    disturbance: float = 1.0
-    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
-    window: float = 1e-6
-    axis: int = 0
 
 
 @dataclass(frozen=True)

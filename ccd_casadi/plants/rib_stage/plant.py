@@ -68,8 +68,8 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
     back = [NAMES.index(name) for name in names]
 
-    def evaluator(variant: RibStage) -> "StageEvaluator":
-        return StageEvaluator(variant, tuple(place), tuple(back))
+    def evaluator(variant: RibStage, derivatives: bool = True) -> "StageEvaluator":
+        return StageEvaluator(variant, tuple(place), tuple(back), derivatives)
 
     theta = ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[i] for i in place])
@@ -86,19 +86,28 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
         outputs=count or len(stage.sensor_points),
         inputs=count or len(stage.actuator_points),
-        references={name: evaluator(variant) for name, variant in references.items()},
+        references={name: evaluator(variant, False) for name, variant in references.items()},
+        values=evaluator(stage, False),
     )
 
 
 class StageEvaluator:
-    """θ in the case's order -> Mechanics, derivatives in that order too."""
+    """θ in the case's order -> Mechanics, derivatives (if they are wanted) in that order too."""
 
-    def __init__(self, stage: RibStage, place: tuple[int, ...], back: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        stage: RibStage,
+        place: tuple[int, ...],
+        back: tuple[int, ...],
+        derivatives: bool = True,
+    ) -> None:
         self.stage, self.place, self.back = stage, place, back
+        self.derivatives = derivatives
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
-        found = self.stage.mechanics([float(theta[i]) for i in self.place])
-        if self.back == tuple(range(len(NAMES))):
+        here = [float(theta[i]) for i in self.place]
+        found = self.stage.mechanics(here, derivatives=self.derivatives)
+        if not self.derivatives or self.back == tuple(range(len(NAMES))):
             return found
         M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
         return replace(found, derivatives=(M, D, K, B, C))
