@@ -95,7 +95,8 @@ def _minimised(M: NDArray, x: Array, p: float) -> Array:
         live = -slope > FLAT
         if not live.any():
             break
-        rows, M, x, H, f, g, d, slope = (a[live] for a in (rows, M, x, H, f, g, d, slope))
+        rows, M, x, H = rows[live], M[live], x[live], H[live]
+        f, g, d, slope = f[live], g[live], d[live], slope[live]
         t = np.minimum(1.0, 2.0 / np.abs(d).max(axis=1))  # no factor above e² at a step
         waiting = np.ones(len(x), dtype=bool)
         new, f_new, g_new = x.copy(), f.copy(), g.copy()
@@ -115,7 +116,7 @@ def _minimised(M: NDArray, x: Array, p: float) -> Array:
         x, f, g = new, f_new, g_new
         found[rows] = x
         going = ~waiting  # no step goes down: as far as rounding lets it
-        rows, M, x, H, f, g = (a[going] for a in (rows, M, x, H, f, g))
+        rows, M, x, H, f, g = rows[going], M[going], x[going], H[going], f[going], g[going]
         if not len(rows):
             break
     return found

@@ -143,10 +143,27 @@ def _rigid_function(geometry: Geometry, points: tuple[Point, ...]) -> ca.Functio
 @lru_cache(maxsize=256)
 def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> Mechanics:
     found, here = modes_at(stage, theta), np.array(theta)
-    points = tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
-    u, du, dK = _displacements(stage, found, here, points, derivatives)
-    n, count = 3 + len(found.flexible), len(du)
-    lam = [(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible]
+    u, du, dK = _displacements(stage, found, here, points_of(stage), derivatives)
+    lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
+    return assembled(stage, lam, u, du, dK)
+
+
+def points_of(stage: RibStage) -> tuple[Point, ...]:
+    """Actuators and sensors, each point once."""
+    return tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
+
+
+def assembled(
+    stage: RibStage, lam: Array, u: Array, du: Array | None = None, dK: Array | None = None
+) -> Mechanics:
+    """The stage's matrices from λ of the flexible modes and u_z of all at the points (n, p).
+
+    The points are its actuators and sensors, each once; `du` (θ, n, p) and `dK` (θ, n, n) are the
+    slopes of u and of K, if there are any. Read-only.
+    """
+    n, points = len(u), points_of(stage)
+    du = np.zeros((0, *u.shape)) if du is None else du
+    dK = np.zeros((0, n, n)) if dK is None else dK
     act = [points.index(p) for p in stage.actuator_points]
     sens = [points.index(p) for p in stage.sensor_points]
     B, dB, C, dC = u[:, act], du[:, :, act], u[:, sens].T, du[:, :, sens].transpose(0, 2, 1)
@@ -155,7 +172,7 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> 
         drive = orthonormal_directions(stage.actuator_points, rows).T
         read = orthonormal_directions(stage.sensor_points, rows)
         B, dB, C, dC = B @ drive, dB @ drive, read @ C, read @ dC
-    zero = np.zeros((count, n, n))
+    zero = np.zeros((len(du), n, n))
     result = Mechanics(
         M=np.eye(n),
         D=np.zeros((n, n)),
@@ -168,6 +185,11 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> 
     for array in (result.M, result.D, result.K, result.B, result.C, *result.derivatives):
         array.flags.writeable = False  # shared by everyone who asks for this θ
     return result
+
+
+def rigid_part(stage: RibStage, theta: Array) -> Array:
+    """(3, points) u_z of z, tip and tilt."""
+    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)[0]
 
 
 def _displacements(

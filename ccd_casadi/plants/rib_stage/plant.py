@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 
-from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.plants.rib_stage import nearby
 from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.plants.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.plants.rib_stage.model import RibStage
 from ccd_casadi.plants.rib_stage.solver import StageError
 from ccd_casadi.plants.rib_stage.truncation import TWENTY, ModeCount
+from ccd_casadi.support.process_pool import Pool
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
 MODES = {10: ModeCount(), 20: TWENTY}
@@ -88,6 +91,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         inputs=count or len(stage.actuator_points),
         references={name: evaluator(variant, False) for name, variant in references.items()},
         values=evaluator(stage, False),
+        nearby=partial(_nearby, evaluator(stage, False)) if nearby.applies(stage) else None,
     )
 
 
@@ -111,6 +115,15 @@ class StageEvaluator:
             return found
         M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
         return replace(found, derivatives=(M, D, K, B, C))
+
+
+def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+    """A reduced basis of the stage within ± reach of θ, its snapshots solved by the pool."""
+    stage, here = own.stage, [float(theta[i]) for i in own.place]
+    tasks = [(stage, place) for place in nearby.places(here, reach)]
+    made = dict(pool.map_unordered(nearby.numbered_snapshot, list(enumerate(tasks))))
+    evaluate = nearby.reduced(stage, here, [made[i] for i in range(len(tasks))])
+    return lambda values: evaluate([float(values[i]) for i in own.place])
 
 
 def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[float, ...]] | None:
