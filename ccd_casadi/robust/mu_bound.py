@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ccd_casadi.support.arrays import Array
 
 SWEEPS = 10  # of balancing
+BALANCED = 1e-4  # of a step in ln d that ends it
 ORDERS = (16.0, 256.0, 4096.0)  # p; what the last leaves is below ln n / 8192
 STEPS = 60  # of BFGS for each p
 FLAT = 1e-7  # a predicted decrease of ln σ_max that is none
@@ -53,13 +54,18 @@ def _balanced(M: NDArray) -> Array:
     x = np.zeros(size.shape[:2])
     tiny = np.finfo(float).tiny
     for _ in range(SWEEPS):
+        moved = 0.0
         for i in range(n):
-            ratio = np.exp(2.0 * (x[:, i, None] - x))
-            row = (size[:, i, :] * ratio).sum(axis=1)
-            column = (size[:, :, i] / ratio).sum(axis=1)
+            row, column = size[:, i, :].sum(axis=1), size[:, :, i].sum(axis=1)
             live = (row > tiny) & (column > tiny)
-            step = np.log(np.where(live, column, 1.0) / np.where(live, row, 1.0))
-            x[:, i] += 0.25 * step
+            factor = np.sqrt(np.where(live, column, 1.0) / np.where(live, row, 1.0))
+            size[:, i, :] *= factor[:, None]
+            size[:, :, i] /= factor[:, None]
+            step = 0.5 * np.log(factor)
+            x[:, i] += step
+            moved = max(moved, float(np.abs(step).max(initial=0.0)))
+        if moved < BALANCED:
+            break
     return x - x.mean(axis=1, keepdims=True)
 
 
