@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -33,7 +34,6 @@ from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import Quality, design, save
 from surrogates.files import write_whole
 
-FORMULATIONS = ("nested", "lifted", "direct")
 Formulation = Nested | Lifted | Direct
 
 
