@@ -35,7 +35,7 @@ LIVE = {
     "ccd_casadi/sampling/cluster.py",
     "ccd_casadi/support/deadline.py",
 }
-# They import by names that sources spell out: optional packages, a command's library, the public face.
+# They import by names that sources spell out: optional packages, what a command needs, names.
 BY_NAME = {
     "ccd_casadi/support/optional_packages.py",
     "ccd_casadi/support/command_line.py",
