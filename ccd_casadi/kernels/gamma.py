@@ -8,7 +8,7 @@ place: a step of order four from one Schur form, whose own terms tell when it is
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.frequency import response
+from ccd_casadi.kernels.frequency import prepare, response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.refine import narrow, next_trial
 from ccd_casadi.kernels.riccati import riccati_level, root_nearby
@@ -24,14 +24,11 @@ def lower_bound_squared(w, gain, ω):
     return W1 * R / (W1 + R)
 
 
-@compiled
 def plant_gain(A, B, C, ω):
-    """σ_p(G(jω)), the least gain over output directions (0 where m < p)."""
-    n, m, p = A.shape[0], B.shape[1], C.shape[0]
-    if m < p:
-        return 0.0
-    M = (1j * ω) * np.eye(n) - A
-    return _least_gain(C.astype(np.complex128) @ np.linalg.solve(M, B.astype(np.complex128)))
+    """σ_p(G(jω)), the least gain over output directions (0 where m < p), at every ω of an array."""
+    if B.shape[1] < C.shape[0]:
+        return np.zeros(ω.size)
+    return np.linalg.svd(responses(prepare(A, B, C), ω), compute_uv=False)[:, -1]
 
 
 @compiled

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
+from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
@@ -24,32 +25,20 @@ def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
     N = Ag.shape[0]
     if not ok:
         return np.zeros((N, N)), B1, np.zeros((m, N)), False
-    X = np.linalg.solve(np.ascontiguousarray(U1.T), np.ascontiguousarray(U2.T))
-    X = 0.5 * (X + X.T)
-    F = -(np.ascontiguousarray(B2.T) @ X + d2 * C1[p : p + m]) / d2**2
-    return Ag + B2 @ F - B1 @ C2, B1, F, True
+    X = symmetric_part(np.linalg.solve(transposed(U1), transposed(U2)), 0.5)
+    F, Ak = transposed(B2) @ X, Ag.copy()
+    for i in range(m):
+        for j in range(N):
+            F[i, j] = -(F[i, j] + d2 * C1[p + i, j]) / d2**2
+    add(Ak, 0, 0, 1.0, B2 @ F)
+    add(Ak, 0, 0, -1.0, B1 @ C2)
+    return Ak, B1, F, True
 
 
 @compiled
-def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
-    """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
-
-    The row's code is CERTIFIED where the controller may go on to be assessed. `balanced` solves
-    in balanced coordinates, with the noise of rounding measured; the controller is in the
-    plant's own ones always.
-    """
+def _search_and_control(gp, H0, bound, backoff, guess, noise):
+    """γ_opt, never below `bound`, and the central controller at backoff·γ_opt: the row, K."""
     row = np.full(_COUNT, np.nan)
-    gp = generalized_plant(A, B, C, w)
-    m, p, N = B.shape[1], C.shape[0], gp[0].shape[0]
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
-    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
-    τ, noise = np.ones(N), NOISE
-    if balanced:
-        t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
-        τ = balancing(level_hamiltonian(H0, gp[1], gp[3], gp[5], t))
-        gp = in_coordinates(gp, τ)
-        H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
-        noise = rounding_noise(H0)
     Ag, B1, B2, C1, C2, d1, d2 = gp
     gamma_opt, limited, forms, converged = optimal_gamma(
         H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE, noise
@@ -62,7 +51,36 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
         row[Figure.CODE] = Code.RICCATI_FAILED.value
     if not converged:
         row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
-    if balanced:
+    return row, Ak, Bk, Ck
+
+
+@compiled
+def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
+    gp = generalized_plant(A, B, C, w)
+    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
+    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    return _search_and_control(gp, H0, bound, backoff, guess, NOISE)
+
+
+def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
+    """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
+
+    The row's code is CERTIFIED where the controller may go on to be assessed. `balanced` solves
+    in balanced coordinates, with the noise of rounding measured; the controller is in the
+    plant's own ones always.
+    """
+    if not balanced:
+        return _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+    p, m = C.shape[0], B.shape[1]
+    gp = generalized_plant(A, B, C, w)
+    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
+    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
+    with np.errstate(all="ignore"):  # an undefined number is seen in the result
+        τ = balancing(level_hamiltonian(H0, gp[1], gp[3], gp[5], t))
+        gp = in_coordinates(gp, τ)
+        H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
+        noise = rounding_noise(H0)
+        row, Ak, Bk, Ck = _search_and_control(gp, H0, bound, backoff, guess, noise)
         back = τ.reshape(-1, 1)
         return row, Ak * (back / τ), Bk * back, Ck / τ
-    return row, Ak, Bk, Ck
