@@ -6,17 +6,24 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test lint docs bench setup setup-test clean
+.PHONY: solve test test-processors lint docs bench setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
 test: setup-test lint docs
 	$(BIN)/python -m pytest -n 2
+	$(BIN)/python benchmarks/processors.py --other
+
+# The suite under the kernels that OpenBLAS has for other processors, three times each, with
+# examples drawn anew: an hour or more on two cores.
+test-processors: setup-test
+	$(BIN)/python benchmarks/processors.py
 
 lint: setup-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 # The documentation site, in site/: a broken link or reference is an error.
 docs: setup-test

@@ -9,9 +9,9 @@ from collections import Counter
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
-from ccd_casadi.backends.mixed import TITLES, synthesise_with
-from ccd_casadi.cross_check import verdicts
-from ccd_casadi.deadline import Runner
+from ccd_casadi.support.deadline import Runner
+from ccd_casadi.synthesis.backends.judgement import verdicts
+from ccd_casadi.synthesis.backends.mixed import TITLES, synthesise_with
 
 SEED = 0
 

@@ -15,16 +15,16 @@ from numba import njit
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import linprog, minimize
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.closed_loop import local_peaks
-from ccd_casadi.inner import sweep_inner
-from ccd_casadi.inner_search import search_inner
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner_problem.problem import scaled_plant, true_inner
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.sweep import sweep_inner
 from ccd_casadi.kernels.design import design
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
-from ccd_casadi.problem import scaled_plant, true_inner
-from ccd_casadi.synthesis import synthesise
+from ccd_casadi.synthesis.closed_loop import local_peaks
+from ccd_casadi.synthesis.synthesis import synthesise
 
 HZ, W1, W2 = 2.0 * np.pi, 0.0995, -0.9950
 CASE = Path(__file__).parent.parent / "runs" / "two_mass_paper.toml"

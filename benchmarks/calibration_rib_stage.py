@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import brentq
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.inner_search import search_inner
-from ccd_casadi.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.scaling import ScaledPlant
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.plants.scaling import ScaledPlant
 
 HZ = 2.0 * np.pi
 CASE = Path(__file__).parent.parent / "runs" / "rib_stage.toml"

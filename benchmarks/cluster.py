@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.cluster import Cluster
-from ccd_casadi.parallel import Pool, Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import CHUNK, design_unit, inner_unit
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.sampler import CHUNK, design_unit, inner_unit
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Pool, Workers
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).with_name("cluster.json")

@@ -44,10 +44,10 @@ FILES = ("controller.json", "surrogate.json", "case.toml")
 SAMPLING = f"""
 import sys
 import numpy as np
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.sampler import Truth
 
 if __name__ == "__main__":
     problem = problem_of(load_case({str(CASE)!r}))
@@ -136,12 +136,12 @@ def begun(kind: str, folder: Path) -> None:
     (folder.parent / "sampling.py").write_text(SAMPLING)
     (folder.parent / "quick.toml").write_text(CASE.read_text() + QUICK)
     if kind == "retraining":
-        from ccd_casadi.retraining import open_run
+        from ccd_casadi.reporting.retrained_run import open_run
         from surrogates import design
 
         shutil.copy(folder.parent / "quick.toml", folder / "case.toml")
-        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as truth:
-            truth.evaluate(design("sobol", truth.lower, truth.upper, 16, 0))
+        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as sampler:
+            sampler.evaluate(design("sobol", sampler.lower, sampler.upper, 16, 0))
 
 
 def started(words: list[str]) -> subprocess.Popen[str]:

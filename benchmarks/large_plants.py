@@ -8,7 +8,7 @@ import time
 
 from problems import OMEGA_LOW, stage, weights
 
-from ccd_casadi.synthesis import synthesise
+from ccd_casadi.synthesis.synthesis import synthesise
 
 
 def main() -> None:

@@ -55,7 +55,10 @@ GROUPS = (
     Group(
         tuple(
             f"ccd_casadi/{name}.py"
-            for name in ("modal", "scaling", "synthesis", "closed_loop", "weights", "derivatives")
+            for name in (
+                "plants/modal", "plants/scaling", "synthesis/synthesis", "synthesis/closed_loop",
+                "synthesis/weights", "synthesis/derivatives",
+            )
         ),
         (*DESIGN_TESTS, "tests/test_closed_loop.py", "tests/test_plant.py",
          "tests/test_derivatives.py", "tests/test_backends.py", "tests/test_robust_design.py"),
@@ -63,7 +66,7 @@ GROUPS = (
         interpreted=False,
     ),
     Group(
-        ("ccd_casadi/samples.py", "ccd_casadi/sampling.py"),
+        ("ccd_casadi/sampling/store.py", "ccd_casadi/sampling/sampler.py"),
         ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
         "not killed and not ctrl_c",
         interpreted=False,

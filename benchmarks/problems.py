@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.models import two_mass
-from ccd_casadi.plant import Mechanics, build_plant, mechanics
-from ccd_casadi.scaling import ScaledPlant, scale_plant
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants import two_mass
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi
 OMEGA_LOW = 1.0 * HZ

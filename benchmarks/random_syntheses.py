@@ -28,12 +28,13 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.norms import hinf_norm
-from ccd_casadi.plant import Mechanics, PlantError
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant, scale_state_space
-from ccd_casadi.synthesis import Design, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, scale_state_space
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.synthesis.norms import hinf_norm
+from ccd_casadi.synthesis.synthesis import Design, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 EACH = 10  # weights a plant
 LIMIT = 10.0  # seconds a synthesis

@@ -19,10 +19,11 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.retraining import CoDesignTruth, open_run
+from ccd_casadi.codesign.retraining import CoDesignTruth
+from ccd_casadi.reporting.retrained_run import open_run
 from surrogates import sobol
 from surrogates.acquisition import objective_and_violation
-from surrogates.judgement import STARTS, fit_all
+from surrogates.iteration import STARTS, fit_all
 from surrogates.optimum import predicted_optimum
 from surrogates.retraining import Settings, retrain, thinned
 

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.known import known_designs
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore, problem_hash, sample_key
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parent.parent
 UNIT = 20  # rows a transaction, as many as an inner problem takes
@@ -33,11 +33,11 @@ def filled(path: Path, rows: int) -> list[str]:
     """Make a store of so many rows of 20 problems, one of them case study 1; return its keys."""
     problem = problem_of(load_case(ROOT / "runs" / "two_mass.toml"))
     with SampleStore(path) as store, Workers(1) as workers:
-        truth = Truth(problem, store, workers)
-        truth.quantities(np.array([[60.0, 60.0, 8.0, 5.0]]))
-        (model,) = store.select(truth.hash)
+        sampler = Sampler(problem, store, workers)
+        sampler.quantities(np.array([[60.0, 60.0, 8.0, 5.0]]))
+        (model,) = store.select(sampler.hash)
         rng, keys = np.random.default_rng(0), []
-        owners = [truth.hash, *(problem_hash({"other": i}) for i in range(1, PROBLEMS))]
+        owners = [sampler.hash, *(problem_hash({"other": i}) for i in range(1, PROBLEMS))]
         for start in range(0, rows, UNIT):
             owner = owners[start // UNIT % PROBLEMS]
             unit = []
@@ -47,7 +47,7 @@ def filled(path: Path, rows: int) -> list[str]:
                 unit.append(
                     replace(model, key=key, theta=theta, omega_S=omega[0], omega_T=omega[1])
                 )
-                if owner == truth.hash:
+                if owner == sampler.hash:
                     keys.append(key)
             inner = sample_key(owner, unit[0].theta, 0.0, 0.0)
             store.put_unit(unit, (inner, owner, unit[0].theta, {"syntheses": UNIT}), owner)
@@ -122,7 +122,7 @@ def main() -> None:
             assert len(found) == 500
             seconds["select_one_problem"], found = timed(lambda: store.select(hashed))
             assert len(found) == len(keys) + 1
-            seconds["resume_known_designs"], found = timed(lambda: known_designs(store, problem))
+            seconds["resume_known_designs"], found = timed(lambda: stored_designs(store, problem))
             assert len(found) == len(keys) + 1
         figures["eight_processes"] = eight(Path(name), path)
     figures["peak_megabytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

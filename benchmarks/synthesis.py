@@ -21,8 +21,8 @@ import numpy as np
 import slycot
 from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 
-from ccd_casadi.inner import InnerProblem
-from ccd_casadi.inner_search import search_inner
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.kernels.design import assess, design, sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.gamma import optimal_gamma

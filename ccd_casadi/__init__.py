@@ -1,6 +1,74 @@
+"""Control co-design of precision motion stages: a machine and its H∞ controller, certified.
+
+>>> import ccd_casadi as ccd
+>>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+>>> round(ccd.true_inner(problem, (60.0, 60.0)).bandwidth / ccd.HZ, 1)
+58.2
+
+Names are imported when they are first used: this module alone loads neither numba nor CasADi.
+"""
+
 import sys
+from importlib import import_module, metadata
+from types import ModuleType
 
 if sys.argv[:1] == ["-m"]:  # a command is starting, not a library: its first import is this
     import surrogates as _surrogates  # takes care of Ctrl-C while the rest is imported
 
     del _surrogates
+
+# Every public name, and the module that defines it.
+_PUBLIC = {
+    "CoDesignProblem": "inner_problem.problem",
+    "Direct": "codesign.direct",
+    "HZ": "support.units",
+    "Lifted": "codesign.lifted",
+    "Nested": "codesign.nested",
+    "Plant": "plants.plant",
+    "Solution": "codesign.run",
+    "StateSpace": "plants.scaling",
+    "TrueQuantities": "inner_problem.true_function",
+    "UserError": "support.errors",
+    "Weights": "synthesis.weights",
+    "build_plant": "plants.plant",
+    "compare": "codesign.comparison",
+    "deploy": "deployment.pipeline",
+    "load_case": "cases.case",
+    "parse_case": "cases.case",
+    "plant_from_control": "synthesis.interchange",
+    "problem_of": "cases.case",
+    "read_run": "cases.run_folder",
+    "robustness": "robust.study",
+    "scaled_plant": "inner_problem.problem",
+    "solve": "codesign.run",
+    "synthesise": "synthesis.synthesis",
+    "true_design": "inner_problem.problem",
+    "true_inner": "inner_problem.problem",
+    "verify": "codesign.verify",
+}
+__all__ = [*_PUBLIC, "__version__"]
+
+
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        return metadata.version("ccd-casadi")
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+class _Package(ModuleType):
+    """Keeps `ccd_casadi.solve` the function when the command's module of that name is imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _PUBLIC and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -2,73 +2,15 @@
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.case_sections import Case
-from ccd_casadi.command_line import ExitCode, parser, run
-from ccd_casadi.diagnosis import Finding, Severity, diagnose, first_seen
-from ccd_casadi.plant_facts import PlantFacts
-from ccd_casadi.problem import CoDesignProblem, plant_of
-from ccd_casadi.results import clean
-
-# ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
-# resonances stand in the way.
-WINDOW = (0.4, 1.1)
-SHARES = (0.2, 1.0 / 3.0, 0.5)  # of the first resonance: the rule of thumb, and beyond it
-
-
-def report(
-    case: Case, problem: CoDesignProblem, facts: Sequence[PlantFacts], findings: Sequence[Finding]
-) -> dict[str, Any]:
-    """The diagnosis as plain values; frequencies in Hz, M_K in force over displacement."""
-    plant = plant_of(problem)
-    start = facts[0]
-    ranges = _ranges(facts)
-    return {
-        "plant": case.plant.model or case.plant.function,
-        "inputs": plant.inputs,
-        "outputs": plant.outputs,
-        "notes": list(plant.notes(problem.start)),
-        "theta": dict(zip(problem.names, problem.start, strict=True)),
-        "points": len(facts),
-        "rigid_modes": sum(mode.rigid for mode in start.modes),
-        "modes": [asdict(mode) for mode in start.modes],
-        "frequency_ranges_hz": ranges,
-        "zeros": [asdict(zero) for zero in start.zeros],
-        "effort_hz": start.effort_hz,
-        "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
-        "M_K": problem.weights.M_K,
-        "M_K_for_bandwidth": _suitable(problem, start),
-        "findings": [
-            {"severity": f.severity.value, "topic": f.topic.value, "words": f.words}
-            for f in first_seen(findings)
-        ],
-    }
-
-
-def _ranges(facts: Sequence[PlantFacts]) -> list[list[float]]:
-    """Least and largest frequency of the i-th mode in order of frequency, over the points."""
-    count = min(len(item.modes) for item in facts)
-    table = np.array([[mode.frequency_hz for mode in item.modes[:count]] for item in facts])
-    return [[float(low), float(high)] for low, high in zip(table.min(0), table.max(0), strict=True)]
-
-
-def _suitable(problem: CoDesignProblem, start: PlantFacts) -> list[dict[str, float]]:
-    """M_K that moves `effort_hz` to shares of the first resonance, below which G falls as ω⁻²."""
-    first = next((mode.frequency_hz for mode in start.modes if not mode.rigid), math.nan)
-    M_K, effort = problem.weights.M_K, start.effort_hz
-    return [
-        {"bandwidth_hz": share * first, "M_K": M_K * (share * first / effort) ** 2}
-        for share in SHARES
-        if math.isfinite(first / effort) and start.modes[0].rigid
-    ]
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.diagnosis import Severity, diagnose
+from ccd_casadi.cases.plant_report import SHARES, plant_report
+from ccd_casadi.codesign.result import clean
+from ccd_casadi.support.command_line import ExitCode, parser, run
 
 
 def text(found: dict[str, Any]) -> str:
@@ -115,7 +57,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"{options.case}: plant: {item.words}", file=sys.stderr)
     if errors:
         return ExitCode.BAD_INPUT
-    found = clean(report(case, problem, facts, findings))
+    found = clean(plant_report(case, problem, facts, findings))
     print(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
     return ExitCode.DONE
 

@@ -7,54 +7,17 @@ design that is not certified does not count, and among those that are the lowest
 import argparse
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from ccd_casadi.backends.mixed import RICCATI, TITLES, BackendResult, every_backend
-from ccd_casadi.case import CaseError, load_case, parse_theta, problem_of
-from ccd_casadi.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.problem import CoDesignProblem, scaled_plant, true_inner
-from ccd_casadi.results import clean, figures_dict, versions, write_json
-from ccd_casadi.run_folder import read_run
-
-HZ = 2.0 * math.pi
-AGREE = 1e-3  # relative: what an interior-point method is good for
-BELOW = 1e-6  # relative: a claim this far below the bound is wrong
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the certificate says of one back end, and whether its claim and design hold."""
-
-    result: BackendResult
-    holds: bool | None  # None: it made no claim
-    words: str
-
-
-def verdicts(results: Sequence[BackendResult]) -> list[Verdict]:
-    """Judge every claim by the certificates and by the bound γ_jω of the package's own design."""
-    ours = next(item for item in results if item.backend == RICCATI)
-    bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
-    proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
-    lowest = min(
-        (g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan
-    )  # fmt: skip
-    found = []
-    for item in results:
-        if item.design is None:
-            found.append(Verdict(item, None, item.reason))
-        elif item.gamma_opt < bound * (1.0 - BELOW):
-            short = 100.0 * (1.0 - item.gamma_opt / bound)
-            words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
-            found.append(Verdict(item, False, words))
-        elif not item.certified:
-            found.append(Verdict(item, False, f"not certified: {item.reason}"))
-        elif item.gamma_opt > lowest * (1.0 + AGREE):
-            over = 100.0 * (item.gamma_opt / lowest - 1.0)
-            found.append(Verdict(item, False, f"certified, but {over:.2g} % above the least"))
-        else:
-            found.append(Verdict(item, True, "certified"))
-    return found
+from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.result import clean, figures_dict, versions, write_json
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.backends.judgement import AGREE, Verdict, verdicts
+from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, every_backend
+from surrogates.options import positive
 
 
 def _problem(
@@ -177,24 +140,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
     for name in ("S", "T"):
         arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=_positive, metavar="X",
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
             help="with the other one; without both the best pair at theta, or the run's",
         )  # fmt: skip
     arguments.add_argument(
-        "--limit", type=_positive, default=60.0, metavar="SECONDS",
+        "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="for each optional back end (default: 60)",
     )  # fmt: skip
     return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
 
 
 if __name__ == "__main__":

@@ -1,191 +1,27 @@
 """`python -m ccd_casadi.solve CASE.toml`: sample, fit, IPOPT, verify; writes the run folder."""
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from time import perf_counter
-from typing import Any
 
-import numpy as np
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of, write_run
+from ccd_casadi.codesign.stored import named_surrogate
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.registry import SHIPPED
+from ccd_casadi.sampling.cluster import pool
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
+from ccd_casadi.support.process_pool import PATIENCE
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.case_sections import Case
-from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.cluster import pool
-from ccd_casadi.command_line import ExitCode, add_scheduler, parser, run, run_folder
-from ccd_casadi.diagnosis import Severity, diagnose, first_seen
-from ccd_casadi.direct import solve_direct
-from ccd_casadi.iterates import FormulationResult
-from ccd_casadi.known import Surrogates, named_surrogate
-from ccd_casadi.lifted import solve_lifted
-from ccd_casadi.models import SHIPPED
-from ccd_casadi.nested import solve_nested
-from ccd_casadi.outer import unmet_constraint
-from ccd_casadi.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.results import (
-    clean,
-    controller_dict,
-    infeasible_dict,
-    result_dict,
-    write_json,
-)
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
-from ccd_casadi.surrogate_quality import Quality, quality_dict, surrogate_quality
-from ccd_casadi.verify import VerifiedDesign, verify
-from surrogates import design, save
-
-PATIENCE = 2.0  # s of work that is not worth starting processes for
-FORMULATIONS = ("nested", "lifted", "direct")
 _CODES = {
     "verified": ExitCode.DONE,
     "not_verified": ExitCode.NOT_VERIFIED,
     "infeasible": ExitCode.INFEASIBLE,
 }
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Everything a run found: the JSON result, and the objects behind it (None: infeasible)."""
-
-    result: dict[str, Any]
-    outcome: FormulationResult
-    verified: VerifiedDesign | None
-    quality: tuple[Quality, ...] = ()
-
-    @property
-    def exit_code(self) -> ExitCode:
-        """The command's exit code."""
-        return _CODES[self.result["status"]]
-
-
-def solve(
-    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None = None
-) -> Solution:
-    """Run one formulation, verify and polish its design on the truth."""
-    began = perf_counter()
-    forbidden = unmet_constraint(truth.problem, case.outer.starts, seed)
-    if forbidden:
-        outcome = FormulationResult(None, None, (), (), None, False, forbidden)
-    else:
-        outcome = _formulate(case, truth, formulation, seed, given)
-        if outcome.x is None:
-            outcome = rescue(truth, outcome, seed)
-    return conclude(truth, formulation, outcome, case.outer.tolerance, seed, began)
-
-
-def conclude(
-    truth: Truth,
-    formulation: str,
-    outcome: FormulationResult,
-    tolerance: float,
-    seed: int,
-    began: float,
-) -> Solution:
-    """Verify and polish what a formulation found, if anything."""
-    if outcome.x is None:
-        result = infeasible_dict(
-            formulation,
-            outcome.message,
-            syntheses=truth.syntheses,
-            seconds=perf_counter() - began,
-            seed=seed,
-        )
-        return Solution(result, outcome, None)
-    verified = verify(truth, outcome.x)
-    quality = surrogate_quality(outcome.surrogates, verified.x, seed)
-    result = result_dict(
-        truth.problem,
-        formulation,
-        outcome,
-        verified,
-        tolerance=tolerance,
-        syntheses=truth.syntheses,
-        seconds=perf_counter() - began,
-        seed=seed,
-    )
-    result["surrogate_quality"] = clean(quality_dict(quality))
-    return Solution(result, outcome, verified, quality)
-
-
-def _formulate(
-    case: Case, truth: Truth, formulation: str, seed: int, given: Surrogates | None
-) -> FormulationResult:
-    outer, sampling = case.outer, case.sampling
-    if formulation == "nested":
-        return solve_nested(
-            truth,
-            kind=sampling.design,
-            points=sampling.points,
-            starts=outer.starts,
-            tolerance=outer.tolerance,
-            max_refinements=outer.max_refinements,
-            seed=seed,
-            given=given,
-            surrogate_kind=outer.surrogate,
-        )
-    if formulation == "lifted":
-        # A quadratic in n variables has (n+1)(n+2)/2 coefficients; a sample with gradients
-        # gives n+1 numbers: 6n samples are twelve times what it needs at n = 4, six times at n = 8.
-        points = sampling.lifted_points or 6 * (len(case.theta) + 2)
-        return solve_lifted(
-            truth,
-            points=points,
-            starts=outer.starts,
-            tolerance=outer.tolerance,
-            max_refinements=outer.max_refinements,
-            seed=seed,
-            given=given,
-            surrogate_kind=outer.surrogate,
-        )
-    return solve_direct(truth, starts=outer.direct_starts, seed=seed)
-
-
-def rescue(truth: Truth, outcome: FormulationResult, seed: int) -> FormulationResult:
-    """Ask the true inner problem at a few θ: is the case infeasible, or did a formulation fail?"""
-    lower, upper = box(truth.problem)
-    points = design("sobol", lower, upper, 8, seed)
-    samples = truth.bandwidths(points, "looking for a feasible design")
-    feasible = [sample for sample in samples if sample.feasible]
-    if not feasible:
-        assert truth.nearest is not None
-        words = truth.nearest.shortfall
-        return FormulationResult(None, None, outcome.iterates, (), None, False, words)
-    best = max(feasible, key=lambda sample: sample.bandwidth)
-    x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
-    return FormulationResult(
-        x, None, outcome.iterates, outcome.surrogates, outcome.outer, False, outcome.message
-    )
-
-
-def write_run(folder: Path, case: Case, solution: Solution) -> None:
-    """Write what a run folder holds besides samples and report; clear an earlier run's."""
-    for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
-        (folder / name).unlink(missing_ok=True)
-    text = case_to_toml(case)
-    draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, folder / "case.toml")
-    formulation = solution.result["formulation"]
-    write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
-    if solution.verified is not None:
-        write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
-    if solution.outcome.surrogates:
-        save(
-            solution.outcome.surrogates,
-            folder / "surrogate.json",
-            {
-                "formulation": formulation,
-                "outputs": ["bandwidth"]
-                if len(solution.outcome.surrogates) == 1
-                else ["bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low"],
-                "loo": [vars(process.loo) for process in solution.outcome.surrogates],
-            },
-        )
-    write_json(folder / "result.json", solution.result)
 
 
 def summary(solution: Solution) -> str:
@@ -216,7 +52,7 @@ def summary(solution: Solution) -> str:
     return "\n".join(lines)
 
 
-def tell(case: Case, problem: CoDesignProblem) -> None:
+def show_findings(case: Case, problem: CoDesignProblem) -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     if case.plant.model in SHIPPED:
         return
@@ -235,7 +71,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
     if not options.quiet:
-        tell(case, problem)
+        show_findings(case, problem)
     given = None
     if options.surrogate is not None:
         given = named_surrogate(folder, options.surrogate, options.formulation, problem)
@@ -244,18 +80,20 @@ def command(options: argparse.Namespace) -> ExitCode:
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(store) as samples,
     ):
-        truth = Truth(problem, samples, workers, quiet=options.quiet)
-        solution = solve(case, truth, options.formulation, options.seed, given)
+        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+        formulation = formulation_of(case, options.formulation)
+        solution = co_design(sampler, formulation, options.seed, given)
         write_run(folder, case, solution)
-    from ccd_casadi.report import write_report  # matplotlib is slow to import
+    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
     write_report(folder, case, problem, solution)
+    code = _CODES[solution.result["status"]]
     if not options.quiet:
         print(summary(solution))
         print(f"run folder    {folder}")
-    elif solution.exit_code is not ExitCode.DONE:
+    elif code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
-    return solution.exit_code
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:

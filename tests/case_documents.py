@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from ccd_casadi.case import CaseError, load_case, parse_case
-from ccd_casadi.case_sections import Case
-from ccd_casadi.case_toml import case_to_toml
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 DOCUMENT = tomllib.loads(TWO_MASS.read_text("utf-8"))

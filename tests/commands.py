@@ -9,7 +9,7 @@ from ccd_casadi.solve import main
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.models import MODELS
+from ccd_casadi.plants.registry import MODELS
 
 def model(theta, least):
     total = theta["m1"] + theta["m2"]

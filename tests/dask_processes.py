@@ -8,7 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from ccd_casadi.cluster import Cluster
+from ccd_casadi.sampling.cluster import Cluster
 
 HERE = Path(__file__).parent
 

@@ -23,15 +23,15 @@ from fuzz_judge import Ending, misbehaviour
 from fuzz_refute import refuted
 from fuzz_values import ROOT, Input
 
-import ccd_casadi.report
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.errors import UserError
-from ccd_casadi.inner_command import main as inner
+import ccd_casadi.reporting.solve_page
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
-from ccd_casadi.known import known_designs
-from ccd_casadi.run_folder import read_run
-from ccd_casadi.samples import SampleStore
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main as solve
+from ccd_casadi.support.errors import UserError
 from surrogates import SurrogateFileError, load
 from surrogates.retrain import main as retrain
 from surrogates.truth import TruthError, opener_of
@@ -221,7 +221,7 @@ def read(argv: list[str]) -> int:
         with SampleStore(folder / "samples.sqlite") as opened:
             opened.select()
             problem = problem_of(load_case(folder / "case.toml"))
-            known_designs(opened, problem)
+            stored_designs(opened, problem)
 
     readers: list[tuple[Any, tuple[type[Exception], ...]]] = [
         (lambda: read_run(folder), (UserError,)),
@@ -250,5 +250,5 @@ def _without_pictures(skip: bool) -> Iterator[None]:
     if not skip:
         yield
         return
-    with patch.object(ccd_casadi.report, "write_report", stub):
+    with patch.object(ccd_casadi.reporting.solve_page, "write_report", stub):
         yield

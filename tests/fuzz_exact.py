@@ -9,10 +9,11 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 
-from ccd_casadi.modal import RIGID_RATIO, Suspension
-from ccd_casadi.plant import Array, Mechanics
-from ccd_casadi.scaling import StateSpace
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import RIGID_RATIO, Suspension
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.weights import Weights
 
 mp.mp.dps = 60
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
-from ccd_casadi import samples
+from ccd_casadi.sampling import store as samples
 
 NOBODY = 65534
 

@@ -13,10 +13,11 @@ import numpy as np
 from fuzz_exact import ExactLoop
 from helpers import HZ, dense_grid, reference_plant, sensitivity_gain, stack_gain
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.plant import Array, constraint_values, mechanics
-from ccd_casadi.problem import plant_of
-from ccd_casadi.scaling import StateSpace
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.plants.plant import constraint_values, mechanics
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
 
 CLOSE = 1e-4  # of a figure against the same from a grid
 LEVEL = 1.0 / np.sqrt(2.0)

@@ -10,7 +10,7 @@ import control
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.backends.standard_plant import StandardPlant
+from ccd_casadi.synthesis.backends.standard_plant import StandardPlant
 
 Rows = list[list[float]]
 

@@ -6,7 +6,7 @@ damping come from matrix square roots, loops from dense solves at each frequency
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import casadi as ca
 import control
@@ -15,16 +15,16 @@ from hypothesis import settings
 from scipy.linalg import sqrtm
 from scipy.optimize import brentq, minimize_scalar
 
-from ccd_casadi.inner import InnerProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.kernels.design import assess
 from ccd_casadi.kernels.figures import Figure
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.models import MODELS
-from ccd_casadi.plant import Mechanics, Plant, build_plant, mechanics
-from ccd_casadi.problem import CoDesignProblem, PlantSource
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant
-from ccd_casadi.synthesis import DesignFigures, figures_from_row
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
+from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row
+from ccd_casadi.synthesis.weights import Weights
 
 Array = np.ndarray
 HZ = 2.0 * np.pi
@@ -33,7 +33,7 @@ SUSPENSION = Suspension()
 # Rounding K alone moves a rigid-body mode by eps·(ω_max/ω_r)²: comparisons between dense
 # matrices to 1e-9 need it nearer to the flexible modes than the default 0.1 Hz.
 STIFF_SUSPENSION = Suspension(2.0, 0.7)
-few = partial(settings, derandomize=True, deadline=None, database=None)
+few = settings  # what else holds is the profile's, see conftest.py
 
 PAPER = Weights(
     M_S=2.0, A_S=1e-4, omega_S=800.0 * HZ, c_K=1e4, omega_K=100.0 * HZ, M_K=2e7,

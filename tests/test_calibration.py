@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.problem import CoDesignProblem, true_inner
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 
 ROOT = Path(__file__).parent.parent
 HZ = 2.0 * np.pi

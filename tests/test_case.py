@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from case_documents import DROP, PLANT, TWO_MASS, edited, message
 
-from ccd_casadi import case as case_module
-from ccd_casadi.case import CaseError, load_case, parse_case, parse_theta, problem_of
-from ccd_casadi.case_sections import Parameter
-from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.errors import UserError
-from ccd_casadi.models import BUILDERS, MODELS
+from ccd_casadi.cases import case as case_module
+from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta, problem_of
+from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.plants.registry import BUILDERS, MODELS
+from ccd_casadi.support.errors import UserError
 
 
 @pytest.fixture

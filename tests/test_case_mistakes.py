@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from case_documents import DOCUMENT, DROP, edited, message
 
-from ccd_casadi.case import CaseError, load_case
-from ccd_casadi.errors import UserError
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.support.errors import UserError
 
 # Every kind of mistake: what is changed, the key that is named, and the remedy.
 MISTAKES: list[tuple[str, Any, str, str]] = [

@@ -10,9 +10,9 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.case import load_case, parse_case
-from ccd_casadi.case_sections import Case
-from ccd_casadi.case_toml import case_to_toml
+from ccd_casadi.cases.case import load_case, parse_case
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
 
 
 def test_the_contracts_case_comes_back_as_it_was(tmp_path: Path) -> None:

@@ -22,9 +22,9 @@ from hypothesis import strategies as st
 from ccd_casadi.kernels.certificate import level_test, stack_norm, weighted_loop
 from ccd_casadi.kernels.design import certificate_grid
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.scaling import ScaledPlant, StateSpace
-from ccd_casadi.synthesis import Outcome, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.synthesis.synthesis import Outcome, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 masses = st.floats(55.0, 70.0)
 exponents_S, exponents_T = st.floats(1.0, 3.25), st.floats(1.3, 3.0)

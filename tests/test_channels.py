@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ortho_group
 
-from ccd_casadi.channels import find_channels
-from ccd_casadi.derivatives import sensitivities
 from ccd_casadi.kernels import design, gradients
-from ccd_casadi.modal import ModalPlant, Suspension, modal_plant
-from ccd_casadi.rib_stage import COARSE, RibStage
-from ccd_casadi.scaling import scale_plant
-from ccd_casadi.synthesis import Outcome, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.channels import find_channels
+from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
+from ccd_casadi.plants.rib_stage import COARSE, RibStage
+from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.synthesis.derivatives import sensitivities
+from ccd_casadi.synthesis.synthesis import Outcome, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 THETA_B = (1e-3, 3e-3, 4.2446e-3, 4.0588e-3, 11.917e-3, 74.974e-3)
 WEIGHTS = Weights(
@@ -54,7 +54,7 @@ def blocks(seed: int, sizes: tuple[int, ...]) -> ModalPlant:
     )  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), sizes=st.sampled_from([(1, 1), (2, 1), (1, 1, 1, 1), (2, 2)]))
 def test_hidden_blocks_are_found(seed: int, sizes: tuple[int, ...]) -> None:
     plant = blocks(seed, sizes)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.case import load_case
-from ccd_casadi.command_line import ExitCode, parser, run, run_folder
-from ccd_casadi.errors import UserError
-from ccd_casadi.parallel import usable_cores
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import usable_cores
 
 COMMAND = """
 import sys
-from ccd_casadi.command_line import ExitCode, parser, run
+from ccd_casadi.support.command_line import ExitCode, parser, run
 
 def main(options):
     {body}

@@ -10,13 +10,13 @@ import pytest
 from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 from numba.core import event
 
-from ccd_casadi.closed_loop import measure
-from ccd_casadi.derivatives import sensitivities
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.synthesis import synthesise as search
-from ccd_casadi.scaling import StateSpace
-from ccd_casadi.synthesis import sweep, synthesise
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.derivatives import sensitivities
+from ccd_casadi.synthesis.synthesis import sweep, synthesise
 
 
 class Compiled(event.Listener):

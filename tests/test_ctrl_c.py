@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogates.ctrl_c import ctrl_c_noticed, was_ctrl_c
+from surrogates.interrupts import ctrl_c_noticed, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.
@@ -34,7 +34,9 @@ def test_ctrl_c_during_imports_is_one_line(tmp_path: Path, module: str) -> None:
 
 
 def test_a_library_leaves_ctrl_c_alone() -> None:
-    words = "import ccd_casadi.case, surrogates, signal; print(signal.getsignal(signal.SIGINT))"
+    words = (
+        "import ccd_casadi.cases.case, surrogates, signal; print(signal.getsignal(signal.SIGINT))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", words], capture_output=True, text=True, check=True, cwd=ROOT,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),

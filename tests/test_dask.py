@@ -12,24 +12,24 @@ from helpers import problem
 from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 
-from ccd_casadi import cluster as module
 from ccd_casadi import solve
-from ccd_casadi.cluster import Cluster
-from ccd_casadi.errors import UserError
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling import cluster as module
+from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 
 
 def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> None:
     found = []
     for name, pool in (("serial", Workers(1)), ("dask", Cluster(shared.address))):
         with SampleStore(tmp_path / name) as store, pool as workers:
-            truth = Truth(problem(), store, workers)
-            bandwidths = truth.bandwidths(THETAS)
-            quantities = truth.quantities(X)
+            sampler = Sampler(problem(), store, workers)
+            bandwidths = sampler.bandwidths(THETAS)
+            quantities = sampler.quantities(X)
         bits = [(sample.values.tobytes(), sample.gradients.tobytes()) for sample in quantities]
-        found.append((bandwidths, bits, truth.syntheses, table(tmp_path / name)))
+        found.append((bandwidths, bits, sampler.syntheses, table(tmp_path / name)))
     assert found[0] == found[1]
     assert len(found[0][3]["samples"]) > 50
 

@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from busy import prompt
 from dask_processes import Processes, both_workers
 from helpers import problem
 from test_sampling import command, rows, started, table, wait_for_rows
 
 from ccd_casadi import solve
-from ccd_casadi.cluster import Cluster
-from ccd_casadi.parallel import WorkerLost, Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling.cluster import Cluster
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import WorkerLost, Workers
 
 pytestmark = pytest.mark.slow
 
@@ -87,7 +88,7 @@ class Counted(SampleStore):
 
 def serial(path: Path, thetas: np.ndarray) -> dict[str, list[tuple[Any, ...]]]:
     with SampleStore(path) as store:
-        Truth(problem(), store, Workers(1)).bandwidths(thetas)
+        Sampler(problem(), store, Workers(1)).bandwidths(thetas)
     return table(path)
 
 
@@ -141,10 +142,10 @@ def test_killed_workers_lose_no_sample_and_double_none(
         killer = threading.Thread(target=kill)
         killer.start()
         try:
-            truth = Truth(problem(), store, cluster)
+            sampler = Sampler(problem(), store, cluster)
             while killer.is_alive():
                 batches.append(box.uniform(55.0, 70.0, (20, 2)))
-                found = truth.bandwidths(batches[-1])
+                found = sampler.bandwidths(batches[-1])
                 assert [sample.theta for sample in found] == [tuple(t) for t in batches[-1]]
         finally:
             finished.set()
@@ -191,8 +192,8 @@ def test_ctrl_c_ends_promptly_and_is_resumable(shared: Processes, tmp_path: Path
     wait_for_rows(process, folder / "samples.sqlite", 20)
     process.send_signal(signal.SIGINT)
     began = time.monotonic()
-    output, errors = process.communicate(timeout=20)
-    assert time.monotonic() - began < 2.0
+    output, errors = process.communicate(timeout=60)
+    assert time.monotonic() - began < prompt()
     assert (process.returncode, output) == (130, "")
     assert len(errors.splitlines()) == 1, errors
     assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")

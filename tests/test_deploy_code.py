@@ -11,12 +11,12 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.deploy.c_code import COMPILE, c_files, write_c
-from ccd_casadi.deploy.channels import Channel
-from ccd_casadi.deploy.realisation import Realisation, difference_equation, realise
-from ccd_casadi.deploy.sampled import DiscreteStateSpace
-from ccd_casadi.deploy.sections import Section, sections_of
-from ccd_casadi.scaling import StateSpace
+from ccd_casadi.deployment.c_code import COMPILE, c_files, write_c
+from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
+from ccd_casadi.deployment.sampled import DiscreteStateSpace
+from ccd_casadi.deployment.sections import Section, sections_of
+from ccd_casadi.plants.scaling import StateSpace
 
 HZ = 2.0 * np.pi
 # `make test` needs no compiler on a bare machine; where there is none only this is left out.

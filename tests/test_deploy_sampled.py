@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ccd_casadi.deploy.discretise import (
+from ccd_casadi.deployment.discretise import (
     Conversion,
     Discretisation,
     Target,
@@ -17,7 +17,7 @@ from ccd_casadi.deploy.discretise import (
     needed_rate,
     nice_rate,
 )
-from ccd_casadi.deploy.sampled import (
+from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
     SampledFigures,
     sampled_figures,
@@ -25,8 +25,8 @@ from ccd_casadi.deploy.sampled import (
     sensitivity_loop,
     together,
 )
-from ccd_casadi.deploy.simulation import measure_sensitivity, simulate
-from ccd_casadi.scaling import StateSpace
+from ccd_casadi.deployment.simulation import measure_sensitivity, simulate
+from ccd_casadi.plants.scaling import StateSpace
 
 HZ = 2.0 * np.pi
 

@@ -21,11 +21,11 @@ from helpers import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.derivatives import Sensitivities, sensitivities
-from ccd_casadi.plant import Mechanics, mechanics
-from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.synthesis import DesignFigures, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 ROWS = ("bandwidth", "peak", "low", "gamma")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.diagnosis import Topic, diagnose
 from ccd_casadi.check import main as check
-from ccd_casadi.diagnosis import Topic, diagnose
 from ccd_casadi.solve import main as solve
 
 ROOT = Path(__file__).parent.parent

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.channels import find_channels
-from ccd_casadi.modal import modal_plant
-from ccd_casadi.plant import mechanics
-from ccd_casadi.problem import plant_of
-from ccd_casadi.run_folder import FinishedRun, read_run
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.plants.channels import find_channels
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.solve import main
 
 CASE = Path(__file__).parent.parent / "examples" / "planar_stage" / "case.toml"

@@ -16,9 +16,9 @@ from ccd_casadi.kernels.generalized_plant import (
     generalized_plant,
     squared_weights,
 )
-from ccd_casadi.plant import mechanics
-from ccd_casadi.scaling import ScaledPlant
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.synthesis.weights import Weights
 
 to_plant, bound_gradient = pullback.to_plant, pullback.bound_gradient
 bound_slope = bound_peak._bound_slope

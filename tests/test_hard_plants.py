@@ -4,23 +4,24 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from busy import prompt
 from hard_plants import HARD
 
-from ccd_casadi.backends import lmi
-from ccd_casadi.backends.general import synthesise_standard
-from ccd_casadi.backends.standard_plant import (
+from ccd_casadi.support.deadline import Runner
+from ccd_casadi.synthesis.backends import lmi
+from ccd_casadi.synthesis.backends.general import synthesise_standard
+from ccd_casadi.synthesis.backends.standard_plant import (
     certify,
     close,
     irregularities,
     obstacles,
     regularised,
 )
-from ccd_casadi.deadline import Runner
-from ccd_casadi.norms import gains
+from ccd_casadi.synthesis.norms import gains
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")
-LIMIT = 10.0  # seconds a plant, the back ends' imports not counted
+LIMIT = prompt(10.0)  # seconds a plant, the back ends' imports not counted
 BACKOFF = 1.02
 
 

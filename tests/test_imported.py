@@ -15,13 +15,14 @@ from scipy.io import mmwrite, savemat
 from scipy.linalg import eigh
 from scipy.sparse import coo_array, csc_array, save_npz
 
-from ccd_casadi.case import CaseError, load_case, problem_of
-from ccd_casadi.imported.frames import frames
-from ccd_casadi.imported.interpolation import InterpolatedModes
-from ccd_casadi.imported.matrices import modes_of, reduced_table
-from ccd_casadi.imported.modal_table import ModalTable, read_modal_table, write_modal_table
-from ccd_casadi.imported.plant import plant_of_table
-from ccd_casadi.plant import Mechanics, PlantError, mechanics
+from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.plants.imported.frames import frames
+from ccd_casadi.plants.imported.interpolation import InterpolatedModes
+from ccd_casadi.plants.imported.matrices import modes_of, reduced_table
+from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table, write_modal_table
+from ccd_casadi.plants.imported.plant import plant_of_table
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.support.errors import PlantError
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "modal_table"
 gantry = runpy.run_path(str(EXAMPLE / "gantry.py"))

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
 
-from ccd_casadi.inner import (
+from ccd_casadi.inner_problem.problem import plant_of, true_inner
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.sweep import (
     InnerProblem,
     InnerResult,
     InnerStatus,
@@ -14,10 +16,8 @@ from ccd_casadi.inner import (
     sweep_inner,
     sweep_starts,
 )
-from ccd_casadi.inner_search import search_inner
-from ccd_casadi.plant import hardware_cost
-from ccd_casadi.problem import plant_of, true_inner
-from ccd_casadi.synthesis import sweep
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.synthesis.synthesis import sweep
 
 BUDGET = 40
 

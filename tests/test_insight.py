@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.direct import polish
-from ccd_casadi.errors import UserError
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.pareto import Front, pareto_front
+from ccd_casadi.codesign.post_optimal import post_optimal
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.insight import main
-from ccd_casadi.parallel import Workers
-from ccd_casadi.pareto import Front, pareto_front
-from ccd_casadi.plant import Array
-from ccd_casadi.post_optimal import post_optimal
-from ccd_casadi.problem import CoDesignProblem, true_inner
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.models import MODELS
+from ccd_casadi.plants.registry import MODELS
 
 def model(theta):
     bowl = (theta["m1"] - 58.0) ** 2 + (theta["m2"] - 59.0) ** 2
@@ -40,12 +40,12 @@ def own_problem(folder: Path, cost: str) -> CoDesignProblem:
 
 
 @pytest.fixture
-def truth_of(tmp_path: Path) -> Callable[[CoDesignProblem], Truth]:
-    return lambda problem: Truth(problem, SampleStore(tmp_path / "samples.sqlite"), Workers(1))
+def truth_of(tmp_path: Path) -> Callable[[CoDesignProblem], Sampler]:
+    return lambda problem: Sampler(problem, SampleStore(tmp_path / "samples.sqlite"), Workers(1))
 
 
-def optimum(truth: Truth, start: Array) -> Array:
-    return polish(truth, start)[0]
+def optimum(sampler: Sampler, start: Array) -> Array:
+    return polish(sampler, start)[0]
 
 
 def bowl_start(problem: CoDesignProblem, theta: tuple[float, float]) -> Array:
@@ -56,7 +56,7 @@ def bowl_start(problem: CoDesignProblem, theta: tuple[float, float]) -> Array:
 
 
 def test_responses_are_what_solving_again_gives(
-    tmp_path: Path, truth_of: Callable[[CoDesignProblem], Truth]
+    tmp_path: Path, truth_of: Callable[[CoDesignProblem], Sampler]
 ) -> None:
     """An optimum inside the box of θ: the Lagrangian's Hessian has its part in it."""
     problem = replace(own_problem(tmp_path, "bowl"), w1=2.0)
@@ -87,7 +87,7 @@ def _objective(problem: CoDesignProblem, x: Array) -> float:
     inner = problem.inner
     omega = np.clip(np.exp(x[2:]), [inner.omega_S[0], inner.omega_T[0]],
                     [inner.omega_S[1], inner.omega_T[1]])  # fmt: skip
-    from ccd_casadi.problem import true_design
+    from ccd_casadi.inner_problem.problem import true_design
 
     design = true_design(problem, tuple(x[:2]), float(omega[0]), float(omega[1]))
     return float(problem.w1 * bowl + problem.w2 * design.figures.bandwidth)
@@ -97,7 +97,7 @@ def _objective(problem: CoDesignProblem, x: Array) -> float:
 def front(tmp_path_factory: pytest.TempPathFactory) -> Front:
     problem = problem_of(load_case(TWO_MASS))
     with SampleStore(tmp_path_factory.mktemp("front") / "samples.sqlite") as store:
-        return pareto_front(Truth(problem, store, Workers(1)), points=5)
+        return pareto_front(Sampler(problem, store, Workers(1)), points=5)
 
 
 def test_front_is_verified_and_spans_the_costs(front: Front) -> None:
@@ -126,7 +126,7 @@ def test_efficient_points_are_those_that_nothing_beats(front: Front) -> None:
 
 
 def test_a_constant_cost_leaves_nothing_to_trade(
-    tmp_path: Path, truth_of: Callable[[CoDesignProblem], Truth]
+    tmp_path: Path, truth_of: Callable[[CoDesignProblem], Sampler]
 ) -> None:
     problem = own_problem(tmp_path, "7.0")
     with pytest.raises(UserError, match="hardware_cost is the same"):

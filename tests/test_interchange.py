@@ -9,9 +9,12 @@ import pytest
 import scipy.io
 from helpers import FlexibleCase, flexible_case
 
-from ccd_casadi.closed_loop import measure
-from ccd_casadi.errors import UserError
-from ccd_casadi.interchange import (
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.codesign.closer_models import UNBOUNDED
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.interchange import (
     DesignFile,
     controller_from_control,
     from_control,
@@ -22,11 +25,7 @@ from ccd_casadi.interchange import (
     to_control,
     write_mat,
 )
-from ccd_casadi.plant import PlantError
-from ccd_casadi.references import UNBOUNDED
-from ccd_casadi.run_folder import FinishedRun, read_run
-from ccd_casadi.scaling import StateSpace
-from ccd_casadi.synthesis import synthesise
+from ccd_casadi.synthesis.synthesis import synthesise
 
 OMEGA_LOW = 2.0 * np.pi
 

@@ -6,10 +6,15 @@ from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.kkt import KktCertificate, kkt_certificate
-from ccd_casadi.outer import OuterSolution, active_bounds, lifted_program, solve_program
-from ccd_casadi.problem import CoDesignProblem, PlantSource
-from ccd_casadi.true_function import TrueQuantities
+from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
+from ccd_casadi.codesign.outer_problem import (
+    OuterSolution,
+    active_bounds,
+    lifted_program,
+    solve_program,
+)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.true_function import TrueQuantities
 
 
 def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:
@@ -47,7 +52,7 @@ def test_optimum_of_the_true_problem_is_certified() -> None:
 
 
 MODEL = """
-from ccd_casadi.models.two_mass import two_mass
+from ccd_casadi.plants.two_mass import two_mass
 
 def model(theta, least, zeta=0.01):
     m1, m2 = theta["m1"], theta["m2"]

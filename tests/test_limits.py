@@ -5,9 +5,9 @@ import pytest
 from helpers import HZ, problem, two_mass
 
 from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
-from ccd_casadi.reporting.loops import Loop, loop_data
 from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.synthesis import synthesise
+from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+from ccd_casadi.synthesis.synthesis import synthesise
 
 
 @pytest.fixture(scope="module")

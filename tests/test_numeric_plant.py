@@ -11,10 +11,11 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.numeric_plant import own_plant
-from ccd_casadi.outer import NonlinearProgram, solve_program
-from ccd_casadi.plant import PlantError, build_plant, constraint_values, hardware_cost
+from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
+from ccd_casadi.plants.differenced import own_plant
+from ccd_casadi.plants.plant import build_plant, constraint_values, hardware_cost
 from ccd_casadi.solve import main
+from ccd_casadi.support.errors import PlantError
 
 NAMES, LOWER, UPPER = ("m", "t"), (1.0, 2e-3), (3.0, 5e-3)
 SOLVE = ["--formulation", "lifted", "--workers", "1"]

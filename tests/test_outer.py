@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from ccd_casadi.outer import (
+from ccd_casadi.codesign.outer_problem import (
     NonlinearProgram,
     OuterFailure,
     active_bounds,
@@ -20,12 +20,12 @@ from ccd_casadi.outer import (
     nested_program,
     solve_program,
 )
-from ccd_casadi.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
 
 W1, W2 = 0.0995, -0.9950
 LOWER, UPPER = np.array([55.0, 55.0]), np.array([70.0, 70.0])
 CONSTRAINED = """
-from ccd_casadi.models import MODELS
+from ccd_casadi.plants.registry import MODELS
 
 def model(theta, least):
     light = {"total": least - theta["m1"] - theta["m2"], "never": theta["m1"] - 1000.0}

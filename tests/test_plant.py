@@ -21,9 +21,10 @@ from helpers import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.plant import Mechanics, PlantError, build_plant, mechanics
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant, transmission_zeros
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, transmission_zeros
+from ccd_casadi.support.errors import PlantError
 
 GRID = np.geomspace(0.05, 1000.0, 200) * HZ
 shapes = st.fixed_dictionaries(

@@ -14,10 +14,10 @@ from helpers import (
     HZ,
 )
 
-from ccd_casadi import sampling
-from ccd_casadi.inner_command import main as inner
-from ccd_casadi.parallel import WorkerLost
+from ccd_casadi.inner import main as inner
+from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
+from ccd_casadi.support.process_pool import WorkerLost
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str], command: Any = main) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from helpers import HZ
 
-from ccd_casadi.plant import Mechanics
-from ccd_casadi.rib_stage import (
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rib_stage import (
     COARSE,
     FINE,
     LOWER,
@@ -22,12 +22,12 @@ from ccd_casadi.rib_stage import (
     StageError,
     mode_shape,
 )
-from ccd_casadi.rib_stage.geometry import has_square_symmetry, mass_properties
-from ccd_casadi.rib_stage.mesh import Mesh, build_mesh, plain
-from ccd_casadi.rib_stage.model import discretisation, modes_at, orthonormal_directions
-from ccd_casadi.rib_stage.modes import SQUARE_GROUPS, WHOLE, functionals, spectrum
-from ccd_casadi.rib_stage.reference import line_nodes
-from ccd_casadi.rib_stage.rigid import rigid_fields, rigid_values
+from ccd_casadi.plants.rib_stage.geometry import has_square_symmetry, mass_properties
+from ccd_casadi.plants.rib_stage.mesh import Mesh, build_mesh, plain
+from ccd_casadi.plants.rib_stage.model import discretisation, modes_at, orthonormal_directions
+from ccd_casadi.plants.rib_stage.modes import SQUARE_GROUPS, WHOLE, functionals, spectrum
+from ccd_casadi.plants.rib_stage.reference import line_nodes
+from ccd_casadi.plants.rib_stage.rigid import rigid_fields, rigid_values
 
 Array = np.ndarray
 A = tuple(1e-3 * np.array([1.0, 3.0, 8.0, 8.0, 16.806, 67.5]))

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from helpers import HZ, OMEGA_LOW, SUSPENSION, log_uniform, problem, random_plant, two_mass_model
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.case_toml import case_to_toml
-from ccd_casadi.closed_loop import measure
-from ccd_casadi.derivatives import Sensitivities, sensitivities
-from ccd_casadi.modal import Perturbation, modal_plant
-from ccd_casadi.plant import Plant, mechanics
-from ccd_casadi.problem import CoDesignProblem, RobustSet, scaled_plant, true_design
-from ccd_casadi.run_folder import FinishedRun, read_run
-from ccd_casadi.samples import problem_hash
-from ccd_casadi.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.inner_problem.problem import CoDesignProblem, RobustSet, scaled_plant, true_design
+from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.plant import Plant, mechanics
+from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.sampling.store import problem_hash
 from ccd_casadi.solve import main
-from ccd_casadi.synthesis import UNBOUNDED, DesignFigures, Outcome, sweep, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures, Outcome, sweep, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 RUNS = Path(__file__).parent.parent / "runs"
 ROBUST = RobustSet(0.03, 5, (), -0.03)
@@ -91,7 +91,12 @@ def test_total_derivatives_over_a_set(robust: RobustSet) -> None:
 
 
 def test_derivatives_with_several_channels() -> None:
-    """2 x 2, ω_0 itself moving with θ."""
+    """2 x 2, ω_0 itself moving with θ.
+
+    The gain's weak direction is 1/200 of the strong one: a plant rounded to 1e-14 moves γ_opt by
+    8e-10 here, whatever finds it. That is 1.6e-3 of a difference with a step of 1e-5, and 1.6e-5
+    of one with 1e-3, whose own error is 4e-7.
+    """
     plant = random_plant(3, rigid=2, flexible=2, inputs=2, outputs=2)
     M_K = 2e4
     weights = Weights(
@@ -109,7 +114,7 @@ def test_derivatives_with_several_channels() -> None:
 
     design = at(theta)
     assert design.figures.certified
-    h = 1e-5
+    h = 1e-3
     for i in range(2):
         e = h * np.eye(2)[i]
         up, down = at(theta + e), at(theta - e)

@@ -12,13 +12,12 @@ import pytest
 from helpers import HZ, SUSPENSION, random_plant, scaled
 from scipy.integrate import trapezoid
 
-from ccd_casadi.closed_loop import responses
-from ccd_casadi.interchange import named_controller, named_plant, to_control
-from ccd_casadi.modal import Perturbation, modal_plant
-from ccd_casadi.plant import mechanics
-from ccd_casadi.robustness.__main__ import main
-from ccd_casadi.robustness.margins import margins
-from ccd_casadi.robustness.perturbed import (
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import StateSpace, scale_plant
+from ccd_casadi.robust.margins import margins
+from ccd_casadi.robust.perturbed import (
     damping_line,
     shift_line,
     single_modes,
@@ -26,12 +25,13 @@ from ccd_casadi.robustness.perturbed import (
     tolerances,
     worst_in_box,
 )
-from ccd_casadi.robustness.signals import closed_loop, gains, noise
-from ccd_casadi.robustness.structured import structured_bound
-from ccd_casadi.run_folder import FinishedRun, read_run
-from ccd_casadi.scaling import StateSpace, scale_plant
-from ccd_casadi.synthesis import synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.robust.signals import closed_loop, gains, noise
+from ccd_casadi.robust.structured import structured_bound
+from ccd_casadi.robustness import main
+from ccd_casadi.synthesis.closed_loop import responses
+from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
+from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 GRID = np.unique(np.concatenate([np.geomspace(0.2, 3000.0, 800), np.linspace(120, 260, 600)]))
 
@@ -244,7 +244,7 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
         (["--axis", "2"], "--axis: is 2; the plant has outputs 1 to 1"),
         (["--damping", "1.5", "2"], "--damping: is 1.5 2"),
         (["--tolerance", "-1"], "--tolerance"),
-        (["--shift", "60"], "not below 50 %"),
+        (["--shift", "60"], "no number above 0 and below 50"),
         (["--stroke", "0"], "no number above 0"),
         (["--samples", "0"], "no whole number"),
     ],

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from ccd_casadi.errors import UserError
-from ccd_casadi.run_folder import read_run
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.support.errors import UserError
 
 
 def edited(folder: Path, name: str, change: Callable[[dict[str, Any]], object]) -> None:

@@ -16,13 +16,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from busy import prompt
 from helpers import HZ, INNER, problem
 
-from ccd_casadi import sampling as module
-from ccd_casadi.parallel import Workers
-from ccd_casadi.problem import PlantSource
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import CHUNK, Truth
+from ccd_casadi.inner_problem.problem import PlantSource
+from ccd_casadi.sampling import sampler as module
+from ccd_casadi.sampling.sampler import CHUNK, Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parent.parent
 TWO_MASS = ROOT / "runs" / "two_mass.toml"
@@ -43,13 +44,13 @@ def table(path: Path) -> dict[str, list[tuple[Any, ...]]]:
 
 
 @pytest.fixture(scope="module")
-def sampled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Truth]]:
+def sampled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Sampler]]:
     path = tmp_path_factory.mktemp("sampled") / "s.sqlite"
     with SampleStore(path) as store:
-        truth = Truth(problem(), store, Workers(1))
-        truth.bandwidths(THETAS)
-        truth.quantities(X)
-        yield path, truth
+        sampler = Sampler(problem(), store, Workers(1))
+        sampler.bandwidths(THETAS)
+        sampler.quantities(X)
+        yield path, sampler
 
 
 def untouchable(*_: Any) -> Any:
@@ -57,14 +58,14 @@ def untouchable(*_: Any) -> Any:
 
 
 def test_rows_do_not_depend_on_the_number_of_workers(
-    sampled: tuple[Path, Truth], tmp_path: Path
+    sampled: tuple[Path, Sampler], tmp_path: Path
 ) -> None:
     path, first = sampled
     with SampleStore(tmp_path / "s.sqlite") as store, Workers(2) as workers:
-        truth = Truth(problem(), store, workers)
-        bandwidths = truth.bandwidths(THETAS)
-        quantities = truth.quantities(X)
-        assert truth.syntheses == first.syntheses
+        sampler = Sampler(problem(), store, workers)
+        bandwidths = sampler.bandwidths(THETAS)
+        quantities = sampler.quantities(X)
+        assert sampler.syntheses == first.syntheses
     assert bandwidths == first.bandwidths(THETAS)
     for ours, theirs in zip(quantities, first.quantities(X), strict=True):
         assert ours.x == theirs.x
@@ -76,43 +77,43 @@ def test_rows_do_not_depend_on_the_number_of_workers(
 
 
 def test_nothing_is_computed_twice(
-    sampled: tuple[Path, Truth], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sampled: tuple[Path, Sampler], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, first = sampled
     spent = first.syntheses
     monkeypatch.setattr(module, "inner_unit", untouchable)
     monkeypatch.setattr(module, "design_unit", untouchable)
     with SampleStore(path) as store:
-        truth = Truth(problem(), store, Workers(1))
-        assert truth.syntheses == 0
-        turned = truth.bandwidths(THETAS[::-1])
-        truth.bandwidths(THETAS[[0, 0, 2]])
-        truth.quantities(np.vstack([X, X]))
-        assert truth.syntheses == spent, "what was found counts as what was computed"
+        sampler = Sampler(problem(), store, Workers(1))
+        assert sampler.syntheses == 0
+        turned = sampler.bandwidths(THETAS[::-1])
+        sampler.bandwidths(THETAS[[0, 0, 2]])
+        sampler.quantities(np.vstack([X, X]))
+        assert sampler.syntheses == spent, "what was found counts as what was computed"
         with pytest.raises(AssertionError, match="known already"):
-            truth.bandwidths([[61.0, 61.0]])
+            sampler.bandwidths([[61.0, 61.0]])
     assert [sample.theta for sample in turned] == [tuple(row) for row in THETAS[::-1]]
     assert turned[::-1] == first.bandwidths(THETAS)
 
 
-def test_a_sample_says_what_the_inner_problem_found(sampled: tuple[Path, Truth]) -> None:
-    _, truth = sampled
-    light = truth.bandwidths(THETAS[:1])[0]
+def test_a_sample_says_what_the_inner_problem_found(sampled: tuple[Path, Sampler]) -> None:
+    _, sampler = sampled
+    light = sampler.bandwidths(THETAS[:1])[0]
     assert light.feasible
     assert light.bandwidth / HZ == pytest.approx(72.0452, abs=1e-3)
     assert light.omega_S / HZ == pytest.approx(1800.0, rel=1e-9)
     assert set(light.active) == {"S_max", "omega_S upper"}
-    above = truth.bandwidths([[55.0 + 1e-3, 55.0]])[0]
+    above = sampler.bandwidths([[55.0 + 1e-3, 55.0]])[0]
     slope = (above.bandwidth - light.bandwidth) / 1e-3
     assert light.gradient[0] == pytest.approx(slope, rel=1e-3)
 
 
-def test_quantities_are_the_rows_figures_with_their_slopes(sampled: tuple[Path, Truth]) -> None:
-    path, truth = sampled
-    sample = truth.quantities(X[:1])[0]
+def test_quantities_are_the_rows_figures_with_their_slopes(sampled: tuple[Path, Sampler]) -> None:
+    path, sampler = sampled
+    sample = sampler.quantities(X[:1])[0]
     for i, h in enumerate([0.02, 0.02, 1e-4, 1e-4]):
         step = h * np.eye(4)[i]
-        ends = truth.quantities(np.array([X[0] + step, X[0] - step]))
+        ends = sampler.quantities(np.array([X[0] + step, X[0] - step]))
         slope = (ends[0].values - ends[1].values) / (2 * h)
         np.testing.assert_allclose(sample.gradients[:, i], slope, rtol=2e-3, atol=1e-5)
     with SampleStore(path) as store:
@@ -127,7 +128,7 @@ def test_designs_go_out_in_chunks_and_come_back_in_order(tmp_path: Path) -> None
     order = np.random.default_rng(0).permutation(len(X))
     assert len(X) > CHUNK
     with SampleStore(tmp_path / "s.sqlite") as store, Workers(2) as workers:
-        found = Truth(problem(), store, workers).quantities(X[order])
+        found = Sampler(problem(), store, workers).quantities(X[order])
     assert [sample.x for sample in found] == [tuple(x) for x in X[order]]
 
 
@@ -135,7 +136,7 @@ def test_an_infeasible_theta_is_a_sample_too(tmp_path: Path) -> None:
     hard = problem(inner=replace(INNER, S_max=1.05))
     with SampleStore(tmp_path / "s.sqlite") as store:
         for _ in range(2):  # computed, then read
-            (sample,) = Truth(hard, store, Workers(1)).bandwidths(THETAS[:1])
+            (sample,) = Sampler(hard, store, Workers(1)).bandwidths(THETAS[:1])
             assert not sample.feasible
             assert math.isnan(sample.bandwidth)
             assert all(map(math.isnan, sample.gradient))
@@ -160,12 +161,12 @@ def test_the_nearest_is_the_infeasible_theta_that_falls_short_least(
     monkeypatch.setattr(module, "inner_unit", unit)
     for order in ([0, 1, 2, 3], [1, 3, 0, 2], [2, 3, 1, 0]):
         with SampleStore(tmp_path / f"{order}.sqlite") as store:
-            truth = Truth(problem(), store, Workers(1))
-            truth.bandwidths(THETAS[[2]])
-            assert truth.nearest is None, "a feasible one does not count"
-            truth.bandwidths(THETAS[order])
-            assert truth.nearest is not None
-            assert truth.nearest.theta == tuple(THETAS[1])
+            sampler = Sampler(problem(), store, Workers(1))
+            sampler.bandwidths(THETAS[[2]])
+            assert sampler.nearest is None, "a feasible one does not count"
+            sampler.bandwidths(THETAS[order])
+            assert sampler.nearest is not None
+            assert sampler.nearest.theta == tuple(THETAS[1])
 
 
 def test_theta_is_all_but_the_last_two_however_many_there_are(
@@ -188,17 +189,17 @@ def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     monkeypatch.setattr(module, "constraint_values", lambda *_: np.array([-1.0, float(violated)]))
     monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
     with SampleStore(tmp_path / "s.sqlite") as store:
-        truth = Truth(problem(w1=2.0, w2=-3.0), store, Workers(1))
-        truth._spend("a", 5, (60.0, 60.0), 10.0)
-        truth._spend("a", 5, (60.0, 60.0), 10.0)
-        truth._spend("b", 2, (61.0, 60.0), math.nan)
-    assert [entry.syntheses for entry in truth.trace] == [5, 7]
-    assert truth.trace[0].bandwidth == 10.0
+        sampler = Sampler(problem(w1=2.0, w2=-3.0), store, Workers(1))
+        sampler._spend("a", 5, (60.0, 60.0), 10.0)
+        sampler._spend("a", 5, (60.0, 60.0), 10.0)
+        sampler._spend("b", 2, (61.0, 60.0), math.nan)
+    assert [entry.syntheses for entry in sampler.trace] == [5, 7]
+    assert sampler.trace[0].bandwidth == 10.0
     if violated:
-        assert math.isnan(truth.trace[0].objective)
+        assert math.isnan(sampler.trace[0].objective)
     else:
-        assert truth.trace[0].objective == 170.0
-    assert math.isnan(truth.trace[1].objective)
+        assert sampler.trace[0].objective == 170.0
+    assert math.isnan(sampler.trace[1].objective)
 
 
 def test_the_rows_of_a_unit_share_its_seconds() -> None:
@@ -214,8 +215,8 @@ def test_the_rows_of_a_unit_share_its_seconds() -> None:
 
 def test_what_determines_a_synthesis_and_nothing_else_is_in_its_key(tmp_path: Path) -> None:
     def hashes(**changes: Any) -> tuple[str, str]:
-        truth = Truth(problem(**changes), store, Workers(1))
-        return truth.hash, truth.inner_hash
+        sampler = Sampler(problem(**changes), store, Workers(1))
+        return sampler.hash, sampler.inner_hash
 
     with SampleStore(tmp_path / "s.sqlite") as store:
         base = hashes()
@@ -330,10 +331,10 @@ def test_killed_and_resumed_ends_as_if_undisturbed(
 POOL = f"""
 import sys
 import numpy as np
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.parallel import Workers
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import Truth
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.sampler import Truth
 
 if __name__ == "__main__":
     problem = problem_of(load_case({str(TWO_MASS)!r}))
@@ -382,9 +383,9 @@ def test_ctrl_c_is_resumable(undisturbed: Path, tmp_path: Path, formulation: str
     wait_for_rows(process, folder / "samples.sqlite", 20)
     os.kill(process.pid, signal.SIGINT)
     began = time.monotonic()
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=60)
+    assert time.monotonic() - began < prompt()
     assert (process.returncode, output) == (130, "")
-    assert time.monotonic() - began < 2.0
     assert len(errors.splitlines()) == 1, errors
     assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")
     assert not (folder / "result.json").exists()

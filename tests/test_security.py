@@ -18,25 +18,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.errors import UserError
-from ccd_casadi.inner_command import main as inner
-from ccd_casadi.plant import PlantError
-from ccd_casadi.problem import _own_plant, plant_of
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner import main as inner
+from ccd_casadi.inner_problem.problem import _own_plant, plant_of
 from ccd_casadi.solve import main as solve
-from ccd_casadi.user_code import permit_user_code, time_limit
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.user_code import permit_user_code, time_limit
 from surrogates import SurrogateFileError, load
 from surrogates.truth import TruthError, opener_of
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
 # Pipes between the processes of one run.
-LIVE = {"ccd_casadi/parallel.py", "ccd_casadi/cluster.py", "ccd_casadi/deadline.py"}
-OPTIONAL = "ccd_casadi/optional.py"  # imports optional packages by names that sources spell out
+LIVE = {
+    "ccd_casadi/support/process_pool.py",
+    "ccd_casadi/sampling/cluster.py",
+    "ccd_casadi/support/deadline.py",
+}
+# They import by names that sources spell out: optional packages, and the public face.
+BY_NAME = {"ccd_casadi/support/optional_packages.py", "ccd_casadi/__init__.py"}
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()
-from ccd_casadi.models import MODELS
+from ccd_casadi.plants.registry import MODELS
 
 def f(theta, **options):
     return MODELS["two_mass"](theta, 0.01)
@@ -66,7 +70,7 @@ def trapped_run(two_mass_run: Path, trap: Path) -> Path:
 # ---- user code -----------------------------------------------------------------------------------
 
 
-OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy.__main__", "ccd_casadi.robustness.__main__",
+OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy", "ccd_casadi.robustness",
             "surrogates.retrain"}  # fmt: skip
 COMMANDS = sorted(
     {
@@ -74,7 +78,7 @@ COMMANDS = sorted(
         for p in SOURCES
         if "return run(command, " in p.read_text()
     }
-    - {"ccd_casadi.imported.__main__"}  # takes a folder of matrices or results, no case
+    - {"ccd_casadi.imported"}  # takes a folder of matrices or results, no case
     | {"surrogates.retrain"}
 )
 
@@ -96,7 +100,7 @@ def test_no_user_code_refuses_a_plant_function_and_runs_nothing_of_it(
 
 
 def test_all_commands_are_found() -> None:
-    assert {"ccd_casadi.solve", "ccd_casadi.inner_command", *OF_A_RUN} <= set(COMMANDS)
+    assert {"ccd_casadi.solve", "ccd_casadi.inner", *OF_A_RUN} <= set(COMMANDS)
 
 
 def test_models_of_the_package_are_no_user_code(capsys: pytest.CaptureFixture[str]) -> None:
@@ -248,9 +252,11 @@ def test_no_source_reads_code_from_data() -> None:
         name = path.relative_to(ROOT).as_posix()
         for called, node in calls(path):
             seen.append(called)
-            if (name, called) != (OPTIONAL, "import_module"):
+            if not (name in BY_NAME and called == "import_module"):
                 assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
-            if called == "require" and name != "ccd_casadi/backends/attempt.py":  # its constants
+            if (
+                called == "require" and name != "ccd_casadi/synthesis/backends/registry.py"
+            ):  # its constants
                 assert isinstance(node.args[0], ast.Constant), f"{name}:{node.lineno}"
             for keyword in node.keywords:
                 if keyword.arg in ("allow_pickle", "shell"):
@@ -262,8 +268,8 @@ def test_no_source_reads_code_from_data() -> None:
 
 def test_plant_files_are_loaded_where_permission_is_asked() -> None:
     loading = {p.relative_to(ROOT).as_posix() for p in SOURCES if "exec_module" in p.read_text()}
-    assert loading == {"ccd_casadi/problem.py"}
-    text = (ROOT / "ccd_casadi" / "problem.py").read_text()
+    assert loading == {"ccd_casadi/inner_problem/problem.py"}
+    text = (ROOT / "ccd_casadi" / "inner_problem" / "problem.py").read_text()
     assert text.count("exec_module") == 1
     assert "require_user_code(" in text
 

@@ -21,11 +21,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.plant import Mechanics, mechanics
-from ccd_casadi.scaling import ScaledPlant, StateSpace, scale_plant
-from ccd_casadi.synthesis import Outcome, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.synthesis.synthesis import Outcome, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 LEVEL = 1.0 / np.sqrt(2.0)
 

@@ -10,12 +10,12 @@ from helpers import few, random_plant
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.modal import Suspension, modal_plant
-from ccd_casadi.plant import mechanics
-from ccd_casadi.robustness.move import mass_feedforward, simulate
-from ccd_casadi.robustness.setpoint import Limits, Setpoint, setpoint
-from ccd_casadi.robustness.signals import closed_loop
-from ccd_casadi.scaling import StateSpace
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.robust.move import mass_feedforward, simulate
+from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robust.signals import closed_loop
 
 # ---- the setpoint -------------------------------------------------------------------------------
 

@@ -20,11 +20,11 @@ from helpers import (
     two_mass_model,
 )
 
-from ccd_casadi import sampling
-from ccd_casadi.case import load_case
-from ccd_casadi.inner_command import main as inner
-from ccd_casadi.plant import mechanics
-from ccd_casadi.scaling import StateSpace
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.inner import main as inner
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
 from surrogates import load
 

@@ -11,6 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from ccd_casadi.plants.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shape
+from ccd_casadi.plants.rib_stage.geometry import LOWER, UPPER, mass
 from ccd_casadi.reporting.page import Section, page
 from ccd_casadi.reporting.stage_drawing import TALLER, draw_stages
 from ccd_casadi.reporting.stage_pictures import (
@@ -37,8 +39,6 @@ from ccd_casadi.reporting.turntable import (
     still,
     with_turntables,
 )
-from ccd_casadi.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shape
-from ccd_casadi.rib_stage.geometry import LOWER, UPPER, mass
 
 Array = np.ndarray
 A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.plant import hardware_cost
-from ccd_casadi.problem import plant_of, true_inner
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.inner_problem.problem import plant_of, true_inner
+from ccd_casadi.plants.plant import hardware_cost
 
 CASE = Path(__file__).parents[1] / "runs" / "two_mass.toml"
 BEST = -439.46482

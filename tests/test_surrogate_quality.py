@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.case import load_case, problem_of
-from ccd_casadi.known import known_designs
-from ccd_casadi.lifted import fit_quantities
-from ccd_casadi.processes import best_left_out, kernels_of
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.lifted import fit_quantities
+from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
-from ccd_casadi.samples import SampleStore
-from ccd_casadi.sampling import quantity_sample
-from ccd_casadi.surrogate_quality import quality_dict, recommendation, surrogate_quality
+from ccd_casadi.sampling.sampler import quantity_sample
+from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, Roughness, design, errors, fit
 
 HZ = 2.0 * np.pi
@@ -45,7 +45,7 @@ def test_a_kinked_bandwidth_recommends_lifted() -> None:
     assert q.roughness is not Roughness.SMOOTH
     assert "--formulation lifted" in recommendation([q])
     several = [q, replace(q, name="sensitivity_peak", unit="%")]
-    assert "fit_maximum" in recommendation(several)
+    assert "kinked where they are equal" in recommendation(several)
 
 
 def test_a_design_beyond_the_samples_is_flagged() -> None:
@@ -103,7 +103,7 @@ def test_auto_takes_the_kernel_that_predicts_left_out_samples_best() -> None:
 def test_lifted_fits_the_kernel_that_the_case_names(two_mass_run: Path) -> None:
     problem = problem_of(load_case(two_mass_run / "case.toml"))
     with SampleStore(two_mass_run / "samples.sqlite") as store:
-        rows = known_designs(store, problem)[:20]
+        rows = stored_designs(store, problem)[:20]
     samples = [quantity_sample(tuple(x), row, len(problem.names)) for x, row in rows]
     named = fit_quantities(problem, samples, 0, kind="rbf")
     assert {p.kernel.value for p in named} == {"rbf"}

@@ -25,11 +25,11 @@ from helpers import (
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ccd_casadi.backends.mixed import synthesise_with
-from ccd_casadi.modal import Suspension
-from ccd_casadi.plant import Mechanics, mechanics
-from ccd_casadi.synthesis import Design, Outcome, StateSpace, sweep, synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.synthesis.backends.mixed import synthesise_with
+from ccd_casadi.synthesis.synthesis import Design, Outcome, StateSpace, sweep, synthesise
+from ccd_casadi.synthesis.weights import Weights
 
 LIMITED = (6, 22, 23, 30, 34, 47, 56)  # seeds of flexible_case that γ_jω limits
 FLEXIBLE = (*LIMITED[:5], *range(10, 20))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from helpers import HZ, INNER, problem
 
-from ccd_casadi.inner_search import search_inner
-from ccd_casadi.outer import lifted_bounds
-from ccd_casadi.problem import scaled_plant, true_design
-from ccd_casadi.true_function import TrueQuantities
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import scaled_plant, true_design
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.true_function import TrueQuantities
 
 
 def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:

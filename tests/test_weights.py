@@ -14,9 +14,9 @@ from ccd_casadi.kernels.generalized_plant import (
     generalized_plant,
     squared_weights,
 )
-from ccd_casadi.plant import mechanics
-from ccd_casadi.scaling import StateSpace
-from ccd_casadi.weights import Weights
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.synthesis.weights import Weights
 
 weights = st.builds(
     Weights,

@@ -24,7 +24,7 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from ccd_casadi.progress import Progress, duration
+from ccd_casadi.support.progress import Progress, duration
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate")

@@ -1,6 +1,7 @@
 """The one decorator of the kernels: compiled, cached on disk, 1/0 = inf as in NumPy."""
 
 import os
+from importlib import import_module
 from typing import Any
 
 from numba import njit
@@ -21,9 +22,8 @@ class _FirstCompilation(event.Listener):
         module = event.data["dispatcher"].py_func.__module__
         if not self.seen and module.startswith(PACKAGE + "."):
             self.seen = True
-            from ccd_casadi.kernels.compilation import ensure_compiled
-
-            ensure_compiled()
+            # which itself imports the kernels
+            import_module(f"{PACKAGE}.compilation").ensure_compiled()
 
     def on_end(self, event: Any) -> None:
         pass

@@ -24,7 +24,6 @@ from math import nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccd_casadi.kernels.bound_peak import bound_peak
 from ccd_casadi.kernels.design import design
@@ -35,8 +34,7 @@ from ccd_casadi.kernels.generalized_plant import first_order_weights, generalize
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 from ccd_casadi.kernels.pullback import bound_gradient, gain_to_weights, to_plant, to_weights
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
-
-Array = NDArray[np.float64]
+from ccd_casadi.support.arrays import Array
 
 
 class Loop(NamedTuple):

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.reporting.lines import Array, Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import Loop, shown_rows
+from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.reporting.loops import shown_rows
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLACK, BLUE, ORANGE
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.loop_responses import Loop
 
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.units import HZ
 
-HZ = 2.0 * np.pi
 Fact = tuple[str, str, str]
 _FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
 

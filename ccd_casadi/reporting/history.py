@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.iterates import Iterate
-from ccd_casadi.reporting.lines import Array, Curve, Level, Panel, figure_lines
+from ccd_casadi.codesign.formulation import Iterate
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLUE, ORANGE
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
 
-HZ = 2.0 * np.pi
 LEAST_SPAN = 1e-3  # half the least height of a panel, relative
 LEAST_ERROR = 1e-16  # an exact agreement still has a place on the logarithmic axis
 

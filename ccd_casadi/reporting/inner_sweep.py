@@ -4,15 +4,15 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.lifted_maximum import fields
-from ccd_casadi.reporting.lines import Array
 from ccd_casadi.reporting.maps import SweepMap
 from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.truths import Truths, feasible
+from ccd_casadi.reporting.true_samples import Truths, feasible
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 
-HZ = 2.0 * np.pi
 LEAST_ROWS = 9
 GRID = 101
 LIFTED = "contours from the lifted surrogates, dots true"

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.outer import lifted_bounds
-from ccd_casadi.pareto import Front
-from ccd_casadi.post_optimal import PostOptimal
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.pareto import Front
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import Loop
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import Loop
 
-HZ = 2.0 * np.pi
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
 

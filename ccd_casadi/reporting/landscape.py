@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from ccd_casadi.plant import constraint_values
-from ccd_casadi.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
-from ccd_casadi.reporting.lines import Array
 from ccd_casadi.reporting.maps import Landscape
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import axis_label
-from ccd_casadi.reporting.truths import Truths, feasible
+from ccd_casadi.reporting.true_samples import Truths, feasible
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 
-HZ = 2.0 * np.pi
 GRID = 33  # points per parameter of a landscape
 MANY = 80  # samples with gradients above which the landscape's grid is made coarser
 TABLE_STEP = 4  # of the grid, in the table

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.reporting.loops import Loop
 from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.synthesis.loop_responses import Loop
 
 PARTS = ("error W_S S", "control effort W_KS KS", "response W_T T")
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccd_casadi.reporting.svg import (
     BLACK,
@@ -18,12 +17,13 @@ from ccd_casadi.reporting.svg import (
     style,
     to_svg,
 )
+from ccd_casadi.support.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
-Array = NDArray[np.float64]
+
 _BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
 

@@ -1,83 +1,19 @@
 """Closed loops over frequency: σ_max of S, KS and T against their bounds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ccd_casadi.closed_loop import local_peaks, responses
-from ccd_casadi.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.reporting.lines import Array, Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
-from ccd_casadi.scaling import ScaledPlant, StateSpace, transmission_zeros
-from ccd_casadi.synthesis import synthesise
-from ccd_casadi.weights import Weights
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+from ccd_casadi.synthesis.synthesis import synthesise
 
-HZ = 2.0 * np.pi
-POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
 SHOWN = 45  # rows of a data table
-LIGHT = 0.3  # damping ratio below which a pole or zero counts as a resonance
-
-
-@dataclass(frozen=True)
-class Loop:
-    """One design over frequency in Hz: G (k, p, m), K (k, m, p), gains of S, KS, T, and bounds.
-
-    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `peaks`: local maxima of σ_max(S) as (Hz, gain).
-    """
-
-    label: str
-    hz: Array
-    plant: NDArray[np.complex128]
-    controller: NDArray[np.complex128]
-    gains: Array
-    bounds: Array
-    bandwidth_hz: float
-    peaks: tuple[tuple[float, float], ...]
-    resonances_hz: tuple[float, ...]
-    antiresonances_hz: tuple[float, ...]
-
-
-def loop_data(
-    plant: ScaledPlant,
-    controller: StateSpace,
-    weights: Weights,
-    *,
-    gamma: float,
-    bandwidth_hz: float,
-    omega_low: float,
-    label: str = "",
-) -> Loop:
-    """Frequency responses of a design; `omega_low` in rad/s sets where the plots begin."""
-    poles = _light(np.linalg.eigvals(plant.A) * plant.omega_0)
-    zeros = _light(transmission_zeros(plant.A, plant.B, plant.C) * plant.omega_0)
-    peaks = tuple((omega / HZ, gain) for omega, gain in local_peaks(plant, controller))
-    tops = [hz for hz, gain in peaks if gain > 1.05]
-    low = min(omega_low / HZ, bandwidth_hz / 10.0) / 5.0
-    high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
-    around = plant.grid * plant.omega_0 / HZ
-    special = [*poles, *zeros, bandwidth_hz, *(hz for hz, _ in peaks)]
-    grid = np.unique(np.concatenate([np.geomspace(low, high, POINTS), around, special]))
-    hz = grid[(grid >= low) & (grid <= high)]
-    G, K, S = responses(plant, controller, HZ * hz)
-    KS = K @ S
-    stack = (S, KS, G @ KS)
-    gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in stack])
-    return Loop(
-        label=label,
-        hz=hz,
-        plant=G,
-        controller=K,
-        gains=gains,
-        bounds=gamma / np.abs(weights.responses(HZ * hz)),
-        bandwidth_hz=bandwidth_hz,
-        peaks=peaks,
-        resonances_hz=poles,
-        antiresonances_hz=zeros,
-    )
 
 
 def synthesised_loop(
@@ -202,10 +138,3 @@ def table_gains(loop: Loop) -> Table:
 def shown_rows(hz: Array, special: Sequence[float]) -> list[int]:
     wanted = [*np.geomspace(hz[0], hz[-1], SHOWN), *special]
     return sorted({int(np.abs(hz - value).argmin()) for value in wanted})
-
-
-def _light(roots: NDArray[Any]) -> tuple[float, ...]:
-    """Frequencies in Hz of lightly damped pairs, ascending."""
-    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
-    light = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
-    return tuple(sorted(float(value) for value in np.abs(light) / HZ))

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.reporting.lines import Array
 from ccd_casadi.reporting.svg import (
     BLACK,
     COLOUR_MAP,
@@ -20,6 +19,7 @@ from ccd_casadi.reporting.svg import (
     style,
     to_svg,
 )
+from ccd_casadi.support.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

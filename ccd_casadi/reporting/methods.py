@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.case import HZ
-from ccd_casadi.compare import Method
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.codesign.comparison import Method
+from ccd_casadi.codesign.steepest_descent import Descent
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import CYCLE, axis_label
 from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.steepest_descent import Descent
+from ccd_casadi.support.units import HZ
 
 LABELS = {
     "nested": "nested",

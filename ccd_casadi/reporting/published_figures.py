@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.problem import CoDesignProblem, true_inner
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import figure_bode, table_bode
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import Loop, synthesised_loop, table_gains
+from ccd_casadi.reporting.loops import synthesised_loop, table_gains
 from ccd_casadi.reporting.page import Section, Table, figure_html, paragraph, table_html
 from ccd_casadi.reporting.svg import CYCLE
+from ccd_casadi.synthesis.loop_responses import Loop
 
 THETA = (60.0, 60.0)
 

@@ -4,16 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import predicted
-from ccd_casadi.reporting.lines import Array, Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
-from ccd_casadi.reporting.truths import Truths, feasible
+from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 
-HZ = 2.0 * np.pi
 SLICE = 61
 NEARBY = 0.1  # share of the box within which a sample is shown beside a slice
 TABLE_STEP = 4

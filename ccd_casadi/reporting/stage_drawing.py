@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, axis_lengths, mass
 from ccd_casadi.reporting.page import escape, number
 from ccd_casadi.reporting.svg import BLACK, LONGEST_LABEL
-from ccd_casadi.rib_stage.geometry import NAMES, Geometry, axis_lengths, mass
 
 WIDTH = 960.0  # of the drawing; a page column shows a unit as about a pixel
 TALLER = 3.0  # heights in the cut against lengths

@@ -6,7 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from ccd_casadi.plant import Array
+from ccd_casadi.plants.rib_stage import Geometry, ModeCount, ModeShape, RibStage, mode_shape
+from ccd_casadi.plants.rib_stage.geometry import (
+    NAMES,
+    axis_lengths,
+    bays,
+    has_square_symmetry,
+    mass,
+)
 from ccd_casadi.reporting.page import Table, escape, figure_html, number
 from ccd_casadi.reporting.stage_drawing import TALLER, draw_stages
 from ccd_casadi.reporting.turntable import (
@@ -18,14 +25,7 @@ from ccd_casadi.reporting.turntable import (
     legend,
     still,
 )
-from ccd_casadi.rib_stage import Geometry, ModeCount, ModeShape, RibStage, mode_shape
-from ccd_casadi.rib_stage.geometry import (
-    NAMES,
-    axis_lengths,
-    bays,
-    has_square_symmetry,
-    mass,
-)
+from ccd_casadi.support.arrays import Array
 
 CLOSEST = 0.02  # share of the side; drawn points keep this distance inside a bay
 SHAPES = {  # by symmetry; the diagonal and the mirrors of the square tell them apart

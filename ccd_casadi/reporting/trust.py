@@ -7,7 +7,7 @@ import numpy as np
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLUE, GREY
-from ccd_casadi.surrogate_quality import Quality
+from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
 WORDS = {

@@ -13,10 +13,10 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.plant import Array
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import COLOUR_MAP
 from ccd_casadi.reporting.turntable_script import CSS, LIGHT, SCRIPT, SHADE
+from ccd_casadi.support.arrays import Array
 
 AZIMUTH, ELEVATION = -62.0, 44.0  # degrees, of the camera as seen from the object
 WIDTH, HEIGHT = 320, 236  # of one picture, in its own units

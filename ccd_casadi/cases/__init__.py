@@ -1,0 +1,1 @@
+"""Case files, what is wrong with them, and finished run folders."""

@@ -1,0 +1,236 @@
+"""What is wrong, or worth knowing, with a plant before anything is designed for it.
+
+A plant is looked at in the start of θ, the middle and the corners of the box. Errors are what no
+design can be made with; warnings what a designer must know; notes what explains the bandwidth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.facts import PlantFacts, facts_of
+from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
+from ccd_casadi.plants.plant import Plant, mechanics, theta_words
+from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.units import HZ
+
+MAX_CORNERS = 16
+HIDDEN = 1e-6  # a mode whose gain is below this share of the largest is not driven, or measured
+COUPLED = 1e-9  # a share of the modes' own damping above which a damper connects modes
+LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
+
+
+class Severity(StrEnum):
+    """How much a finding matters."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    NOTE = "note"
+
+
+class Topic(StrEnum):
+    """What a finding is about."""
+
+    MATRICES = "matrices"
+    RIGID_MODES = "rigid modes"
+    HIDDEN_MODE = "hidden mode"
+    ZERO = "transmission zero"
+    DOMAIN = "domain"
+    EFFORT = "control effort"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about the plant; `index` of the θ where it was seen, among those looked at."""
+
+    severity: Severity
+    topic: Topic
+    words: str
+    index: int
+
+
+def points_to_check(problem: CoDesignProblem) -> list[tuple[float, ...]]:
+    """Start, middle, and the corners of the box, of which at most 16 (drawn with a fixed seed)."""
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    n = len(lower)
+    if n <= np.log2(MAX_CORNERS):
+        sides = np.array(list(product((0.0, 1.0), repeat=n)))
+    else:
+        sides = np.random.default_rng(0).integers(0, 2, (MAX_CORNERS, n)).astype(float)
+    corners = lower + (upper - lower) * sides
+    rows = [problem.start, 0.5 * (lower + upper), *corners]
+    return list(dict.fromkeys(tuple(float(value) for value in row) for row in rows))
+
+
+@lru_cache(maxsize=4)
+def diagnose(
+    problem: CoDesignProblem, rigid_modes: int | None = None
+) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
+    """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
+
+    Facts are of the points where the matrices are those of a plant, in the order of
+    `points_to_check`. Raises PlantError where the model's function fails.
+    """
+    plant = plant_of(problem)
+    facts: list[PlantFacts] = []
+    findings = list(_outside(problem, plant))
+    if findings:
+        return (), tuple(findings)
+    for index, theta in enumerate(points_to_check(problem)):
+        place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
+        try:
+            system = mechanics(plant, theta, derivatives=index == 0)
+            modal = modal_plant(system, problem.suspension)
+            scaled = scale_plant(modal, problem.weights.M_K)
+        except PlantError as error:
+            words = str(error) if "at theta" in str(error) else f"{error} {place}"
+            findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
+            continue
+        found = facts_of(theta, modal, scaled)
+        findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
+        findings += _hidden(modal, index, place)
+        findings += _about_zeros(found, problem.inner.S_max, index)
+        facts.append(found)
+    counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
+    if len(counts) > 1 and rigid_modes is None:
+        words = (
+            f"from {counts[0]} to {counts[-1]} rigid-body modes over the bounds of theta: a mode "
+            "that is free at one theta and held at another has no derivative between; narrow the "
+            "bounds, or hold it everywhere"
+        )
+        findings.append(Finding(Severity.WARNING, Topic.RIGID_MODES, words, 0))
+    return tuple(facts), tuple(findings)
+
+
+def first_seen(findings: Sequence[Finding]) -> list[Finding]:
+    """The findings at the first θ where their topic comes up, the serious first.
+
+    What holds at one θ mostly holds, with other numbers, at the others too.
+    """
+    first: dict[tuple[Topic, Severity], int] = {}
+    for item in findings:
+        first.setdefault((item.topic, item.severity), item.index)
+    kept = [item for item in findings if item.index == first[item.topic, item.severity]]
+    return sorted(kept, key=lambda item: list(Severity).index(item.severity))
+
+
+def _outside(problem: CoDesignProblem, plant: Plant) -> list[Finding]:
+    if plant.domain is None:
+        return []
+    found = []
+    box = zip(problem.names, problem.lower, problem.upper, *plant.domain, strict=True)
+    for name, low, high, least, most in box:
+        slack = 1e-9 * (most - least)
+        if low < least - slack or high > most + slack:
+            words = (
+                f"theta.{name}: its bounds {low:g} to {high:g} go beyond the model's samples, "
+                f"{least:g} to {most:g}; narrow them, or add samples"
+            )
+            found.append(Finding(Severity.ERROR, Topic.DOMAIN, words, 0))
+    return found
+
+
+def _clusters(modal: ModalPlant) -> list[np.ndarray]:
+    """Modes of one frequency, whose shapes are one space; the rigid ones are one."""
+    groups: list[list[int]] = []
+    for i, w in enumerate(modal.natural):
+        last = groups[-1][-1] if groups else None
+        same = last is not None and (
+            (modal.rigid[i] and modal.rigid[last])
+            or (not modal.rigid[last] and w - modal.natural[last] <= HIDDEN * w)
+        )
+        if same:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return [np.array(group) for group in groups]
+
+
+def _hidden(modal: ModalPlant, index: int, place: str) -> list[Finding]:
+    """Directions of each eigenspace that no input drives, or no output measures (rank of B, C)."""
+    D = np.abs(modal.D - np.diag(np.diag(modal.D)))
+    coupled = (COUPLED * np.diag(modal.D).max() < D).any(axis=1)
+    found = []
+    for group in _clusters(modal):
+        if coupled[group].any():
+            continue  # a damper hands its motion on to others
+        lacks = [
+            name
+            for name, gains in (("driven", modal.B), ("measured", modal.C.T))
+            if np.linalg.matrix_rank(gains[group], tol=HIDDEN * np.abs(gains).max()) < len(group)
+        ]
+        if not lacks:
+            continue
+        missing = "not " + " and not ".join(lacks)
+        if modal.rigid[group[0]]:
+            words = (
+                f"of {len(group)} rigid-body motions {place} one or more are {missing}: the "
+                "suspension alone holds them; add an input or output, or take them out of the model"
+            )
+        else:
+            formal = {"driven": "uncontrollable", "measured": "unobservable"}
+            words = (
+                f"the mode at {modal.natural[group[0]] / HZ:.5g} Hz {place} is {missing} "
+                f"({', '.join(formal[name] for name in lacks)}): no controller damps it, and S "
+                "does not show it"
+            )
+        found.append(Finding(Severity.WARNING, Topic.HIDDEN_MODE, words, index))
+    return found
+
+
+def _rigid(
+    facts: PlantFacts,
+    modal: ModalPlant,
+    suspension: Suspension,
+    expected: int | None,
+    index: int,
+    place: str,
+) -> list[Finding]:
+    count = int(modal.rigid.sum())
+    flexible = modal.natural[~modal.rigid] / HZ
+    least = f"; the lowest frequency is {flexible[0]:.4g} Hz" if flexible.size else ""
+    if expected is not None and count != expected:
+        words = (
+            f"{count} rigid-body modes {place}, where suspension.rigid_modes expects "
+            f"{expected}{least}; mend the stiffness (K v = 0 for a rigid-body motion v), or "
+            "suspension.rigid_modes"
+        )
+        return [Finding(Severity.ERROR, Topic.RIGID_MODES, words, index)]
+    slow = flexible[flexible < 10.0 * suspension.frequency_hz]
+    if count and slow.size:
+        words = (
+            f"a flexible mode at {slow[0]:.3g} Hz {place} lies next to the suspension's "
+            f"{suspension.frequency_hz:g} Hz: is it a rigid-body mode that K holds by mistake?"
+        )
+        return [Finding(Severity.WARNING, Topic.RIGID_MODES, words, index)]
+    return []
+
+
+def _about_zeros(facts: PlantFacts, S_max: float, index: int) -> list[Finding]:
+    found = []
+    for zero in facts.zeros:
+        z = zero.frequency_hz
+        if zero.damping_ratio < -1e-9:
+            words = (
+                f"a transmission zero in the right half-plane at {z:.4g} Hz: with a peak of S of "
+                f"{S_max:g} no controller has a bandwidth much above {z * (1 - 1 / S_max):.3g} Hz "
+                "(z (1 - 1/S_max)); move sensor and actuator closer together"
+            )
+            severe = z < 2.0 * facts.effort_hz
+            severity = Severity.WARNING if severe else Severity.NOTE
+            found.append(Finding(severity, Topic.ZERO, words, index))
+        elif zero.damping_ratio < LIGHT:
+            words = (
+                f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
+                f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
+                f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
+                "Hz unless M_K pays for it"
+            )
+            found.append(Finding(Severity.NOTE, Topic.ZERO, words, index))
+    return found

@@ -1,0 +1,145 @@
+"""A finished run folder read back: its problem, its design, and the design's figures measured anew.
+
+What a run folder holds may come from somebody else, or from an older version: everything is
+checked, and the controller is certified again on the plant that the case file describes.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import DesignFigures
+from ccd_casadi.synthesis.weights import Weights
+
+SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
+
+    `figures` are measured when the folder is read, on the plant as the case describes it now;
+    `result` is result.json as it was written.
+    """
+
+    folder: Path
+    case: Case
+    problem: CoDesignProblem
+    theta: tuple[float, ...]
+    plant: ScaledPlant
+    weights: Weights
+    controller: StateSpace
+    figures: DesignFigures
+    result: Mapping[str, Any]
+
+
+def read_run(folder: Path) -> FinishedRun:
+    """The run in `folder` (case.toml, result.json, controller.json).
+
+    Raises UserError with a remedy where a file is missing, damaged or foreign, where the run
+    found no feasible design, or where the controller is not certified on its plant any more.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+    result = read_json(folder / "result.json")
+    if result.get("status") == "infeasible":
+        words = "the run found no feasible design; there is nothing to work on"
+        raise UserError(f"{folder / 'result.json'}: status: {words}")
+    case = load_case(folder / "case.toml")
+    problem = problem_of(case)
+    theta = _theta(folder / "result.json", result, problem)
+    frequencies = [_number(folder / "result.json", result, k) for k in ("omega_S_hz", "omega_T_hz")]
+    weights = problem.weights.at(HZ * frequencies[0], HZ * frequencies[1])
+    plant = scaled_plant(problem, theta)
+    path = folder / "controller.json"
+    controller = _controller(path, read_json(path), plant)
+    gamma = _number(folder / "result.json", result, "gamma") * (1.0 + SHORTFALL)
+    figures = measure(
+        plant, controller, weights, gamma=gamma, omega_low=problem.inner.omega_low,
+        gamma_opt=_number(folder / "result.json", result, "gamma_opt"),
+        gamma_lower_bound=_number(folder / "result.json", result, "gamma_lower_bound"),
+    )  # fmt: skip
+    if not figures.certified:
+        words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
+        raise UserError(f"{path}: {words}; solve the case again")
+    return FinishedRun(folder, case, problem, theta, plant, weights, controller, figures, result)
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """A JSON object. Raises UserError where there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: there is no such file; solve the case first") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}; solve the case again") from None
+    except (ValueError, RecursionError):
+        raise UserError(f"{path}: is not valid JSON; solve the case again") from None
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: holds no JSON object; solve the case again")
+    return found
+
+
+def _number(path: Path, table: Mapping[str, Any], key: str) -> float:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{path}: {key}: is no number; solve the case again")
+    if value <= 0.0:
+        raise UserError(f"{path}: {key}: is not positive; solve the case again")
+    return float(value)
+
+
+def _theta(path: Path, result: Mapping[str, Any], problem: CoDesignProblem) -> tuple[float, ...]:
+    table = result.get("theta")
+    if not isinstance(table, dict) or set(table) != set(problem.names):
+        words = f"does not name {', '.join(problem.names)} as case.toml does; solve the case again"
+        raise UserError(f"{path}: theta: {words}")
+    values = []
+    for name, low, high in zip(problem.names, problem.lower, problem.upper, strict=True):
+        value = table[name]
+        slack = 1e-9 * (high - low)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not low - slack <= value <= high + slack
+        ):
+            words = f"is outside the bounds {low:g} to {high:g} of case.toml; solve the case again"
+            raise UserError(f"{path}: theta.{name}: {words}")
+        values.append(float(value))
+    return tuple(values)
+
+
+def _controller(path: Path, table: Mapping[str, Any], plant: ScaledPlant) -> StateSpace:
+    m, p = plant.B.shape[1], plant.C.shape[0]
+    A = _matrix(path, table, "A")
+    n = A.shape[0]
+    parts = {"A": (n, n), "B": (n, p), "C": (m, n), "D": (m, p)}
+    found = {key: _matrix(path, table, key) for key in parts}
+    for key, shape in parts.items():
+        if found[key].shape != shape:
+            words = f"is {found[key].shape}, not {shape} for this plant; solve the case again"
+            raise UserError(f"{path}: {key}: {words}")
+    return StateSpace(**found)
+
+
+def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:
+    try:
+        matrix = np.array(table[key], dtype=float)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise UserError(f"{path}: {key}: is no matrix; solve the case again") from None
+    if matrix.ndim != 2 or matrix.size == 0 or not np.isfinite(matrix).all():
+        raise UserError(f"{path}: {key}: is no finite matrix; solve the case again")
+    return matrix

@@ -1,0 +1,194 @@
+"""The sections of a case file as frozen dataclasses; each key carries its check.
+
+Units are those of the file (Hz where a name says so).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.checks import (
+    ABOVE_ONE,
+    FRACTION,
+    POSITIVE,
+    Check,
+    choice,
+    count,
+    factors,
+    interval,
+    number,
+    points,
+    steps,
+)
+
+
+def _key(check: Check, default: Any = MISSING) -> Any:
+    if default is MISSING:
+        return field(metadata={"check": check})
+    return field(default=default, metadata={"check": check})
+
+
+@dataclass(frozen=True)
+class PlantSection:
+    """[plant]: a model's name or function = "file.py:name"; all other keys are its options."""
+
+    model: str | None
+    function: str | None
+    options: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter."""
+
+    name: str
+    lower: float
+    upper: float
+    start: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class ObjectiveSection:
+    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s."""
+
+    w1: float = _key(number(0.0, math.inf, "give 0 or more: J is minimised", closed=True))
+    w2: float = _key(number(-math.inf, 0.0, "give a negative number: J must reward bandwidth"))
+
+
+@dataclass(frozen=True)
+class WeightsSection:
+    """[weights] of the paper's Table 1; M_K in force over displacement."""
+
+    M_S: float = _key(POSITIVE)
+    A_S: float = _key(FRACTION)
+    c_K: float = _key(ABOVE_ONE)
+    omega_K_hz: float = _key(POSITIVE)
+    M_K: float = _key(POSITIVE)
+    A_l: float = _key(POSITIVE)
+    A_u: float = _key(FRACTION)
+
+
+@dataclass(frozen=True)
+class InnerSection:
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
+
+    S_max: float = _key(
+        number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral")
+    )
+    S_low: float = _key(FRACTION)
+    omega_low_hz: float = _key(POSITIVE)
+    omega_S_hz: tuple[float, float] = _key(interval)
+    omega_T_hz: tuple[float, float] = _key(interval)
+    gamma_backoff: float = _key(
+        number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"), 1.02
+    )
+    sweep_points: tuple[int, int] = _key(points, (20, 20))
+    method: str = _key(choice("search", "sweep"), "search")
+
+
+@dataclass(frozen=True)
+class SuspensionSection:
+    """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
+
+    frequency_hz: float = _key(POSITIVE, 0.1)
+    damping_ratio: float = _key(POSITIVE, 0.7)
+    rigid_modes: int | None = _key(count(0), None)
+
+
+@dataclass(frozen=True)
+class RobustSection:
+    """[robust]: plants on which the loop has to be stable and ‖S‖∞ within S_max; off by default.
+
+    `resonance_shift` s: flexible frequencies at `shifts` places from -s to +s (relative), each with
+    damping times 1 and every factor of `damping`. `design_at`: which end of that range, or its
+    middle, the controller is synthesised for.
+    """
+
+    resonance_shift: float = _key(
+        number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True), 0.0
+    )
+    shifts: int = _key(count(2), 5)
+    damping: tuple[float, ...] = _key(factors, ())
+    design_at: str = _key(choice("low", "nominal", "high"), "low")
+
+
+@dataclass(frozen=True)
+class SamplingSection:
+    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
+
+    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
+    """
+
+    design: str = _key(choice("grid", "sobol", "lhs"), "grid")
+    points: int = _key(count(2), 5)
+    lifted_points: int = _key(count(0), 0)
+
+
+@dataclass(frozen=True)
+class OuterSection:
+    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
+
+    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
+    that predicts left-out samples best.
+    """
+
+    starts: int = _key(count(1), 16)
+    direct_starts: int = _key(count(1), 4)
+    tolerance: float = _key(FRACTION, 1e-3)
+    max_refinements: int = _key(count(0), 12)
+    surrogate: str = _key(choice("matern52", "rbf", "auto"), "matern52")
+
+
+@dataclass(frozen=True)
+class BaselineSection:
+    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
+
+    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
+    and a Latin hypercube.
+    """
+
+    first_resonance_hz: float = _key(POSITIVE, 250.0)
+    steps: tuple[float, ...] = _key(steps, (0.02, 0.05, 0.1))
+    starts: int = _key(count(1), 3)
+    max_iterations: int = _key(count(1), 100)
+
+
+@dataclass(frozen=True)
+class LimitsSection:
+    """[limits]: how long a user's plant function may take at each call, in s."""
+
+    plant_seconds: float = _key(POSITIVE, 60.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A checked case file."""
+
+    path: Path
+    plant: PlantSection
+    theta: tuple[Parameter, ...]
+    objective: ObjectiveSection
+    weights: WeightsSection
+    inner: InnerSection
+    suspension: SuspensionSection
+    robust: RobustSection
+    sampling: SamplingSection
+    outer: OuterSection
+    baseline: BaselineSection
+    limits: LimitsSection
+
+
+SECTIONS: dict[str, type] = {
+    "objective": ObjectiveSection,
+    "weights": WeightsSection,
+    "inner": InnerSection,
+    "suspension": SuspensionSection,
+    "robust": RobustSection,
+    "sampling": SamplingSection,
+    "outer": OuterSection,
+    "baseline": BaselineSection,
+    "limits": LimitsSection,
+}

@@ -1,0 +1,49 @@
+"""The resolved case, defaults included, back as TOML.
+
+By hand: tomli-w lets marks through that turn the direction of a terminal's text, and cases come
+from strangers.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from ccd_casadi.cases.sections import SECTIONS, Case
+
+
+def case_to_toml(case: Case) -> str:
+    """The resolved case, defaults included, as TOML."""
+    plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
+    lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
+    for parameter in case.theta:
+        entry = {key: value for key, value in vars(parameter).items() if key != "name"}
+        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(entry)]
+    for name in SECTIONS:
+        lines += ["", f"[{name}]", *_pairs(vars(getattr(case, name)))]
+    return "\n".join(lines) + "\n"
+
+
+def _pairs(table: Mapping[str, Any]) -> list[str]:
+    given = {key: value for key, value in table.items() if value is not None}
+    return [f"{_toml_key(key)} = {_toml(value)}" for key, value in given.items()]
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else _toml(key)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = "".join(_escape(letter) for letter in value)
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value)
+
+
+def _escape(letter: str) -> str:
+    if letter in '"\\':
+        return "\\" + letter
+    return letter if letter.isprintable() else f"\\U{ord(letter):08X}"

@@ -1,0 +1,1 @@
+"""The outer problem, its formulations, verification, baselines and retraining."""

@@ -1,0 +1,254 @@
+"""Every method side by side on one case: the formulations, the descents, the sequential design."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.codesign.conclusions import conclusions
+from ccd_casadi.codesign.published import PUBLISHED
+from ccd_casadi.codesign.result import clean, figures_dict, versions
+from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of
+from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
+from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler, TraceEntry
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from surrogates import latin_hypercube
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method's entry: its JSON figures, its path over θ, and J against syntheses spent."""
+
+    name: str
+    figures: dict[str, Any]
+    path: tuple[tuple[float, ...], ...]
+    trace: tuple[TraceEntry, ...]
+    solution: Solution | None = None
+    descent: Descent | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All methods on one case, and the descents behind the best of each gradient."""
+
+    case: Case
+    problem: CoDesignProblem
+    methods: tuple[Method, ...]
+    descents: tuple[Descent, ...]
+    seconds: float
+
+    def method(self, name: str) -> Method:
+        """The method of that name."""
+        return next(method for method in self.methods if method.name == name)
+
+
+def compare(
+    case: Case, problem: CoDesignProblem, folder: Path, workers: Pool, *, seed: int, quiet: bool
+) -> Comparison:
+    """Run every method, each with a store and a count of its own."""
+    began = perf_counter()
+    methods = [
+        _formulation(case, problem, folder, workers, name, seed, quiet) for name in FORMULATIONS
+    ]
+    descents = _descents(case, problem, workers, seed, quiet)
+    for gradient in Gradient:
+        methods.append(_best_descent(problem, descents, gradient))
+    for name, starts in (("sequential", 0), ("sequential_global", 8)):
+        methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
+    return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
+
+
+def _formulation(
+    case: Case,
+    problem: CoDesignProblem,
+    folder: Path,
+    workers: Pool,
+    name: str,
+    seed: int,
+    quiet: bool,
+) -> Method:
+    began = perf_counter()
+    with SampleStore(folder / f"samples_{name}.sqlite") as store:
+        sampler = Sampler(problem, store, workers, quiet=quiet)
+        solution = co_design(sampler, formulation_of(case, name), seed)
+        trace = tuple(sampler.trace)
+    figures = solution.result | {"seconds": perf_counter() - began}
+    path = tuple(iterate.theta for iterate in solution.outcome.iterates)
+    if solution.verified is not None:
+        path = (*path, solution.verified.theta)
+        figures["first_resonance_hz"] = _resonance(problem, solution.verified.theta)
+    return Method(name, figures, path, trace, solution=solution)
+
+
+def _descents(
+    case: Case, problem: CoDesignProblem, workers: Pool, seed: int, quiet: bool
+) -> list[Descent]:
+    """Both gradients from every start with every first step."""
+    base = case.baseline
+    lower, upper = box(problem)
+    starts = [problem.start]
+    if base.starts > 1:
+        spread = latin_hypercube(lower, upper, base.starts - 1, seed)
+        starts += [tuple(float(v) for v in theta) for theta in spread]
+    tasks = [
+        (problem, start, gradient, step, base.max_iterations)
+        for gradient in Gradient
+        for start in starts
+        for step in base.steps
+    ]
+    found = []
+    with Progress(len(tasks), "steepest descent", quiet=quiet) as progress:
+        for descent in workers.map_unordered(_descend, tasks):
+            found.append(descent)
+            progress.advance()
+    return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
+
+
+def _descend(
+    task: tuple[CoDesignProblem, tuple[float, ...], Gradient, float, int],
+) -> Descent:
+    problem, start, gradient, step, iterations = task
+    began = perf_counter()
+    descent = steepest_descent(
+        problem, start, gradient=gradient, first_step=step, max_iterations=iterations
+    )
+    return Descent(**{**vars(descent), "seconds": perf_counter() - began})
+
+
+def _best_descent(
+    problem: CoDesignProblem, descents: Sequence[Descent], gradient: Gradient
+) -> Method:
+    """The descent of that gradient with the best J, fewest syntheses among equals."""
+    runs = [descent for descent in descents if descent.gradient is gradient]
+    best = min(runs, key=lambda d: (round(d.objective, 9), d.syntheses))
+    name = "steepest_descent" if gradient is Gradient.FIXED else "steepest_descent_total"
+    extra = {
+        "gradient": gradient.value,
+        "start": best.start,
+        "first_step": best.first_step,
+        "stop": best.stop.value,
+        "iterations": len(best.iterates),
+        "runs": len(runs),
+        "syntheses_of_all_runs": sum(run.syntheses for run in runs),
+        "history": [asdict(iterate) for iterate in best.iterates],
+    }
+    if best.design is None:
+        figures = {"status": "infeasible", "reason": best.stop.value, "syntheses": best.syntheses}
+        return Method(name, clean(figures | extra), (), (), descent=best)
+    theta = best.iterates[-1].theta
+    figures = _figures(problem, theta, best.design, best.syntheses, best.seconds) | extra
+    trace = tuple(
+        TraceEntry(item.syntheses, item.theta, item.bandwidth, item.objective)
+        for item in best.iterates
+    )
+    path = tuple(item.theta for item in best.iterates)
+    return Method(name, clean(figures), path, trace, descent=best)
+
+
+def _sequential(
+    case: Case,
+    problem: CoDesignProblem,
+    folder: Path,
+    workers: Pool,
+    name: str,
+    starts: int,
+    seed: int,
+) -> Method:
+    began = perf_counter()
+    resonance = HZ * case.baseline.first_resonance_hz
+    hardware: HardwareDesign = design_hardware(
+        problem, resonance, starts=starts, seed=seed, workers=workers
+    )
+    with SampleStore(folder / f"samples_{name}.sqlite") as store:
+        sampler = Sampler(problem, store, workers)
+        sample = sampler.bandwidths(np.array(hardware.theta))[0]
+        trace = tuple(sampler.trace)
+        spent = sampler.syntheses
+        if not sample.feasible:
+            figures = {"status": "infeasible", "reason": sample.shortfall, "syntheses": spent}
+            return Method(name, figures, (hardware.theta,), trace)
+        x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+        design = sampler.design(x)
+    figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
+    figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
+    return Method(name, clean(figures), (hardware.theta,), trace)
+
+
+def _figures(
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    design: Sensitivities,
+    syntheses: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """The contract's keys for a design that no formulation made."""
+    cost = hardware_cost(plant_of(problem), theta)
+    figures = design.figures
+    feasible = problem.inner.feasible(figures)
+    return {
+        **figures_dict(figures),
+        "status": "verified" if feasible else "not_verified",
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "hardware_cost": cost,
+        "objective": problem.w1 * cost + problem.w2 * figures.bandwidth,
+        "active": list(active_constraints(problem.inner, figures)),
+        "first_resonance_hz": _resonance(problem, theta),
+        "surrogate_bandwidth_hz": None,
+        "verification_error": None,
+        "syntheses": syntheses,
+        "seconds": seconds,
+        "versions": versions(),
+    }
+
+
+def _resonance(problem: CoDesignProblem, theta: tuple[float, ...]) -> float:
+    return first_resonance(problem, np.array(theta))[0] / HZ
+
+
+def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
+    """compare.json."""
+    model = comparison.problem.source.model or ""
+    return clean(
+        {
+            "case": str(comparison.case.path),
+            "methods": {method.name: method.figures for method in comparison.methods},
+            "traces": {
+                method.name: [asdict(entry) for entry in method.trace]
+                for method in comparison.methods
+            },
+            "descents": [
+                {
+                    "gradient": descent.gradient.value,
+                    "start": descent.start,
+                    "first_step": descent.first_step,
+                    "objective": descent.objective,
+                    "theta": descent.iterates[-1].theta if descent.iterates else None,
+                    "stop": descent.stop.value,
+                    "iterations": len(descent.iterates),
+                    "syntheses": descent.syntheses,
+                }
+                for descent in comparison.descents
+            ],
+            "published": PUBLISHED.get(model, {}),
+            "conclusions": conclusions(comparison.problem, _entries(comparison)),
+            "seconds": comparison.seconds,
+            "seed": seed,
+            "versions": versions(),
+        }
+    )
+
+
+def _entries(comparison: Comparison) -> dict[str, dict[str, Any]]:
+    return {method.name: method.figures for method in comparison.methods}

@@ -1,0 +1,97 @@
+"""What a comparison shows, computed from its figures: who wins, by how much, at what cost, why."""
+
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+
+OURS = ("nested", "lifted", "direct")
+EQUAL = 1e-6  # relative difference of J that counts as none
+
+
+def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Figures and sentences; entries without a feasible design are left out of the ranking."""
+    solved = {name: f for name, f in methods.items() if f.get("objective") is not None}
+    if not solved:
+        return {"best": None, "sentences": ["No method found a feasible design."]}
+    ranked = sorted(solved, key=lambda name: solved[name]["objective"])
+    best = solved[ranked[0]]["objective"]
+    near = [n for n in ranked if solved[n]["objective"] <= best + EQUAL * abs(best)]
+    cheapest = min(near, key=lambda name: solved[name]["syntheses"])
+    answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
+    sentences = [
+        f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
+        f"{cheapest} with {solved[cheapest]['syntheses']} true syntheses."
+    ]
+    for name in ("steepest_descent", "steepest_descent_total"):
+        if name in solved:
+            found, words = _descent(problem, solved[name], solved[cheapest], name)
+            answer[name] = found
+            sentences += words
+    for name in ("sequential", "sequential_global"):
+        if name in solved:
+            found, sentence = _sequential(solved[name], solved[cheapest], name)
+            answer[name] = found
+            sentences.append(sentence)
+    return answer | {"sentences": sentences}
+
+
+def _descent(
+    problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str
+) -> tuple[dict[str, Any], list[str]]:
+    """How far a descent ends from the best, and which of gradient, sweep or step stopped it."""
+    gap = run["objective"] - best["objective"]
+    ratio = run["syntheses"] / best["syntheses"]
+    theta = tuple(run["theta"].values())
+    truth = true_inner(problem, theta)
+    swept_loss = (truth.bandwidth - 2 * np.pi * run["bandwidth_hz"]) * abs(problem.w2)
+    moved = max(
+        abs(a - b) / (high - low)
+        for a, b, low, high in zip(
+            theta, best["theta"].values(), problem.lower, problem.upper, strict=True
+        )
+    )
+    found = {
+        "objective_gap": gap,
+        "synthesis_ratio": ratio,
+        "loss_to_swept_inner": swept_loss,
+        "distance_to_best": moved,
+        "stop": run["stop"],
+        "last_gradient": run["history"][-1]["gradient"],
+    }
+    label = (
+        "Steepest descent with K held fixed"
+        if name == "steepest_descent"
+        else ("Steepest descent with the total gradient")
+    )
+    words = [
+        f"{label} (best of {run['runs']} runs) ends at J = {run['objective']:.4f}, "
+        f"{gap:.3g} above, after {run['syntheses']} syntheses, {ratio:.0f} times as many; "
+        f"all its runs together took {run['syntheses_of_all_runs']}."
+    ]
+    if gap > EQUAL * abs(best["objective"]):
+        share = min(1.0, max(0.0, swept_loss / gap)) if gap > 0 else 0.0
+        words.append(
+            f"It stopped because of: {run['stop']}. Of its gap, {100 * share:.0f} % is the inner "
+            f"sweep's coarse grid (the true inner optimum at its theta is worth {swept_loss:.3g} "
+            f"more), the rest its theta, {100 * moved:.2g} % of the box from the best one."
+        )
+    return found, words
+
+
+def _sequential(run: dict[str, Any], best: dict[str, Any], name: str) -> tuple[dict[str, Any], str]:
+    cost = 100.0 * (best["hardware_cost"] / run["hardware_cost"] - 1.0)
+    speed = 100.0 * (best["bandwidth_hz"] / run["bandwidth_hz"] - 1.0)
+    found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
+    label = (
+        "the sequential design next to the case's start"
+        if name == "sequential"
+        else ("the globally cheapest sequential hardware")
+    )
+    words = (
+        f"Against {label} (hardware cost {run['hardware_cost']:.5g}, "
+        f"{run['bandwidth_hz']:.2f} Hz) co-design changes the hardware cost by {cost:+.1f} % and "
+        f"the bandwidth by {speed:+.1f} %."
+    )
+    return found, words

@@ -1,0 +1,115 @@
+"""The direct formulation: IPOPT on the true quantities, and the polish that every solve ends with.
+
+Nothing is approximated: each iteration is a certified synthesis with its total derivatives.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.outer_problem import (
+    LocalOptimum,
+    OuterFailure,
+    OuterSolution,
+    lifted_bounds,
+    lifted_program,
+    solve_program,
+)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from surrogates import design
+
+STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem.
+
+    >>> Direct(starts=2).starts
+    2
+    """
+
+    starts: int = 4
+    tolerance: float = 1e-3
+
+
+def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
+    """IPOPT on the true problem from the case's start and a Sobol set of starts."""
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    program = lifted_program(problem, quantities, exact_hessian=False)
+    lower, upper = lifted_bounds(problem)
+    middle = 0.5 * (lower + upper)
+    first = np.array([*problem.start, *middle[-2:]])
+    points = first[None, :]
+    if options.starts > 1:
+        points = np.vstack([points, design("sobol", lower, upper, options.starts - 1, seed)])
+    certified = [x for x in points if quantities.at(x).figures.certified]
+    if not certified:
+        reason = quantities.at(first).figures.outcome.value
+        message = f"none of {len(points)} starting designs is certified; the first: {reason}"
+        return FormulationResult(None, None, (), (), None, False, message)
+    try:
+        solution = solve_program(program, np.array(certified))
+    except OuterFailure as error:
+        return FormulationResult(None, None, (), (), None, False, str(error))
+    for optimum in solution.optima:
+        if acceptable(problem, optimum.x, quantities.at(optimum.x)):
+            chosen = quantities.at(optimum.x)
+            return FormulationResult(optimum.x, chosen, (), (), solution, True, "")
+    message = "IPOPT's optima are not certified or not feasible"
+    return FormulationResult(None, None, (), (), solution, False, message)
+
+
+def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolution | None]:
+    """From a design nearly optimal to the nearest stationary point of the true problem.
+
+    Returns the start itself where IPOPT finds nothing better that is certified and feasible.
+    """
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    program = lifted_program(problem, quantities, exact_hessian=False)
+    start = quantities.at(x)
+    if acceptable(problem, x, start) and _stationary(problem, x, start):
+        return x, start, None
+    solution: OuterSolution | None = None
+    try:
+        solution = solve_program(program, x, warm=True)
+    except OuterFailure:
+        pass
+    best, best_x = start, x
+    candidates = [] if solution is None else [solution.best]
+    for candidate in candidates:
+        found = quantities.at(candidate.x)
+        if not acceptable(problem, candidate.x, found):
+            continue
+        if not acceptable(problem, x, start) or _no_worse(problem, candidate, x, start):
+            best, best_x = found, candidate.x
+    return best_x, best, solution
+
+
+def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
+    """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
+    lam = constraint_values(plant_of(problem), x[: len(problem.names)])
+    return problem.inner.feasible(design.figures) and bool((lam <= 1e-9).all())
+
+
+def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
+    """Whether the true optimality conditions hold already, to what IPOPT would reach."""
+    kkt = kkt_certificate(problem, x, design)
+    return max(kkt.stationarity, kkt.complementarity) <= STATIONARY
+
+
+def _no_worse(
+    problem: CoDesignProblem, candidate: LocalOptimum, x: Array, start: Sensitivities
+) -> bool:
+    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
+    before = problem.w1 * cost + problem.w2 * start.figures.bandwidth
+    return candidate.objective <= before + 1e-9 * abs(before)

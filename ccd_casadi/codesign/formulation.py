@@ -1,0 +1,44 @@
+"""What a formulation leaves behind: its iterates, its surrogate, and the design it ends with."""
+
+from dataclasses import dataclass
+
+from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from surrogates import GaussianProcess
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """One round: what the surrogate promised at θ and what the true inner problem gave.
+
+    Bandwidths in rad/s; `truth` NaN where θ is infeasible; `radius` of the trust region as a
+    share of the box; `step` from the incumbent, likewise.
+    """
+
+    theta: tuple[float, ...]
+    predicted: float
+    truth: float
+    predicted_objective: float
+    objective: float
+    error: float
+    step: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class FormulationResult:
+    """x = (θ, ln ω_S, ln ω_T) of the best verified design (None: infeasible) and the way there.
+
+    `surrogates` are the processes of ω_b* (nested) or of ω_b, ln‖S‖∞, ln|S(jω_low)| (lifted),
+    none for direct, which has a `design` of its own instead; `agreed` tells whether prediction and
+    truth met the tolerance at the end.
+    """
+
+    x: Array | None
+    design: Sensitivities | None
+    iterates: tuple[Iterate, ...]
+    surrogates: tuple[GaussianProcess, ...]
+    outer: OuterSolution | None
+    agreed: bool
+    message: str

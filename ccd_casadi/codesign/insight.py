@@ -1,0 +1,54 @@
+"""insight.json: the front around a design and the derivatives of its optimum, as plain values."""
+
+from dataclasses import asdict
+from typing import Any
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.pareto import Front
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.result import versions
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.support.units import HZ
+
+
+def natural_hz(run: FinishedRun) -> tuple[float, ...]:
+    """Natural frequencies of the flexible modes at the design, Hz."""
+    modal = modal_plant(mechanics(plant_of(run.problem), run.theta), run.problem.suspension)
+    return tuple(float(w) / HZ for w in modal.natural[~modal.rigid])
+
+
+def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict[str, Any]:
+    """insight.json: SI, and Hz where a key says so."""
+    names = run.problem.names
+    points = [
+        {
+            "theta": dict(zip(names, point.theta, strict=True)),
+            "hardware_cost": point.hardware_cost,
+            "bandwidth_hz": point.bandwidth / HZ,
+            "predicted_bandwidth_hz": point.predicted / HZ,
+            "omega_S_hz": point.omega_S / HZ,
+            "omega_T_hz": point.omega_T / HZ,
+            "active": list(point.active),
+            "efficient": point.efficient,
+            "status": "verified" if point.verified else "not_verified",
+            "reason": point.reason,
+        }
+        for point in front.points
+    ]
+    natural = natural_hz(run)
+    return {
+        "front": {"points": points, "rounds": front.rounds, "syntheses": front.syntheses},
+        "optimum": {
+            "responses": {item.parameter: asdict(item) for item in responses.responses},
+            "determined": responses.determined,
+            "weakly_active": list(responses.weak),
+            "stationarity": responses.kkt.stationarity,
+        },
+        "natural_hz": list(natural),
+        "first_resonance_over_bandwidth": (
+            min(natural) * HZ / run.figures.bandwidth if natural else None
+        ),
+        "versions": versions(),
+    }

@@ -1,0 +1,177 @@
+"""Certificate of first- and second-order optimality on the true problem.
+
+    min J(x) = w1 f(θ) + w2 ω_b(x),  x = (θ, ln ω_S, ln ω_T),
+    g(x) = (ln‖S‖∞ - ln S_max, ln σ_max(S(jω_low)) - ln S_low, λ(θ)) <= 0,  bounds,
+
+with the total derivatives of the true synthesis. Variables are scaled to the unit box, and the
+residual to the gradient of J: r = ‖∇J + Aᵀμ‖∞/‖∇J‖∞ with μ >= 0 by non-negative least squares.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import null_space
+from scipy.optimize import nnls
+
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+
+# The polish stops where steps no longer change J by more than rounding; a constraint closer
+# than this (in logarithm, or share of the box) is one that it runs along.
+ACTIVE = 1e-6
+STEP = 1e-4  # of the box: differences of true gradients
+
+
+@dataclass(frozen=True)
+class KktCertificate:
+    """Residuals of the true optimality conditions at a verified design.
+
+    stationarity: scaled, see the module. primal: largest violation of g (logarithms) or a bound
+    (share of the box). complementarity: largest |μ g| over ‖∇J‖∞. multipliers: per name, change
+    of J per unit of g, or per unit box of a bound. second_order: least eigenvalue of the reduced
+    Hessian of the Lagrangian over ‖∇J‖∞, inf at a vertex, None where it was not computed.
+    """
+
+    stationarity: float
+    primal: float
+    complementarity: float
+    multipliers: dict[str, float]
+    active: tuple[str, ...]
+    second_order: float | None
+    objective_gradient: tuple[float, ...]
+
+
+def kkt_certificate(
+    problem: CoDesignProblem,
+    x: Array,
+    design: Sensitivities,
+    true_at: Callable[[Array], Sensitivities] | None = None,
+) -> KktCertificate:
+    """First-order residuals at x; the second-order check too where `true_at` may synthesise."""
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
+    slack_low, slack_high = (x - lower) / width, (upper - x) / width
+    rows, labels, slack = [], [], []
+    for value, row, name in zip(g, jacobian, names, strict=True):
+        if value >= -ACTIVE:
+            rows.append(row)
+            labels.append(name)
+            slack.append(value)
+    for i, name in enumerate((*problem.names, "omega_S", "omega_T")):
+        for end, gap, sign in (("lower", slack_low[i], -1.0), ("upper", slack_high[i], 1.0)):
+            if gap <= ACTIVE:
+                rows.append(sign * np.eye(x.size)[i])
+                labels.append(f"{name} {end}")
+                slack.append(-gap)
+    size = max(float(np.abs(gradient).max()), 1e-300)
+    if rows:
+        A = np.array(rows)
+        mu, _ = nnls(A.T, -gradient)
+        residual = gradient + A.T @ mu
+        complementarity = float(np.abs(mu * np.array(slack)).max()) / size
+    else:
+        A, mu, residual, complementarity = np.empty((0, x.size)), np.empty(0), gradient, 0.0
+    primal = max(0.0, float(-slack_low.min()), float(-slack_high.min()))
+    if g.size:
+        primal = max(primal, float(g.max()))
+    second = _second_order(problem, x, A[mu > 0.0], size, mu, labels, true_at)
+    return KktCertificate(
+        stationarity=float(np.abs(residual).max()) / size,
+        primal=primal,
+        complementarity=complementarity,
+        multipliers={name: float(value) for name, value in zip(labels, mu, strict=True)},
+        active=tuple(labels),
+        second_order=second,
+        objective_gradient=tuple(float(value) for value in gradient),
+    )
+
+
+def lagrangian_parts(
+    problem: CoDesignProblem, x: Array, design: Sensitivities
+) -> tuple[Array, Array, Array, tuple[str, ...]]:
+    """∇J, g and its Jacobian in unit-box variables, and the constraints' names."""
+    plant = plant_of(problem)
+    count = len(problem.names)
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    theta = x[:count]
+    symbol = ca.MX.sym("theta", count)
+    f, lam = plant.hardware(symbol)
+    slopes = ca.Function("slopes", [symbol], [ca.jacobian(f, symbol), ca.jacobian(lam, symbol)])
+    df, dlam = (np.array(value) for value in slopes(theta))
+    total = np.hstack([design.to_theta, design.to_break_frequencies])
+    gradient = problem.w2 * total[0]
+    gradient[:count] += problem.w1 * df.ravel()
+    lam_values = np.array(plant.hardware(theta)[1]).ravel()
+    levels = np.log([problem.inner.S_max, problem.inner.S_low])
+    g = np.concatenate([design.values[1:3] - levels, lam_values])
+    jacobian = np.vstack(
+        [total[1:3], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])]
+    )
+    names = ("S_max", "S_low", *plant.constraint_names)
+    return gradient * width, g, jacobian * width, names
+
+
+def _second_order(
+    problem: CoDesignProblem,
+    x: Array,
+    strong: Array,
+    size: float,
+    mu: Array,
+    labels: list[str],
+    true_at: Callable[[Array], Sensitivities] | None,
+) -> float | None:
+    """Least eigenvalue of Zᵀ∇²L Z, Z spanning the null space of the strongly active gradients."""
+    Z = null_space(strong) if strong.size else np.eye(x.size)
+    if Z.shape[1] == 0:
+        return np.inf
+    if true_at is None:
+        return None
+    columns = lagrangian_hessian(
+        problem, x, Z, dict(zip(labels, map(float, mu), strict=True)), true_at
+    )
+    if columns is None:
+        return None
+    H = Z.T @ columns
+    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+
+
+def lagrangian_hessian(
+    problem: CoDesignProblem,
+    x: Array,
+    directions: Array,
+    multipliers: Mapping[str, float],
+    true_at: Callable[[Array], Sensitivities],
+) -> Array | None:
+    """∇²L Z (n, k) by differences of true gradients, unit-box variables; None where not certified.
+
+    At a bound the difference is one-sided. `multipliers` by the certificate's names.
+    """
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+
+    def slope(at: Array) -> Array | None:
+        design = true_at(at)
+        if not design.figures.certified:
+            return None
+        gradient, _, jacobian, names = lagrangian_parts(problem, at, design)
+        return gradient + sum(
+            (multipliers.get(name, 0.0) * row for name, row in zip(names, jacobian, strict=True)),
+            start=np.zeros(x.size),
+        )
+
+    columns = np.empty((x.size, directions.shape[1]))
+    for k, direction in enumerate(directions.T):
+        step = STEP * direction * width
+        ends = [np.clip(x + sign * step, lower, upper) for sign in (1.0, -1.0)]
+        slopes = [slope(end) for end in ends]
+        span = float(np.linalg.norm((ends[0] - ends[1]) / width))
+        if slopes[0] is None or slopes[1] is None or span < 0.5 * STEP:
+            return None
+        columns[:, k] = (slopes[0] - slopes[1]) / span
+    return columns

@@ -1,0 +1,211 @@
+"""The lifted formulation: smooth surrogates over (θ, ω_S, ω_T), the bounds on S explicit.
+
+ω_b, ln‖S‖∞ and ln σ_max(S(jω_low)) are smooth where ω_b*(θ) is not, so a few dozen designs with
+their exact gradients determine them; the same samples answer any S_max, S_low, w1, w2, bounds
+and λ with no new synthesis.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate
+from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.outer_problem import (
+    OuterFailure,
+    OuterSolution,
+    lifted_bounds,
+    lifted_program,
+    solve_program,
+)
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.sampler import QuantitySample, Sampler
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
+
+STEP = 1e-4  # share of the box below which a step counts as small
+SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
+REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated anew
+# IPOPT aims this far inside ln S_max and ln S_low: about the surrogates' error at the end, so
+# that the truth is feasible there and has nothing left to be polished.
+MARGIN = 1e-7
+FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """Options of the lifted formulation; the defaults are those of a case file.
+
+    `points` designs of (θ, ω_S, ω_T) are sampled; 0 takes 6 (n_θ + 2). A quadratic in n variables
+    has (n + 1)(n + 2)/2 coefficients and a sample with gradients gives n + 1 numbers: 6 n samples
+    are twelve times what it needs at n = 4, six times at n = 8. The rest as for `Nested`.
+
+    >>> Lifted(points=24, tolerance=1e-4).starts
+    16
+    """
+
+    points: int = 0
+    starts: int = 16
+    tolerance: float = 1e-3
+    max_refinements: int = 12
+    kernel: str = "matern52"
+
+
+def solve_lifted(
+    sampler: Sampler, options: Lifted, *, seed: int, given: Surrogates | None = None
+) -> FormulationResult:
+    """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
+
+    With `given` surrogates the rounds start from those and what they were fitted to.
+    """
+    problem = sampler.problem
+    lower, upper = lifted_bounds(problem)
+    points = options.points or 6 * len(lower)
+    if given is None:
+        X = design("sobol", lower, upper, points, seed)
+        samples = [s for s in sampler.quantities(X) if s.certified]
+    else:
+        samples = list(given.samples)
+    if len(samples) < len(lower) + 1:
+        message = f"only {len(samples)} of {points} designs in the box were certified"
+        return FormulationResult(None, None, (), (), None, False, message)
+    iterates: list[Iterate] = []
+    processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
+    solution: OuterSolution | None = None
+    agreed, fitted = False, 0 if given is None else len(samples)
+    incumbent: QuantitySample | None = None
+    for round_number in range(options.max_refinements + 1):
+        if len(samples) >= REFIT * fitted:
+            processes = fit_quantities(problem, samples, seed, kind=options.kernel)
+            fitted = len(samples)
+        elif len(samples) > len(processes[0].X):
+            processes = update_quantities(problem, samples, processes)
+        program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
+        spread = design("sobol", lower, upper, options.starts, seed + round_number)
+        if incumbent is not None:
+            spread = np.vstack([incumbent.x, spread[: options.starts // 2]])
+        try:
+            solution = solve_program(program, spread)
+        except OuterFailure as error:
+            return FormulationResult(
+                None, None, tuple(iterates), processes, None, False, str(error)
+            )
+        x = solution.best.x
+        predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
+        sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
+        iterate = _iterate(problem, incumbent, sample, predicted)
+        iterates.append(iterate)
+        settled = incumbent is not None and abs(
+            iterate.objective - _objective(problem, incumbent)
+        ) <= SETTLED * options.tolerance * abs(iterate.objective)
+        if sample.certified:
+            samples.append(sample)
+            incumbent = _better(problem, incumbent, sample)
+        agreed = iterate.error <= options.tolerance
+        if agreed and (iterate.step <= STEP or settled):
+            break
+    if incumbent is None:
+        message = "no design near the predicted optima meets S_max and S_low"
+        return FormulationResult(None, None, tuple(iterates), processes, solution, False, message)
+    x = np.array(incumbent.x)
+    message = "" if agreed else "prediction and truth did not agree within the budget"
+    return FormulationResult(x, None, tuple(iterates), processes, solution, agreed, message)
+
+
+def fit_quantities(
+    problem: CoDesignProblem,
+    samples: list[QuantitySample],
+    seed: int,
+    gradients: bool = True,
+    kind: str = "matern52",
+) -> tuple[GaussianProcess, ...]:
+    """Processes of ω_b (rad/s), ln‖S‖∞ and ln σ_max(S(jω_low)) over x = (θ, ln ω_S, ln ω_T)."""
+    lower, upper = lifted_bounds(problem)
+    X = np.array([sample.x for sample in samples])
+    Y = np.array([sample.values[:3] for sample in samples])
+    dY = np.array([sample.gradients[:3] for sample in samples]) if gradients else None
+    found = [
+        fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
+        for kernel in kernels_of(kind)
+    ]
+    return tuple(best_left_out(each) for each in zip(*found, strict=True))
+
+
+def update_quantities(
+    problem: CoDesignProblem,
+    samples: list[QuantitySample],
+    processes: tuple[GaussianProcess, ...],
+) -> tuple[GaussianProcess, ...]:
+    """The same processes conditioned on more samples, hyperparameters kept."""
+    lower, upper = lifted_bounds(problem)
+    X = np.array([sample.x for sample in samples])
+    return tuple(
+        condition(
+            process.hyperparameters,
+            X,
+            np.array([sample.values[i] for sample in samples]),
+            lower=lower,
+            upper=upper,
+            kernel=process.kernel,
+            dY=np.array([sample.gradients[i] for sample in samples]),
+        )
+        for i, process in enumerate(processes)
+    )
+
+
+def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
+    count = len(problem.names)
+    cost = hardware_cost(plant_of(problem), sample.x[:count])
+    return problem.w1 * cost + problem.w2 * float(sample.values[0])
+
+
+def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
+    """Largest violation of ln S_max, ln S_low and λ."""
+    levels = np.log([problem.inner.S_max, problem.inner.S_low]) - MARGIN
+    lam = constraint_values(plant_of(problem), sample.x[: len(problem.names)])
+    return float(np.concatenate([sample.values[1:3] - levels, lam]).max())
+
+
+def _better(
+    problem: CoDesignProblem, incumbent: QuantitySample | None, sample: QuantitySample
+) -> QuantitySample:
+    """The sample with less violation beyond the slack; among feasible ones the better J."""
+    if incumbent is None:
+        return sample
+
+    def rank(s: QuantitySample) -> tuple[float, float]:
+        return max(0.0, _violation(problem, s) - FEASIBLE), _objective(problem, s)
+
+    return min(incumbent, sample, key=rank)
+
+
+def _iterate(
+    problem: CoDesignProblem,
+    incumbent: QuantitySample | None,
+    sample: QuantitySample,
+    predicted: Array,
+) -> Iterate:
+    """Error: the largest of ω_b (relative), ln‖S‖∞ and ln|S(jω_low)| (absolute)."""
+    lower, upper = lifted_bounds(problem)
+    count = len(problem.names)
+    cost = problem.w1 * hardware_cost(plant_of(problem), sample.x[:count])
+    error = np.inf
+    if sample.certified:
+        errors = np.abs(sample.values[:3] - predicted)
+        errors[0] /= sample.values[0]
+        error = float(errors.max())
+    step = np.inf
+    if incumbent is not None:
+        step = float(np.abs((np.array(sample.x) - incumbent.x) / (upper - lower)).max())
+    return Iterate(
+        theta=sample.x[:count],
+        predicted=float(predicted[0]),
+        truth=float(sample.values[0]),
+        predicted_objective=cost + problem.w2 * float(predicted[0]),
+        objective=cost + problem.w2 * float(sample.values[0]),
+        error=error,
+        step=step,
+        radius=1.0,
+    )

@@ -1,0 +1,208 @@
+"""The nested formulation: a surrogate of ω_b*(θ), IPOPT on it, truth, refit, until they agree.
+
+ω_b*(θ) has kinks and jumps, which a smooth surrogate cannot follow everywhere. It does not have
+to: each round fits the samples in a trust region around the best verified design, which shrinks
+where the surrogate promised too much, until prediction and truth agree there.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult, Iterate
+from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.outer_problem import (
+    OuterFailure,
+    OuterSolution,
+    nested_program,
+    solve_program,
+)
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, design, fit, to_casadi
+
+STEP = 1e-3  # share of the box below which a step counts as small
+
+
+@dataclass(frozen=True)
+class Nested:
+    """Options of the nested formulation; the defaults are those of a case file.
+
+    `plan`: "grid" (`points` an axis), "sobol" or "lhs" (`points` in all) over θ. `starts` of IPOPT
+    a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
+    rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
+    best.
+
+    >>> Nested(plan="sobol", points=24).starts
+    16
+    """
+
+    plan: str = "grid"
+    points: int = 5
+    starts: int = 16
+    tolerance: float = 1e-3
+    max_refinements: int = 12
+    kernel: str = "matern52"
+
+
+def solve_nested(
+    sampler: Sampler, options: Nested, *, seed: int, given: Surrogates | None = None
+) -> FormulationResult:
+    """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
+
+    With a `given` surrogate the design is what that was fitted to.
+    """
+    problem = sampler.problem
+    lower, upper = box(problem)
+    if given is None:
+        thetas = np.vstack(
+            [design(options.plan, lower, upper, options.points, seed), np.array(problem.start)]
+        )
+        thetas = _allowed(problem, np.unique(thetas, axis=0))
+    else:
+        thetas = given.thetas
+    samples = sampler.bandwidths(thetas)
+    if not any(sample.feasible for sample in samples):
+        return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
+    iterates: list[Iterate] = []
+    radius, agreed = 1.0, False
+    surrogate: GaussianProcess | None = None
+    solution: OuterSolution | None = None
+    for round_number in range(options.max_refinements + 1):
+        best = _best(problem, samples)
+        low, high = _region(problem, best, radius)
+        local = _local(samples, low, high, upper - lower)
+        surrogate = fit_bandwidth(problem, local, seed, options.kernel)
+        program = nested_program(problem, to_casadi(surrogate, std=False))
+        program = replace(program, lower=low, upper=high)
+        try:
+            solution = solve_program(
+                program, _starts(local, low, high, options.starts, seed + round_number)
+            )
+        except OuterFailure:
+            radius *= 0.5
+            continue
+        theta = solution.best.x
+        predicted = float(surrogate.predict(theta[None, :])[0])
+        sample = sampler.bandwidths(theta, f"verifying round {round_number + 1}")[0]
+        iterate = _iterate(problem, best, sample, predicted, radius)
+        iterates.append(iterate)
+        samples.append(sample)
+        improved = iterate.objective < _objective(problem, best)
+        agreed = iterate.error <= options.tolerance
+        settled = abs(iterate.objective - _objective(problem, best)) <= options.tolerance * abs(
+            iterate.objective
+        )
+        if agreed and (iterate.step <= STEP or settled):
+            break
+        if not agreed:
+            radius = max(radius * (0.6 if improved else 0.4), 1e-3)
+            new = design(
+                "lhs",
+                *_region(problem, _best(problem, samples), radius),
+                2 * len(theta) + 1,
+                seed + round_number,
+            )
+            samples += sampler.bandwidths(
+                _allowed(problem, new), f"refining round {round_number + 1}"
+            )
+        elif not improved:
+            radius *= 0.5
+        elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
+            radius = min(1.0, 2.0 * radius)
+    best = _best(problem, samples)
+    x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
+    message = "" if agreed else "prediction and truth did not agree within the budget"
+    assert surrogate is not None
+    return FormulationResult(x, None, tuple(iterates), (surrogate,), solution, agreed, message)
+
+
+def fit_bandwidth(
+    problem: CoDesignProblem, samples: list[BandwidthSample], seed: int, kind: str = "matern52"
+) -> GaussianProcess:
+    """An interpolating Gaussian process of ω_b*(θ) in rad/s over the whole box."""
+    X = np.array([sample.theta for sample in samples])
+    Y = np.array([sample.bandwidth for sample in samples])
+    lower, upper = box(problem)
+    noise = 1e-7 * float(np.abs(Y).max())
+    return best_left_out(
+        fit(X, Y, lower=lower, upper=upper, noise=noise, seed=seed, kernel=kernel)
+        for kernel in kernels_of(kind)
+    )
+
+
+def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
+    """The points with λ(θ) <= 0; all of them where none has."""
+    plant = plant_of(problem)
+    keep = [bool((constraint_values(plant, theta) <= 0.0).all()) for theta in thetas]
+    return thetas[keep] if any(keep) else thetas
+
+
+def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
+    cost = hardware_cost(plant_of(problem), sample.theta)
+    return problem.w1 * cost + problem.w2 * sample.bandwidth
+
+
+def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> BandwidthSample:
+    plant = plant_of(problem)
+    feasible = [sample for sample in samples if sample.feasible]
+    inside = [s for s in feasible if (constraint_values(plant, s.theta) <= 1e-9).all()]
+    return min(inside or feasible, key=lambda sample: _objective(problem, sample))
+
+
+def _region(problem: CoDesignProblem, best: BandwidthSample, radius: float) -> tuple[Array, Array]:
+    lower, upper = box(problem)
+    half = radius * (upper - lower)
+    return np.maximum(lower, best.theta - half), np.minimum(upper, best.theta + half)
+
+
+def _local(
+    samples: list[BandwidthSample], low: Array, high: Array, width: Array
+) -> list[BandwidthSample]:
+    """Feasible samples in the region and a margin; the nearest ones where these are too few."""
+    feasible = list({s.theta: s for s in samples if s.feasible}.values())
+    centre = 0.5 * (low + high)
+
+    def distance(sample: BandwidthSample) -> float:
+        return float(np.abs((np.array(sample.theta) - centre) / width).max())
+
+    reach = 0.75 * float(((high - low) / width).max())
+    near = [sample for sample in feasible if distance(sample) <= reach]
+    enough = 3 * len(low) + 2
+    return near if len(near) >= enough else sorted(feasible, key=distance)[:enough]
+
+
+def _starts(
+    samples: list[BandwidthSample], low: Array, high: Array, count: int, seed: int
+) -> Array:
+    """The best samples inside the region and a Sobol set over it."""
+    inside = [s for s in samples if (low <= s.theta).all() and (s.theta <= high).all()]
+    top = sorted(inside, key=lambda s: -s.bandwidth)[: max(1, count // 4)]
+    spread = design("sobol", low, high, max(count - len(top), 1), seed)
+    return np.vstack([np.array([s.theta for s in top]).reshape(-1, len(low)), spread])
+
+
+def _iterate(
+    problem: CoDesignProblem,
+    best: BandwidthSample,
+    sample: BandwidthSample,
+    predicted: float,
+    radius: float,
+) -> Iterate:
+    lower, upper = box(problem)
+    cost = problem.w1 * hardware_cost(plant_of(problem), sample.theta)
+    error = abs(predicted / sample.bandwidth - 1.0) if sample.feasible else np.inf
+    step = np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max()
+    return Iterate(
+        theta=sample.theta,
+        predicted=predicted,
+        truth=sample.bandwidth,
+        predicted_objective=cost + problem.w2 * predicted,
+        objective=cost + problem.w2 * sample.bandwidth if sample.feasible else np.inf,
+        error=float(error),
+        step=float(step),
+        radius=radius,
+    )

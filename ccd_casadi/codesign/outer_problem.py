@@ -1,0 +1,240 @@
+"""The outer problem in CasADi, solved by IPOPT from many starts.
+
+    min  w1 f(θ) + w2 ω_b   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0        (paper, equation (9))
+
+`nested` puts the surrogate ω_b*(θ) for ω_b; `lifted` has ω_S and ω_T as variables too, with
+‖S‖∞ <= S_max and σ_max(S(jω_low)) <= S_low as explicit constraints on surrogates; `direct` is
+the lifted problem on the true quantities.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sweep import MARGIN
+from ccd_casadi.plants.plant import Plant, constraint_values
+from ccd_casadi.support.arrays import Array
+from surrogates import design
+from surrogates.ipopt import end_points
+
+
+@dataclass(frozen=True)
+class NonlinearProgram:
+    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper, with names for what may bind.
+
+    `g_lower` is minus infinity where it is not given; zero makes an equation of a row.
+    """
+
+    x: ca.MX
+    f: ca.MX
+    g: ca.MX
+    lower: Array
+    upper: Array
+    variables: tuple[str, ...]
+    constraints: tuple[str, ...]
+    exact_hessian: bool = True
+    g_lower: Array | None = None
+
+
+@dataclass(frozen=True)
+class LocalOptimum:
+    """One end point of IPOPT: x, objective, multipliers of g and of the bounds, its verdict."""
+
+    x: Array
+    objective: float
+    multipliers_g: Array
+    multipliers_x: Array
+    status: str
+    converged: bool
+    starts: int = 1
+
+
+@dataclass(frozen=True)
+class OuterSolution:
+    """The best local optimum, all distinct ones (best first), and the number of starts."""
+
+    best: LocalOptimum
+    optima: tuple[LocalOptimum, ...]
+    starts: int
+
+
+class OuterFailure(RuntimeError):
+    """IPOPT converged from no start."""
+
+
+def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> NonlinearProgram:
+    """The outer problem over θ with a surrogate bandwidth(θ) in rad/s."""
+    plant = plant_of(problem)
+    theta = ca.MX.sym("theta", len(problem.names))
+    f, lam = _hardware(plant, theta)
+    return NonlinearProgram(
+        x=theta,
+        f=problem.w1 * f + problem.w2 * bandwidth(theta),
+        g=lam,
+        lower=np.array(problem.lower),
+        upper=np.array(problem.upper),
+        variables=problem.names,
+        constraints=plant.constraint_names,
+        exact_hessian=plant.exact_hessian,
+    )
+
+
+def lifted_program(
+    problem: CoDesignProblem,
+    quantities: ca.Function,
+    *,
+    exact_hessian: bool = True,
+    margin: float = MARGIN,
+) -> NonlinearProgram:
+    """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln‖S‖∞, ln|S(jω_low)|."""
+    plant = plant_of(problem)
+    count = len(problem.names)
+    x = ca.MX.sym("x", count + 2)
+    theta = x[:count]
+    q = quantities(x)
+    f, lam = _hardware(plant, theta)
+    inner = problem.inner
+    levels = np.log([inner.S_max, inner.S_low]) - margin
+    lower, upper = lifted_bounds(problem)
+    return NonlinearProgram(
+        x=x,
+        f=problem.w1 * f + problem.w2 * q[0],
+        g=ca.vertcat(q[1] - levels[0], q[2] - levels[1], lam),
+        lower=lower,
+        upper=upper,
+        variables=(*problem.names, "omega_S", "omega_T"),
+        constraints=("S_max", "S_low", *plant.constraint_names),
+        exact_hessian=exact_hessian and plant.exact_hessian,
+    )
+
+
+def lifted_bounds(problem: CoDesignProblem) -> tuple[Array, Array]:
+    """Bounds of (θ, ln ω_S, ln ω_T)."""
+    inner = problem.inner
+    lower = np.array([*problem.lower, *np.log([inner.omega_S[0], inner.omega_T[0]])])
+    upper = np.array([*problem.upper, *np.log([inner.omega_S[1], inner.omega_T[1]])])
+    return lower, upper
+
+
+def solve_program(
+    program: NonlinearProgram, starts: Array, *, warm: bool = False, tolerance: float = 1e-9
+) -> OuterSolution:
+    """IPOPT from every row of `starts`; variables are scaled to the unit box.
+
+    `warm` starts close to a solution without pushing it into the interior.
+    Raises OuterFailure where no start converges.
+    """
+    width = program.upper - program.lower
+    z = ca.MX.sym("z", program.x.shape[0])
+    inside = program.lower + width * z
+    f, g = ca.substitute([program.f, program.g], [program.x], [inside])
+    options: dict[str, Any] = {"ipopt.tol": tolerance}
+    if not program.exact_hessian:
+        options["ipopt.hessian_approximation"] = "limited-memory"
+        # The true quantities carry rounding: there is no use in chasing the last digits.
+        options["ipopt.acceptable_iter"] = 4
+    if warm:
+        options |= {
+            "ipopt.warm_start_init_point": "yes",
+            "ipopt.mu_init": 1e-7,
+            "ipopt.bound_push": 1e-10,
+            "ipopt.bound_frac": 1e-10,
+            "ipopt.warm_start_bound_push": 1e-10,
+            "ipopt.warm_start_bound_frac": 1e-10,
+            "ipopt.warm_start_slack_bound_push": 1e-10,
+            "ipopt.warm_start_slack_bound_frac": 1e-10,
+            "ipopt.warm_start_mult_bound_push": 1e-10,
+        }
+    found = [
+        LocalOptimum(
+            x=program.lower + width * end.z,
+            objective=end.objective,
+            multipliers_g=end.multipliers_g,
+            multipliers_x=end.multipliers_z / width,
+            status=end.status,
+            converged=end.converged,
+        )
+        for end in end_points(
+            {"x": z, "f": f, "g": g},
+            (np.atleast_2d(starts) - program.lower) / width,
+            options,
+            -np.inf if program.g_lower is None else program.g_lower,
+        )
+    ]
+    converged = [item for item in found if item.converged]
+    if not converged:
+        raise OuterFailure(f"IPOPT converged from none of {len(found)} starts: {found[0].status}")
+    optima = _distinct(converged, width)
+    return OuterSolution(optima[0], tuple(optima), len(found))
+
+
+def _distinct(found: list[LocalOptimum], width: Array) -> list[LocalOptimum]:
+    """End points closer than 1e-4 of the box are one optimum; best objective first."""
+    kept: list[LocalOptimum] = []
+    for item in sorted(found, key=lambda item: item.objective):
+        for i, other in enumerate(kept):
+            if np.abs((item.x - other.x) / width).max() < 1e-4:
+                kept[i] = LocalOptimum(**{**vars(other), "starts": other.starts + 1})
+                break
+        else:
+            kept.append(item)
+    return kept
+
+
+def active_bounds(program: NonlinearProgram, x: Array, tolerance: float = 1e-6) -> tuple[str, ...]:
+    """Names of the bounds that bind at x, within a share `tolerance` of the box."""
+    width = program.upper - program.lower
+    return tuple(
+        f"{name} {end}"
+        for i, name in enumerate(program.variables)
+        for end, bound in (("lower", program.lower[i]), ("upper", program.upper[i]))
+        if abs(x[i] - bound) <= tolerance * width[i]
+    )
+
+
+def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
+    """Empty where some θ in its box meets λ(θ) <= 0; else which constraint fails, and by how much.
+
+    Minimises the largest λ, so that the words name what stands nearest to being met.
+    """
+    plant = plant_of(problem)
+    if not plant.constraint_names:
+        return ""
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    points = np.vstack([np.array(problem.start), design("sobol", lower, upper, starts, seed)])
+    values = np.array([constraint_values(plant, point) for point in points])
+    if (values <= 0.0).all(axis=1).any():
+        return ""
+    theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
+    lam = _hardware(plant, theta)[1]
+    size = float(np.abs(values).max())
+    program = NonlinearProgram(
+        x=ca.vertcat(theta, slack),
+        f=slack,
+        g=lam / size - slack,
+        lower=np.append(lower, -2.0),
+        upper=np.append(upper, 2.0),
+        variables=(*problem.names, "slack"),
+        constraints=plant.constraint_names,
+        exact_hessian=plant.exact_hessian,
+    )
+    try:
+        best = solve_program(program, np.column_stack([points, np.ones(len(points))])).best.x[:-1]
+    except OuterFailure:
+        best = points[np.argmin(values.max(axis=1))]
+    found = constraint_values(plant, best)
+    worst = int(np.argmax(found))
+    if found[worst] <= 1e-9 * size:
+        return ""
+    return (
+        f"constraint {plant.constraint_names[worst]} cannot be met in the bounds of theta: its "
+        f"least value found is {found[worst]:.4g}, above 0"
+    )
+
+
+def _hardware(plant: Plant, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
+    f, lam = plant.hardware(theta)
+    return f, lam

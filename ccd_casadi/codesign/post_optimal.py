@@ -1,0 +1,165 @@
+"""How the optimum answers to what was given: S_max, S_low, λ <= 0, every bound, w1 and w2.
+
+At a design that satisfies the optimality conditions of the true problem
+
+    L(x, μ) = J(x) + Σ μ_i g_i(x),    ∇L = 0,   g_A = 0,
+
+the implicit function theorem gives, for a parameter p of the case,
+
+    [∇²L  Aᵀ] [dx/dp]     [∂∇L/∂p]
+    [ A   0 ] [dμ/dp] = - [∂g_A/∂p],     dJ*/dp = ∂L/∂p
+
+(Fiacco 1976). ∇²L comes from differences of the true total derivatives. It holds as long as the
+constraints with positive multipliers stay the ones that bind.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import null_space
+
+from ccd_casadi.codesign.kkt import (
+    KktCertificate,
+    kkt_certificate,
+    lagrangian_hessian,
+    lagrangian_parts,
+)
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.support.arrays import Array
+
+WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
+
+
+@dataclass(frozen=True)
+class Response:
+    """Derivatives of the optimum to one parameter of the case, per unit of it.
+
+    Of J*, ω_b (rad/s), f, θ and (ln ω_S, ln ω_T). `value` is the parameter's own; bounds on ω_S
+    and ω_T count in rad/s.
+    """
+
+    parameter: str
+    value: float
+    objective: float
+    bandwidth: float
+    hardware_cost: float
+    theta: tuple[float, ...]
+    ln_omega: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class PostOptimal:
+    """The responses, the certificate that they rest on, and whether they are determined.
+
+    `weak` names what touches without a multiplier: across it a response is one-sided. Where
+    `determined` is False (dependent constraints, no second-order minimum) only dJ*/dp is given.
+    """
+
+    responses: tuple[Response, ...]
+    kkt: KktCertificate
+    weak: tuple[str, ...]
+    determined: bool
+
+
+@dataclass(frozen=True)
+class _Parameter:
+    """∂∇J/∂p (n, unit box), ∂g/∂p by constraint, and ∂J/∂p at a fixed x."""
+
+    name: str
+    value: float
+    gradient: Array
+    levels: Mapping[str, float] = field(default_factory=dict)
+    cost: float = 0.0
+
+
+def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
+    """Responses at an optimum x = (θ, ln ω_S, ln ω_T) of the true problem.
+
+    Costs 2n true syntheses for n variables, none where the constraints alone determine x.
+    """
+    quantities = TrueQuantities(problem)
+    design = quantities.at(x)
+    n = x.size
+    kkt = kkt_certificate(problem, x, design)
+    _, _, jacobian, names = lagrangian_parts(problem, x, design)
+    size = float(np.abs(kkt.objective_gradient).max())
+    strong = [name for name in kkt.active if kkt.multipliers[name] > WEAK * size]
+    rows = dict(zip(names, jacobian, strict=True)) | _bound_rows(problem)
+    A = np.array([rows[name] for name in strong]).reshape(-1, n)
+    Z = null_space(A) if len(A) else np.eye(n)
+    determined = Z.shape[1] == n - len(A)
+    H = np.zeros((n, n))
+    if Z.shape[1]:
+        columns = lagrangian_hessian(problem, x, np.eye(n), kkt.multipliers, quantities.at)
+        H = np.full((n, n), np.nan) if columns is None else 0.5 * (columns + columns.T)
+        reduced = Z.T @ H @ Z
+        determined &= bool(np.isfinite(H).all() and np.linalg.eigvalsh(reduced).min() > 0.0)
+    lower, upper = lifted_bounds(problem)
+    slope_b = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
+    slope_f = _hardware_slope(problem, x) * (upper - lower)
+    system = np.block([[H, A.T], [A, np.zeros((len(A), len(A)))]])
+    responses = []
+    for parameter in _parameters(problem, x, design.values[0], slope_f, slope_b):
+        dz = np.full(n, np.nan)
+        if determined:
+            level = [parameter.levels.get(name, 0.0) for name in strong]
+            dz = np.linalg.solve(system, -np.concatenate([parameter.gradient, level]))[:n]
+        dx = dz * (upper - lower)
+        change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
+        responses.append(
+            Response(
+                parameter=parameter.name,
+                value=parameter.value,
+                objective=float(parameter.cost + change),
+                bandwidth=float(slope_b @ dz),
+                hardware_cost=float(slope_f @ dz),
+                theta=tuple(map(float, dx[:-2])),
+                ln_omega=tuple(map(float, dx[-2:])),
+            )
+        )
+    weak = tuple(name for name in kkt.active if name not in strong)
+    return PostOptimal(tuple(responses), kkt, weak, determined)
+
+
+def _parameters(
+    problem: CoDesignProblem, x: Array, bandwidth: float, slope_f: Array, slope_b: Array
+) -> Iterator[_Parameter]:
+    """w1, w2, S_max, S_low, the level of each λ, and the bounds of θ, ω_S, ω_T."""
+    none = np.zeros(x.size)
+    cost = float(plant_of(problem).hardware(x[: len(problem.names)])[0])
+    yield _Parameter("w1", problem.w1, slope_f, cost=cost)
+    yield _Parameter("w2", problem.w2, slope_b, cost=float(bandwidth))
+    inner = problem.inner
+    yield _Parameter("S_max", inner.S_max, none, {"S_max": -1.0 / inner.S_max})
+    yield _Parameter("S_low", inner.S_low, none, {"S_low": -1.0 / inner.S_low})
+    for name in plant_of(problem).constraint_names:
+        yield _Parameter(f"{name} <= 0", 0.0, none, {name: -1.0})
+    lower, upper = lifted_bounds(problem)
+    for i, name in enumerate((*problem.names, "omega_S", "omega_T")):
+        for end, bound, sign in (("lower", lower[i], 1.0), ("upper", upper[i], -1.0)):
+            value = float(np.exp(bound)) if i >= x.size - 2 else float(bound)
+            unit = value if i >= x.size - 2 else 1.0  # d ln ω = dω/ω
+            slope = sign / (unit * (upper[i] - lower[i]))
+            yield _Parameter(f"{name} {end}", value, none, {f"{name} {end}": slope})
+
+
+def _bound_rows(problem: CoDesignProblem) -> dict[str, Array]:
+    """∇g of the bounds in unit-box variables."""
+    names = (*problem.names, "omega_S", "omega_T")
+    unit = np.eye(len(names))
+    return {f"{n} lower": -unit[i] for i, n in enumerate(names)} | {
+        f"{n} upper": unit[i] for i, n in enumerate(names)
+    }
+
+
+def _hardware_slope(problem: CoDesignProblem, x: Array) -> Array:
+    """∇f over x; ω_S and ω_T have no part in it."""
+    count = len(problem.names)
+    theta = ca.SX.sym("theta", count)
+    f, _ = plant_of(problem).hardware(theta)
+    slope = ca.Function("slope", [theta], [ca.jacobian(f, theta)])
+    return np.append(np.array(slope(x[:count])).ravel(), [0.0, 0.0])

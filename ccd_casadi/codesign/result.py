@@ -1,0 +1,217 @@
+"""The run folder's JSON files: result.json and controller.json."""
+
+import importlib.metadata
+import json
+import math
+import platform
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.kkt import KktCertificate
+from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import DesignFigures
+from surrogates.files import write_whole
+
+PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
+
+
+def figures_dict(figures: DesignFigures) -> dict[str, Any]:
+    """One design's figures under the contract's keys."""
+    return {
+        "omega_S_hz": figures.omega_S / HZ,
+        "omega_T_hz": figures.omega_T / HZ,
+        "outcome": figures.outcome.name.lower(),
+        "reason": figures.outcome.value,
+        "bandwidth_hz": figures.bandwidth / HZ,
+        "gamma_opt": figures.gamma_opt,
+        "gamma": figures.gamma,
+        "gamma_lower_bound": figures.gamma_lower_bound,
+        "sensitivity_peak": figures.sensitivity_peak,
+        "sensitivity_peak_hz": figures.sensitivity_peak_frequency / HZ,
+        "sensitivity_low": figures.sensitivity_low,
+        "certificate": asdict(figures.certificate),
+    }
+
+
+def result_dict(
+    problem: CoDesignProblem,
+    formulation: str,
+    outcome: FormulationResult,
+    verified: VerifiedDesign,
+    *,
+    tolerance: float,
+    syntheses: int,
+    seconds: float,
+    seed: int,
+) -> dict[str, Any]:
+    """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
+    figures = verified.design.figures
+    predicted = predicted_bandwidth(outcome, verified)
+    error = abs(predicted / figures.bandwidth - 1.0)
+    checks = {
+        "certificate": figures.certified,
+        "constraints": verified.feasible,
+        "prediction": bool(error <= tolerance),
+        "inner_optimum": bool(verified.inner_gap <= tolerance),
+    }
+    if verified.robust is not None:
+        checks["robust"] = verified.robust.passed
+    failed = [name for name, passed in checks.items() if not passed]
+    reason = "" if not failed else "failed: " + ", ".join(failed)
+    result = {
+        **figures_dict(figures),
+        "status": "not_verified" if failed else "verified",
+        "reason": "; ".join(part for part in (reason, outcome.message) if part),
+        "formulation": formulation,
+        "theta": dict(zip(problem.names, verified.theta, strict=True)),
+        "units": dict(zip(problem.names, problem.units, strict=True)),
+        "objective": verified.objective,
+        "hardware_cost": verified.hardware_cost,
+        "surrogate_bandwidth_hz": predicted / HZ,
+        "verification_error": error,
+        "checks": checks,
+        "active": list(verified.active),
+        "inner_gap": verified.inner_gap,
+        "kkt": _kkt(verified.kkt),
+        "globality": _globality(outcome.outer),
+        "without_suspension": {
+            "stable": verified.unsuspended.certificate.stable,
+            "bandwidth_hz": verified.unsuspended.bandwidth / HZ,
+            "sensitivity_peak": verified.unsuspended.sensitivity_peak,
+        },
+        "references": {
+            check.name: {
+                "certified": check.certified,
+                "reason": check.outcome.value,
+                "stable": check.figures.certificate.stable,
+                "bandwidth_hz": check.figures.bandwidth / HZ,
+                "sensitivity_peak": check.figures.sensitivity_peak,
+                "gamma": check.figures.gamma,
+            }
+            for check in verified.references
+        },
+        **_robust(verified.robust),
+        "notes": list(plant_of(problem).notes(verified.theta)),
+        "iterates": [asdict(iterate) for iterate in outcome.iterates],
+        "syntheses": syntheses,
+        "seconds": seconds,
+        "seed": seed,
+        "versions": versions(),
+    }
+    return clean(result)
+
+
+def infeasible_dict(
+    formulation: str, reason: str, *, syntheses: int, seconds: float, seed: int
+) -> dict[str, Any]:
+    """result.json where no certified design meets the constraints."""
+    return {
+        "status": "infeasible",
+        "reason": reason,
+        "formulation": formulation,
+        "syntheses": syntheses,
+        "seconds": seconds,
+        "seed": seed,
+        "versions": versions(),
+    }
+
+
+def predicted_bandwidth(outcome: FormulationResult, verified: VerifiedDesign) -> float:
+    """What the last surrogate says at the verified design, rad/s.
+
+    Without a surrogate: the truth at IPOPT's own optimum, or at the design itself where IPOPT
+    found none.
+    """
+    if not outcome.surrogates:
+        made = verified.design if outcome.design is None else outcome.design
+        return made.figures.bandwidth
+    process = outcome.surrogates[0]
+    x = verified.x[: process.lower.size]
+    return float(process.predict(x[None, :])[0])
+
+
+def controller_dict(controller: StateSpace) -> dict[str, Any]:
+    """controller.json: row-major lists, SI, input e = r - y, output u."""
+    return {
+        "A": controller.A.tolist(),
+        "B": controller.B.tolist(),
+        "C": controller.C.tolist(),
+        "D": controller.D.tolist(),
+        "input": "e = r - y",
+        "output": "u",
+        "units": "SI, time in s",
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of what the numbers depend on."""
+    found = {"python": platform.python_version(), "ccd-casadi": _version("ccd-casadi")}
+    return found | {name: _version(name) for name in PACKAGES}
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
+    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
+
+
+def clean(value: Any) -> Any:
+    """Plain JSON values: tuples to lists, NumPy scalars to numbers, what is not finite to None."""
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _kkt(certificate: KktCertificate) -> dict[str, Any]:
+    second = certificate.second_order
+    return asdict(certificate) | {
+        "second_order": None if second is None or math.isinf(second) else second,
+        "vertex": second is not None and math.isinf(second),
+    }
+
+
+def _robust(check: RobustCheck | None) -> dict[str, Any]:
+    """What a robust design does on its nominal plant and on a dense set; nothing for others."""
+    if check is None:
+        return {}
+    return {
+        "robust": {
+            "nominal_sensitivity_peak": check.nominal.sensitivity_peak,
+            "stable": check.worst.certificate.stable,
+            "worst_sensitivity_peak": check.worst.sensitivity_peak,
+            "worst_shift": check.at.shift,
+            "worst_damping": check.at.damping,
+            "plants": check.plants,
+        }
+    }
+
+
+def _globality(solution: OuterSolution | None) -> dict[str, Any]:
+    """Starts tried, distinct local optima of the last problem solved, the best J of each."""
+    if solution is None:
+        return {"starts": 0, "optima": []}
+    return {
+        "starts": solution.starts,
+        "optima": [
+            {"objective": item.objective, "starts": item.starts, "x": item.x.tolist()}
+            for item in solution.optima
+        ],
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,222 @@
+"""The truth of a run folder as `surrogates.retrain` asks for it (entry point "ccd_casadi").
+
+Lifted (and direct): x = (θ, ln ω_S, ln ω_T), y = (ω_b, ln‖S‖∞, ln σ_max(S(jω_low))) with gradients.
+Nested: x = θ, y = ω_b*(θ).
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
+from ccd_casadi.codesign.run import Solution, conclude, rescue, write_run
+from ccd_casadi.codesign.stored import stored_designs, stored_thetas
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.sampling.cluster import pool
+from ccd_casadi.sampling.sampler import BandwidthSample, QuantitySample, Sampler, quantity_sample
+from ccd_casadi.sampling.store import SampleStore, problem_hash
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.process_pool import PATIENCE, WorkerLost
+from ccd_casadi.support.user_code import permit_user_code
+from surrogates import GaussianProcess
+from surrogates.truth import NAMES, Observations, TruthError, TruthInterrupted
+
+OUTPUTS = ("bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low")
+PageWriter = Callable[[Path, Case, CoDesignProblem, Solution], object]
+CLOSE = 1e-2  # of the box: a verified design so near is where the next verification starts
+
+
+@contextmanager
+def open_run(
+    folder: Path,
+    *,
+    tolerance: float | None,
+    workers: int,
+    seed: int,
+    quiet: bool,
+    user_code: bool = True,
+    scheduler: str | None = None,
+    write_page: PageWriter,
+) -> Iterator["CoDesignTruth"]:
+    """The truth of a run folder; `write_page` draws its report. Raises TruthError."""
+    with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
+        case = load_case(folder / "case.toml")
+        problem = problem_of(case)
+        formulation = _formulation(folder)
+        with (
+            pool(scheduler, workers, PATIENCE) as evaluators,
+            SampleStore(folder / "samples.sqlite") as store,
+        ):
+            sampler = Sampler(problem, store, evaluators, quiet=quiet)
+            yield CoDesignTruth(folder, case, sampler, formulation, write_page, tolerance, seed)
+
+
+class CoDesignTruth:
+    """One run's problem behind its store; see `surrogates.truth.Truth`."""
+
+    def __init__(
+        self,
+        folder: Path,
+        case: Case,
+        sampler: Sampler,
+        formulation: str,
+        write_page: PageWriter,
+        tolerance: float | None = None,
+        seed: int = 0,
+    ) -> None:
+        problem = sampler.problem
+        self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
+        self.write_page = write_page
+        self.nested = formulation == "nested"
+        self.formulation = "nested" if self.nested else "lifted"
+        self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
+        self.outputs = OUTPUTS[:1] if self.nested else OUTPUTS
+        self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
+        self.tolerance = case.outer.tolerance if tolerance is None else tolerance
+        self.objective, self.constraints = _functions(problem, self.nested)
+        self.describe = {"formulation": self.formulation, "outputs": list(self.outputs)}
+
+    @property
+    def spent(self) -> int:
+        """Syntheses in the store, of whatever job."""
+        return self.sampler.store.count(self.sampler.hash)
+
+    def samples(self) -> Observations:
+        """What the store holds inside the box, oldest first."""
+        problem = self.sampler.problem
+        if self.nested:
+            known = stored_thetas(self.sampler.store, problem)
+            return self._bandwidths(self.sampler.bandwidths(known) if len(known) else [])
+        count = len(problem.names)
+        designs = stored_designs(self.sampler.store, problem)
+        return self._quantities([quantity_sample(tuple(x), row, count) for x, row in designs])
+
+    def evaluate(self, X: Array) -> Observations:
+        """New syntheses, through the store."""
+        if self.nested:
+            return self._bandwidths(self.sampler.bandwidths(X, "retraining"))
+        return self._quantities(self.sampler.quantities(X, "retraining"))
+
+    def finish(
+        self, x: Array | None, surrogates: Sequence[GaussianProcess], version: str | None
+    ) -> str:
+        """Verify as `solve` does and rewrite the run folder, unless this was done already."""
+        began = perf_counter()
+        mark = {"case": problem_hash({"text": case_to_toml(self.case)}), "version": version,
+                "tolerance": self.tolerance}  # fmt: skip
+        before = self._before(mark)
+        if before is not None and before["retraining"] == mark | {"x": before["retraining"]["x"]}:
+            return str(before["status"])
+        start = None if x is None else self._start(x, before)
+        processes = tuple(surrogates)
+        outcome = FormulationResult(start, None, (), processes, None, True, "")
+        if start is None:
+            words = unmet_constraint(self.sampler.problem, self.case.outer.starts, self.seed)
+            outcome = replace(outcome, message=words)
+            if not words:
+                outcome = rescue(self.sampler, outcome, self.seed)
+        solution = conclude(
+            self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
+        )
+        result = solution.result
+        verified = solution.verified
+        result["syntheses"] = self.spent
+        result["retraining"] = mark | {"x": None if verified is None else verified.x.tolist()}
+        write_run(self.folder, self.case, solution)
+        self.write_page(self.folder, self.case, self.sampler.problem, solution)
+        return str(result["status"])
+
+    def _before(self, mark: dict[str, Any]) -> dict[str, Any] | None:
+        """The result of an earlier verification of the same case."""
+        try:
+            found = json.loads((self.folder / "result.json").read_text())
+            known = found["retraining"]["case"] == mark["case"]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return found if known and (self.folder / "report.html").exists() else None
+
+    def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
+        """Where to verify: x with its break frequencies, or the verified design that is by it."""
+        problem = self.sampler.problem
+        if self.nested:
+            inner = self.sampler.bandwidths(x, "verifying")[0]
+            if not inner.feasible:
+                lower, upper = lifted_bounds(problem)
+                return np.array([*x, *(0.5 * (lower + upper))[-2:]])
+            x = np.array([*inner.theta, np.log(inner.omega_S), np.log(inner.omega_T)])
+        if before is not None and before["retraining"]["x"] is not None:
+            old = np.array(before["retraining"]["x"])
+            lower, upper = lifted_bounds(problem)
+            if np.abs((old - x) / (upper - lower)).max() <= CLOSE:
+                return old
+        return x
+
+    def _quantities(self, samples: list[QuantitySample]) -> Observations:
+        d = len(self.lower)
+        X = np.array([s.x for s in samples]).reshape(-1, d)
+        Y = np.array([s.values[:3] for s in samples]).reshape(-1, 3)
+        dY = np.array([s.gradients[:3] for s in samples]).reshape(-1, 3, d)
+        Y[[not s.certified for s in samples]] = np.nan
+        return Observations(X, Y, dY)
+
+    def _bandwidths(self, samples: list[BandwidthSample]) -> Observations:
+        X = np.array([s.theta for s in samples]).reshape(-1, len(self.lower))
+        return Observations(X, np.array([[s.bandwidth] for s in samples]).reshape(-1, 1))
+
+
+def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.Function]:
+    """J(x, y) = w1 f(θ) + w2 ω_b, and g(x, y): ln S_max and ln S_low where lifted, and λ(θ)."""
+    plant = plant_of(problem)
+    count = len(problem.names)
+    x = ca.MX.sym("x", count + (0 if nested else 2))
+    y = ca.MX.sym("y", 1 if nested else 3)
+    f, lam = plant.hardware(x[:count])
+    middle = np.array([problem.lower, problem.start, problem.upper])
+    sizes = np.array([np.abs(constraint_values(plant, theta)) for theta in middle])
+    g = lam / ca.DM(np.maximum(sizes.max(axis=0), 1e-300)) if lam.numel() else ca.MX(0, 1)
+    if not nested:
+        levels = np.log([problem.inner.S_max, problem.inner.S_low])
+        g = ca.vertcat(y[1] - levels[0], y[2] - levels[1], g)
+    J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])
+    return J, ca.Function("constraints", [x, y], [g])
+
+
+def _formulation(folder: Path) -> str:
+    """As truth.json says, else lifted."""
+    try:
+        found = json.loads((folder / NAMES).read_text())
+    except FileNotFoundError:
+        return "lifted"
+    formulation = found.get("formulation", "lifted")
+    if formulation not in ("nested", "lifted", "direct"):
+        raise TruthError(
+            f"{folder / NAMES}: formulation: {formulation!r:.60} is unknown; give nested or lifted"
+        )
+    return str(formulation)
+
+
+@contextmanager
+def _worded() -> Iterator[None]:
+    """Our errors as those that a retraining job knows."""
+    try:
+        yield
+    except PlantError as error:
+        raise TruthError(f"case.toml: plant: {error}") from error
+    except UserError as error:
+        raise TruthError(str(error)) from error
+    except WorkerLost as error:
+        raise TruthInterrupted(str(error)) from error

@@ -1,0 +1,121 @@
+"""The sequential baseline: hardware first, by a rule of thumb, then the controller once.
+
+    min f(θ)  s.t.  first resonance >= f_1,  θ_min <= θ <= θ_max,  λ(θ) <= 0
+
+with exact eigenvalue derivatives dλ_1 = φᵀ(dK - λ_1 dM)φ, and then the inner problem at that θ.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.process_pool import Pool, Workers
+from surrogates import design
+
+
+@dataclass(frozen=True)
+class HardwareDesign:
+    """The hardware that the rule of thumb gives; resonance in rad/s; `met` False: none meets it."""
+
+    theta: tuple[float, ...]
+    hardware_cost: float
+    first_resonance: float
+    met: bool
+
+
+def first_resonance(problem: CoDesignProblem, theta: Array) -> tuple[float, Array]:
+    """ω_1 of the first flexible mode, rad/s, and its gradient to θ; NaN where all is rigid."""
+    modal = modal_plant(mechanics(plant_of(problem), tuple(theta)), problem.suspension)
+    flexible = np.flatnonzero(~modal.rigid)
+    if flexible.size == 0:
+        return np.nan, np.full(len(theta), np.nan)
+    i = int(flexible[0])
+    omega = float(modal.natural[i])
+    slope = modal.dK[:, i, i] - omega**2 * modal.dM[:, i, i]
+    return omega, slope / (2.0 * omega)
+
+
+class FirstResonance(VectorCallback):
+    """ln(ω_1/ω_ref) of θ with its Jacobian; repeated points cost nothing."""
+
+    def __init__(self, problem: CoDesignProblem, reference: float) -> None:
+        self.problem, self.reference = problem, reference
+        self._known: dict[bytes, tuple[float, Array]] = {}
+        super().__init__("first_resonance", len(problem.names), 1, self.values, self.jacobian_at)
+
+    def at(self, theta: Array) -> tuple[float, Array]:
+        """ω_1 in rad/s and its gradient."""
+        key = theta.tobytes()
+        if key not in self._known:
+            self._known[key] = first_resonance(self.problem, theta)
+        return self._known[key]
+
+    def values(self, x: Array) -> Array:
+        """(1,) ln(ω_1/ω_ref)."""
+        return np.array([np.log(self.at(x)[0] / self.reference)])
+
+    def jacobian_at(self, x: Array) -> Array:
+        """(1, n_θ) derivatives."""
+        omega, slope = self.at(x)
+        return slope[None, :] / omega
+
+
+def design_hardware(
+    problem: CoDesignProblem,
+    resonance: float,
+    *,
+    starts: int = 8,
+    seed: int = 0,
+    workers: Pool | None = None,
+) -> HardwareDesign:
+    """The least hardware cost with ω_1 >= `resonance` (rad/s), by IPOPT.
+
+    From the case's start and `starts` more: with none, the local solution next to the start,
+    which need not be the least one (for the two masses it is the paper's equal-mass design).
+    """
+    lower, upper = box(problem)
+    points = np.array([problem.start])
+    if starts > 0:
+        points = np.vstack([points, design("sobol", lower, upper, starts, seed)])
+    tasks = [(problem, resonance, tuple(float(v) for v in point)) for point in points]
+    pool: Pool = Workers(1) if workers is None else workers
+    found = sorted(pool.map_unordered(_from_start, tasks), key=lambda item: item.theta)
+    meeting = [item for item in found if item.met]
+    if meeting:
+        return min(meeting, key=lambda item: item.hardware_cost)
+    return max(found, key=lambda item: item.first_resonance)
+
+
+def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> HardwareDesign:
+    problem, resonance, start = task
+    lower, upper = box(problem)
+    plant = plant_of(problem)
+    theta = ca.MX.sym("theta", len(lower))
+    cost, lam = plant.hardware(theta)
+    callback = FirstResonance(problem, resonance)
+    program = NonlinearProgram(
+        x=theta,
+        f=cost / (abs(hardware_cost(plant, start)) or 1.0),
+        g=ca.vertcat(-callback(theta), lam),
+        lower=lower,
+        upper=upper,
+        variables=problem.names,
+        constraints=("first_resonance", *plant.constraint_names),
+        exact_hessian=False,
+    )
+    try:
+        point = solve_program(program, np.array([start]), warm=True).best.x
+    except OuterFailure:
+        point = np.array(start)
+    omega = callback.at(point)[0]
+    allowed = bool((constraint_values(plant, point) <= 1e-9).all())
+    met = bool(omega >= resonance * (1.0 - 1e-6)) and allowed
+    value = hardware_cost(plant, point)
+    return HardwareDesign(tuple(float(v) for v in point), value, omega, met)

@@ -1,0 +1,204 @@
+"""The paper's own method: nested steepest descent on a swept inner problem, the baseline.
+
+At the first θ the sweep covers the whole box of (ω_S, ω_T), afterwards a small range around the
+last optimum (paper, section 3.1.2). The gradient of J is the paper's equation (10),
+
+    ∂J/∂θ = w1 ∂f/∂θ + w2 ∂ω_b/∂θ,
+    ∂ω_b/∂θ = -(∂‖S‖₂/∂θ)/(∂‖S‖₂/∂ω_b)             (11, implicit functions)
+    ∂‖S‖₂/∂p = Re(u1* ∂S/∂p v1)                     (12, 13: singular vectors)
+    ∂S/∂θ = -(I+GK)⁻¹ (∂G/∂θ) K (I+GK)⁻¹            (14: K held fixed)
+    ∂S/∂ω_b = -(I+GK)⁻¹ (G'K + GK') (I+GK)⁻¹        (15)
+
+as `derivatives.Sensitivities.fixed_controller` gives it. The variant "total" has K move with θ.
+
+What the paper leaves open, and what is done here: θ is scaled to the unit box; a step goes along
+-∇J/‖∇J‖∞ with length α, projected on the bounds; α is halved when the step does not improve J,
+and the descent ends when α falls under `smallest_step` of the box, when the projected gradient
+vanishes, or after `max_iterations`. The synthesis, its certificate, S_max and the case are ours.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sweep import evaluate
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
+
+LOCAL_POINTS = (7, 7)
+LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
+
+
+class Gradient(StrEnum):
+    """Which dω_b/dθ the descent follows."""
+
+    FIXED = "fixed"
+    TOTAL = "total"
+
+
+class Stop(StrEnum):
+    """Why a descent ended."""
+
+    SMALL_STEP = "no step down to the smallest improves J"
+    STATIONARY = "the projected gradient vanishes"
+    ITERATIONS = "the iteration limit"
+    INFEASIBLE = "no swept design meets S_max and S_low at the start"
+
+
+@dataclass(frozen=True)
+class DescentIterate:
+    """One accepted point: θ, swept optimum (rad/s), J, ∂J/∂θ in the unit box, α, cost so far."""
+
+    theta: tuple[float, ...]
+    omega_S: float
+    omega_T: float
+    bandwidth: float
+    objective: float
+    gradient: tuple[float, ...]
+    step: float
+    syntheses: int
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A whole descent: its history, its last design, and why it ended."""
+
+    gradient: Gradient
+    start: tuple[float, ...]
+    first_step: float
+    iterates: tuple[DescentIterate, ...]
+    design: Sensitivities | None
+    stop: Stop
+    syntheses: int
+    seconds: float = 0.0
+
+    @property
+    def objective(self) -> float:
+        """J at the end; infinite where no feasible start was found."""
+        return self.iterates[-1].objective if self.iterates else np.inf
+
+
+def steepest_descent(
+    problem: CoDesignProblem,
+    start: Sequence[float],
+    *,
+    gradient: Gradient = Gradient.FIXED,
+    first_step: float = 0.05,
+    smallest_step: float = 1e-3,
+    max_iterations: int = 100,
+) -> Descent:
+    """Descend from `start`; steps are shares of the box of θ."""
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    width = upper - lower
+    slope = _cost_gradient(problem)
+    spent = 0
+
+    def swept(theta: Array, around: tuple[float, float] | None) -> Sensitivities | None:
+        nonlocal spent
+        found, used = _sweep(problem, theta, around)
+        spent += used
+        return found
+
+    theta = np.array(start, float)
+    design = swept(theta, None)
+    if design is None:
+        return Descent(gradient, tuple(start), first_step, (), None, Stop.INFEASIBLE, spent)
+    step, history = first_step, []
+    stop = Stop.ITERATIONS
+    for _ in range(max_iterations):
+        bandwidth_slope = (
+            design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
+        )
+        g = (problem.w1 * slope(theta) + problem.w2 * bandwidth_slope) * width
+        history.append(_iterate(problem, theta, design, g, step, spent))
+        blocked = ((theta <= lower) & (g > 0.0)) | ((theta >= upper) & (g < 0.0))
+        direction = np.where(blocked, 0.0, -g)
+        size = float(np.abs(direction).max())
+        if size <= 1e-9 * max(float(np.abs(g).max()), 1e-300):
+            stop = Stop.STATIONARY
+            break
+        figures = design.figures
+        accepted = None
+        while step >= smallest_step:
+            trial = np.clip(theta + step * direction / size * width, lower, upper)
+            found = swept(trial, (figures.omega_S, figures.omega_T))
+            if found is not None and _objective(problem, trial, found) < history[-1].objective:
+                accepted = trial, found
+                break
+            step *= 0.5
+        if accepted is None:
+            stop = Stop.SMALL_STEP
+            break
+        theta, design = accepted
+    return Descent(gradient, tuple(start), first_step, tuple(history), design, stop, spent)
+
+
+def _sweep(
+    problem: CoDesignProblem, theta: Array, around: tuple[float, float] | None
+) -> tuple[Sensitivities | None, int]:
+    """The best feasible design of a sweep, wide or small; and the syntheses that it took."""
+    inner = problem.inner
+    local = inner
+    if around is not None:
+        ranges = [
+            (max(low, centre / LOCAL_FACTOR), min(high, centre * LOCAL_FACTOR))
+            for (low, high), centre in zip((inner.omega_S, inner.omega_T), around, strict=True)
+        ]
+        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
+    plant = scaled_plant(problem, tuple(theta))
+    rows = sweep(
+        plant,
+        problem.weights,
+        *local.axes(),
+        omega_low=inner.omega_low,
+        gamma_backoff=inner.gamma_backoff,
+    )
+    feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]
+    if not feasible:
+        if around is None:
+            return None, len(rows)
+        wide, used = _sweep(problem, theta, None)
+        return wide, used + len(rows)
+    best = max(feasible, key=lambda row: row.bandwidth)
+    # The derivative at the swept optimum is no new synthesis: the paper has K at hand too.
+    return evaluate(plant, problem.weights, inner, (best.omega_S, best.omega_T)), len(rows)
+
+
+def _cost_gradient(problem: CoDesignProblem) -> Callable[[Array], Array]:
+    """∂f/∂θ from the CasADi expression."""
+    symbol = ca.MX.sym("theta", len(problem.names))
+    f, _ = plant_of(problem).hardware(symbol)
+    function = ca.Function("slope", [symbol], [ca.jacobian(f, symbol)])
+    return lambda theta: np.array(function(theta)).ravel()
+
+
+def _objective(problem: CoDesignProblem, theta: Array, design: Sensitivities) -> float:
+    cost = hardware_cost(plant_of(problem), theta)
+    return problem.w1 * cost + problem.w2 * design.figures.bandwidth
+
+
+def _iterate(
+    problem: CoDesignProblem,
+    theta: Array,
+    design: Sensitivities,
+    gradient: Array,
+    step: float,
+    spent: int,
+) -> DescentIterate:
+    figures = design.figures
+    return DescentIterate(
+        theta=tuple(float(v) for v in theta),
+        omega_S=figures.omega_S,
+        omega_T=figures.omega_T,
+        bandwidth=figures.bandwidth,
+        objective=_objective(problem, theta, design),
+        gradient=tuple(float(v) for v in gradient),
+        step=step,
+        syntheses=spent,
+    )

@@ -1,0 +1,116 @@
+"""What a run folder holds already: its true samples, and the versions of its surrogates."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.sampling.sampler import QuantitySample
+from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from surrogates import GaussianProcess, SurrogateFileError
+from surrogates.versions import Versions
+
+SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
+OUTPUTS = {"nested": 1, "lifted": 3}
+
+
+@dataclass(frozen=True)
+class Surrogates:
+    """A version to start from: its processes, and the θ and designs that it was fitted to."""
+
+    processes: tuple[GaussianProcess, ...]
+    thetas: Array
+    samples: tuple[QuantitySample, ...]
+
+
+def named_surrogate(
+    folder: Path, name: str, formulation: str, problem: CoDesignProblem
+) -> Surrogates:
+    """A version of the run folder's surrogates, for a formulation of a problem.
+
+    Raises UserError where there is none of that name, or it is of something else.
+    """
+    try:
+        processes, _ = Versions(folder).load(name)
+    except (SurrogateFileError, OSError) as error:
+        raise UserError(f"--surrogate {name}: {error}") from error
+    lower, upper = box(problem) if formulation == "nested" else lifted_bounds(problem)
+    if len(processes) != OUTPUTS.get(formulation) or processes[0].lower.shape != lower.shape:
+        raise UserError(
+            f"--surrogate {name}: has {len(processes)} outputs of {processes[0].lower.size} "
+            f"inputs, no surrogate of the {formulation} formulation; choose another --formulation"
+        )
+    if not (np.allclose(processes[0].lower, lower) and np.allclose(processes[0].upper, upper)):
+        raise UserError(f"--surrogate {name}: was made for other bounds; retrain the run folder")
+    X = lower + processes[0].X * (upper - lower)
+    if formulation == "nested":
+        with SampleStore(folder / "samples.sqlite") as store:
+            known = stored_thetas(store, problem)
+        return Surrogates(processes, _exact(X, known, upper - lower), ())
+    return Surrogates(processes, X[:, :-2], _quantities(processes, X))
+
+
+def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[Array, Sample]]:
+    """Designs with derivatives inside the box as (x, row), x = (θ, ln ω_S, ln ω_T), oldest first.
+
+    Designs that were not certified are among them.
+    """
+    lower, upper = lifted_bounds(problem)
+    key = problem_hash(problem.identity())
+    keys = store.keys_with_gradients(key)
+    known = store.get(keys)
+    slack = SAME * (upper - lower)
+    found = []
+    for item in keys:
+        row = known.get(item)
+        # an index that names what the table has not is damage too
+        if (
+            row is None
+            or len(row.theta) != len(problem.names)
+            or len(row.gradients or ()) != 4 * len(lower)
+        ):
+            raise store.damaged()
+        x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
+        if (x >= lower - slack).all() and (x <= upper + slack).all():
+            found.append((np.clip(x, lower, upper), row))
+    return found
+
+
+def stored_thetas(store: SampleStore, problem: CoDesignProblem) -> Array:
+    """Every θ (n, n_θ) inside the box whose inner problem was solved, oldest first."""
+    lower, upper = box(problem)
+    designs = problem_hash(problem.identity())
+    key = problem_hash({"problem": designs, "inner": problem.inner_identity()})
+    thetas = store.thetas(key)
+    if any(len(theta) != len(lower) for theta in thetas):
+        raise store.damaged()
+    X = np.array(thetas, dtype=float).reshape(-1, len(lower))
+    return X[((lower <= X) & (upper >= X)).all(axis=1)]
+
+
+def _exact(X: Array, known: Array, width: Array) -> Array:
+    """The known θ that rows of X are but for rounding; the rows themselves elsewhere."""
+    if not len(known):
+        return X
+    found = []
+    for x in X:
+        away = np.abs((known - x) / width).max(axis=1)
+        found.append(known[np.argmin(away)] if away.min() <= SAME else x)
+    return np.array(found)
+
+
+def _quantities(processes: tuple[GaussianProcess, ...], X: Array) -> tuple[QuantitySample, ...]:
+    """The samples that three processes with gradients hold; γ_opt is not among them."""
+    n, d = X.shape
+    values, gradients = np.full((n, 4), np.nan), np.full((n, 4, d), np.nan)
+    for i, process in enumerate(processes):
+        targets = process.targets.reshape(1 + d, n)
+        values[:, i] = process.output_mean + process.output_scale * targets[0]
+        width = process.upper - process.lower
+        gradients[:, i] = process.output_scale * targets[1:].T / width
+    rows = zip(X, values, gradients, strict=True)
+    return tuple(QuantitySample(tuple(map(float, x)), v, g, True) for x, v, g in rows)

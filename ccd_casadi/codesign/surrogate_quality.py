@@ -1,0 +1,84 @@
+"""What the surrogates of a run say about themselves (`surrogates.quality`), and what follows."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from surrogates import GaussianProcess, Quality, quality_of
+
+# Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
+# fitted is a logarithm.
+OUTPUTS = (
+    ("bandwidth", "Hz", 1.0 / HZ, False),
+    ("sensitivity_peak", "%", 100.0, True),
+    ("sensitivity_low", "%", 100.0, True),
+)
+
+
+def surrogate_quality(
+    processes: Sequence[GaussianProcess], x: Array, seed: int = 0
+) -> tuple[Quality, ...]:
+    """Judge the processes of ω_b, or of ω_b, ln‖S‖∞ and ln|S(jω_low)|, at the design x."""
+    return tuple(
+        quality_of(
+            process,
+            x[: process.lower.size],
+            name=name,
+            unit=unit,
+            factor=factor,
+            logarithm=logarithm,
+            seed=seed,
+        )
+        for process, (name, unit, factor, logarithm) in zip(processes, OUTPUTS, strict=False)
+    )
+
+
+def recommendation(qualities: Sequence[Quality]) -> str:
+    """What follows from them, in one or two sentences; nothing where there is no surrogate."""
+    if not qualities:
+        return ""
+    said = []
+    rough = [q.name.replace("_", " ") for q in qualities if not q.smooth_enough]
+    if rough:
+        what = ", ".join(rough)
+        said.append(
+            f"The samples of {what} look kinked or torn: one smooth surrogate follows them only "
+            "near the design. "
+            + (
+                "Solve with --formulation lifted, whose outputs are smooth where the best "
+                "bandwidth is not."
+                if len(qualities) == 1
+                else "The larger of two local peaks is kinked where they are equal; the rounds "
+                "refit by the design, where one of them is the larger."
+            )
+        )
+    beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
+    if beyond:
+        said.append(
+            f"At the design the surrogate of {', '.join(beyond)} extrapolates: trust the "
+            "verification, and retrain before moving bounds or weights."
+        )
+    return " ".join(said) or "The surrogates follow their samples, and support the design."
+
+
+def quality_dict(qualities: Sequence[Quality]) -> dict[str, Any]:
+    """`surrogate_quality` of result.json; errors in the unit that is named."""
+    if not qualities:
+        return {}
+    return {
+        "outputs": {
+            q.name: {
+                "unit": q.unit,
+                "samples": len(q.true),
+                "leave_one_out": asdict(q.loo),
+                "k_fold": asdict(q.kfold),
+                "coverage_95": q.coverage,
+                "roughness": q.roughness.value,
+                "extrapolates": list(q.extrapolates),
+            }
+            for q in qualities
+        },
+        "recommendation": recommendation(qualities),
+    }

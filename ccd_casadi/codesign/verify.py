@@ -1,0 +1,161 @@
+"""Verification of an optimum by the true synthesis, its controller, and optimality of the truth."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.codesign.closer_models import ReferenceCheck, check_references
+from ccd_casadi.codesign.direct import acceptable, polish
+from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
+from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.closed_loop import handed_out, measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
+
+POLISH_ROUNDS = 3
+INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
+PEAK = 1e-6  # relative; by how much S_max may be passed between the plants of a robust set
+DENSE = 41  # shifts of a robust set on which the design is measured at the end
+
+
+@dataclass(frozen=True)
+class VerifiedDesign:
+    """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
+
+    `inner_gap`: by how much (relative) the global inner problem at θ beats the design's ω_b.
+    `unsuspended`: the same controller on the plant with its rigid-body modes free;
+    `references`: on closer models of the plant.
+    """
+
+    x: Array
+    theta: tuple[float, ...]
+    design: Design
+    objective: float
+    hardware_cost: float
+    active: tuple[str, ...]
+    kkt: KktCertificate
+    inner_gap: float
+    feasible: bool
+    unsuspended: DesignFigures
+    references: tuple[ReferenceCheck, ...] = ()
+    robust: "RobustCheck | None" = None
+
+
+@dataclass(frozen=True)
+class RobustCheck:
+    """A robust design on its nominal plant, and on a denser set than it was designed for.
+
+    `worst` has the largest ‖S‖∞ of that set, at `at`; an unstable loop is worse than any.
+    """
+
+    nominal: DesignFigures
+    worst: DesignFigures
+    at: Perturbation
+    plants: int
+    passed: bool
+
+
+def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
+    """Polish x on the true problem, ask the global inner problem there, certify what results."""
+    problem = sampler.problem
+    count = len(problem.names)
+    quantities = TrueQuantities(problem, sampler.record)
+    gap = np.inf
+    design = None
+    for _ in range(POLISH_ROUNDS):
+        x, design, _ = polish(sampler, x)
+        at_bounds = _snapped(problem, x)
+        if acceptable(problem, at_bounds, quantities.at(at_bounds)):
+            x, design = at_bounds, quantities.at(at_bounds)
+        inner = sampler.bandwidths(x[:count], "verifying")[0]
+        gap = inner.bandwidth / design.figures.bandwidth - 1.0 if inner.feasible else 0.0
+        if gap <= INNER_GAP:
+            break
+        # the inner problem has a better design at this θ: go on from there
+        x = np.array([*inner.theta, np.log(inner.omega_S), np.log(inner.omega_T)])
+    assert design is not None
+    theta = tuple(float(v) for v in x[:count])
+    figures = design.figures
+    plant = scaled_plant(problem, theta)
+    final = synthesise(
+        plant,
+        problem.weights.at(figures.omega_S, figures.omega_T),
+        omega_low=problem.inner.omega_low,
+        gamma_backoff=problem.inner.gamma_backoff,
+    )
+    final = handed_out(plant, final, problem.inner.omega_low)
+    free = replace(problem, suspension=Suspension(0.0, 0.0))
+    unsuspended = measure(
+        scaled_plant(free, theta),
+        final.controller,
+        final.weights,
+        gamma=UNBOUNDED,
+        omega_low=problem.inner.omega_low,
+    )
+    cost = hardware_cost(plant_of(problem), theta)
+    return VerifiedDesign(
+        x=x,
+        theta=theta,
+        design=final,
+        objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
+        hardware_cost=cost,
+        active=_active(problem, x, final.figures),
+        kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
+        inner_gap=float(gap),
+        feasible=acceptable(problem, x, design),
+        unsuspended=unsuspended,
+        references=check_references(problem, theta, final),
+        robust=_check_robust(problem, theta, final),
+    )
+
+
+def _check_robust(
+    problem: CoDesignProblem, theta: tuple[float, ...], design: Design
+) -> RobustCheck | None:
+    """The controller on `DENSE` shifts of the robust set; None where the problem has none."""
+    if problem.robust is None:
+        return None
+    system = mechanics(plant_of(problem), theta)
+
+    def measured(perturbation: Perturbation) -> DesignFigures:
+        return measure(
+            scale_plant(modal_plant(system, problem.suspension, perturbation), problem.weights.M_K),
+            design.controller,
+            design.weights,
+            gamma=UNBOUNDED,
+            omega_low=problem.inner.omega_low,
+        )
+
+    places = problem.robust.perturbations(DENSE)
+    found = [(measured(place), place) for place in places]
+
+    def badness(item: tuple[DesignFigures, Perturbation]) -> float:
+        return float(np.nan_to_num(item[0].sensitivity_peak, nan=np.inf))
+
+    worst, at = max(found, key=badness)
+    passed = badness((worst, at)) <= problem.inner.S_max * (1.0 + PEAK)
+    return RobustCheck(measured(Perturbation()), worst, at, len(places), passed)
+
+
+def _snapped(problem: CoDesignProblem, x: Array) -> Array:
+    """Put variables that IPOPT left within rounding of a bound onto it."""
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    x = np.where(np.abs(x - lower) <= 1e-9 * width, lower, x)
+    return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)
+
+
+def _active(problem: CoDesignProblem, x: Array, figures: DesignFigures) -> tuple[str, ...]:
+    program = lifted_program(problem, TrueQuantities(problem), exact_hessian=False)
+    bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
+    plant = plant_of(problem)
+    lam = constraint_values(plant, x[: len(problem.names)])
+    extra = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
+    return (*bounds, *active_constraints(problem.inner, figures), *extra)

@@ -1,0 +1,129 @@
+"""`python -m ccd_casadi.deploy RUN_DIR`: the run's controller as one that can be built."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.deployment.c_code import FILES as C_FILES
+from ccd_casadi.deployment.c_code import write_c
+from ccd_casadi.deployment.discretise import Discretisation
+from ccd_casadi.deployment.files import DESIGN_FILES, write_files
+from ccd_casadi.deployment.pipeline import Deployment, Timing, deploy
+from ccd_casadi.reporting.deploy_page import write_report
+from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.units import HZ
+from surrogates.options import number, positive
+
+LEADS = {"auto": None, "on": True, "off": False}
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Deploy, write the folder, print a summary."""
+    finished = read_run(options.run)
+    folder = run_folder(options.run, options.out or options.run / "deploy")
+    if folder.resolve() == options.run.resolve():
+        words = "would overwrite the run's own controller and report"
+        raise UserError(f"--out {folder}: {words}; choose another folder")
+    method = None if options.method == "auto" else Discretisation(options.method)
+    timing = Timing(
+        options.rate_hz, options.delay, options.delay_samples, method, LEADS[options.lead]
+    )
+    count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
+    channels = len(finished.plant.C) if finished.plant.channels else 1
+    with Progress(channels + count + 1, "deploying", options.quiet) as bar:
+        found = deploy(
+            finished, timing, saturation=options.saturation, seed=options.seed,
+            progress=lambda words: bar.advance(note=words),
+        )  # fmt: skip
+    for name in (*DESIGN_FILES, *C_FILES):  # an earlier controller must not pass for this one
+        (folder / name).unlink(missing_ok=True)
+    write_files(folder, finished, found, options.seed)
+    if found.sampled.stable:
+        write_c(
+            folder, found.realisation, title=options.run.resolve().name, delay=found.delay,
+            verified=found.passed,
+        )  # fmt: skip
+    write_report(folder / "report.html", finished, found)
+    if not options.quiet:
+        print(_summary(finished, found))
+        print(f"report        {folder / 'report.html'}")
+    if found.passed:
+        return ExitCode.DONE
+    print(f"not verified: {_shortfall(found)}", file=sys.stderr)
+    return ExitCode.NOT_VERIFIED
+
+
+def _summary(run: FinishedRun, found: Deployment) -> str:
+    full, small, sampled, measured = (
+        run.figures, found.reduced_figures, found.sampled, found.measured,
+    )  # fmt: skip
+    orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
+    needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
+    lines = [
+        ("status", "verified" if found.passed else "not verified"),
+        ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
+        ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
+        ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),
+        ("sampled", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
+                    f"{found.conversion.label}; needed {needed}"),
+    ]  # fmt: skip
+    if measured is None:
+        lines.append(("", f"unstable: spectral radius {sampled.spectral_radius:.6g}"))
+    else:
+        for name, figures in (("", sampled), ("simulated", measured)):
+            lines.append((
+                name,
+                f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
+                f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
+                f"{figures.sensitivity_peak:.6g} "
+                f"({100 * (figures.sensitivity_peak / run.problem.inner.S_max - 1):+.2f} % of "
+                "S_max)",
+            ))  # fmt: skip
+    return "\n".join(f"{name:13s} {words}" for name, words in lines)
+
+
+def _shortfall(found: Deployment) -> str:
+    rate = f"{found.rate_hz:.6g} Hz"
+    if found.needed_hz is None:
+        return f"{rate} is not enough, and with this delay no rate is; shorten the delay"
+    return f"{rate} is not enough for {found.conversion.label}: {found.needed_hz:.6g} Hz is needed"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.deploy",
+        "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
+    )
+    arguments.add_argument(
+        "--rate-hz", metavar="X", type=positive,
+        help="sampling rate (default: the next round one above what is needed)",
+    )  # fmt: skip
+    delay = arguments.add_mutually_exclusive_group()
+    delay.add_argument(
+        "--delay", metavar="SECONDS", type=number(), help="from reading y to the new u, in s"
+    )
+    delay.add_argument(
+        "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
+        help="the same in sampling periods (default: 1)",
+    )  # fmt: skip
+    arguments.add_argument(
+        "--method", choices=["auto", *Discretisation], default="auto",
+        help="discretisation (default: the one that needs the lowest rate)",
+    )  # fmt: skip
+    arguments.add_argument(
+        "--lead", choices=list(LEADS), default="auto",
+        help="a lead that makes up for hold and delay (default: where it lowers the rate)",
+    )  # fmt: skip
+    arguments.add_argument(
+        "--saturation", metavar="NEWTON", type=positive,
+        help="clip every u to plus or minus this (default: off)",
+    )  # fmt: skip
+    return run(command, arguments, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

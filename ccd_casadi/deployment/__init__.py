@@ -1,0 +1,1 @@
+"""From a synthesised controller to sampled code: reduce, discretise, verify, write."""

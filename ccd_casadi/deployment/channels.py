@@ -1,0 +1,68 @@
+"""The scalar loops that a controller is made of, where plant and controller both fall apart.
+
+Orthogonal directions U of the outputs and V of the inputs that make Uᵀ G V diagonal are known from
+the plant (see `ccd_casadi.channels`). A controller that is diagonal in them as well, Vᵀ K U, is
+reduced, discretised and read channel by channel. σ_max(S) of the whole is the largest of the
+channels', because U is orthogonal. Anything else is one channel: the plant itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.closed_loop import responses
+
+DIAGONAL = 1e-8  # share of the gain that may lie off the diagonal and count as rounding
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Uᵀ G V and Vᵀ K U, controller in SI; U = `outputs` (p, k), V = `inputs` (m, k)."""
+
+    name: str
+    outputs: Array
+    inputs: Array
+    plant: ScaledPlant
+    controller: StateSpace
+
+
+def split(plant: ScaledPlant, controller: StateSpace) -> tuple[Channel, ...]:
+    """The scalar channels of the loop, or the whole loop as one channel."""
+    p, m = plant.C.shape[0], plant.B.shape[1]
+    whole = (Channel("all", np.eye(p), np.eye(m), plant, controller),)
+    U = np.hstack([c.outputs for c in plant.channels] or [np.eye(p)])
+    V = np.hstack([c.inputs for c in plant.channels] or [np.eye(m)])
+    if not (U.shape == (p, p) and V.shape == (m, m) and p == m > 1):
+        return whole
+    G, K, _ = responses(plant, controller, plant.grid * plant.omega_0)
+    if not (_diagonal(U.T @ G @ V) and _diagonal(V.T @ K @ U)):
+        return whole
+    found = []
+    for i in range(p):
+        u, v = U[:, [i]], V[:, [i]]
+        B, C = np.ascontiguousarray(plant.B @ v), np.ascontiguousarray(u.T @ plant.C)
+        part = StateSpace(
+            controller.A, controller.B @ u, v.T @ controller.C, v.T @ controller.D @ u
+        )
+        found.append(Channel(str(i + 1), u, v, replace(plant, B=B, C=C, channels=()), part))
+    return tuple(found)
+
+
+def _diagonal(response: np.ndarray) -> bool:
+    off = response * (1.0 - np.eye(response.shape[1]))
+    return bool(np.abs(off).max() <= DIAGONAL * np.abs(response).max())
+
+
+def assemble(channels: Sequence[Channel], controllers: Sequence[StateSpace]) -> StateSpace:
+    """K = Σ V_i K_i U_iᵀ, its states one channel after the other."""
+    pairs = list(zip(channels, controllers, strict=True))
+    return StateSpace(
+        block_diag(*(K.A for _, K in pairs)),
+        np.vstack([K.B @ c.outputs.T for c, K in pairs]),
+        np.hstack([c.inputs @ K.C for c, K in pairs]),
+        np.sum([c.inputs @ K.D @ c.outputs.T for c, K in pairs], axis=0),
+    )

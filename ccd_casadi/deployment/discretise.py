@@ -1,0 +1,151 @@
+"""Continuous controllers in discrete time, and the sampling rate that they need."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import cont2discrete
+
+from ccd_casadi.deployment.sampled import (
+    DiscreteStateSpace,
+    SampledFigures,
+    sampled_figures,
+    sampled_plant,
+    sensitivity_loop,
+)
+from ccd_casadi.plants.scaling import StateSpace
+
+SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
+CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed
+NICE = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
+
+
+class Discretisation(StrEnum):
+    """How K(s) becomes K(z)."""
+
+    TUSTIN = "tustin"
+    PREWARPED = "prewarped"  # Tustin, exact at the frequency of S's peak
+    STEP = "zoh"  # step-invariant
+    RAMP = "foh"  # ramp-invariant: exact for an error that is straight between samples
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """A method, with or without the lead that makes up for hold and delay; `warp` in rad/s.
+
+    The lead is (1 + α) - α z⁻¹, whose phase is that of a time advance of αT at low frequency;
+    α = τ/T + 1/2 (+ 1/2 with the step-invariant method, which holds too). Its price is the gain
+    1 + 2α at half the sampling rate.
+    """
+
+    method: Discretisation
+    lead: bool
+    warp: float
+
+    @property
+    def label(self) -> str:
+        """`foh with lead`."""
+        return f"{self.method.value}{' with lead' if self.lead else ''}"
+
+    def advance(self, period: float, delay: float) -> float:
+        """α, in periods; 0 without lead."""
+        held = 1.0 if self.method is Discretisation.STEP else 0.5
+        return delay / period + held if self.lead else 0.0
+
+
+def discretise(
+    controller: StateSpace, conversion: Conversion, period: float, delay: float
+) -> DiscreteStateSpace:
+    """K(z) for a period and a delay in s, the lead on its input.
+
+    Raises ValueError where the frequency to be exact at lies above half the sampling rate.
+    """
+    parts = (controller.A, controller.B, controller.C, controller.D)
+    if conversion.method in (Discretisation.TUSTIN, Discretisation.PREWARPED):
+        step = period
+        if conversion.method is Discretisation.PREWARPED:
+            half = 0.5 * conversion.warp * period
+            if half >= 0.5 * np.pi:
+                raise ValueError("the peak of S lies above half the sampling rate")
+            step = 2.0 * np.tan(half) / conversion.warp
+        A, B, C, D, _ = cont2discrete(parts, step, "bilinear")
+    else:
+        A, B, C, D, _ = cont2discrete(parts, period, conversion.method.value)
+    alpha = conversion.advance(period, delay)
+    if not alpha:
+        return DiscreteStateSpace(A, B, C, D, period)
+    n, m = B.shape
+    return DiscreteStateSpace(
+        np.block([[A, -alpha * B], [np.zeros((m, n + m))]]),
+        np.vstack([(1.0 + alpha) * B, np.eye(m)]),
+        np.hstack([C, -alpha * D]),
+        (1.0 + alpha) * D,
+        period,
+    )
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a sampled loop has to keep: ‖S‖∞ <= peak and |ω_b/bandwidth - 1| <= tolerance."""
+
+    peak: float
+    bandwidth: float  # rad/s
+    tolerance: float
+
+    def met(self, figures: SampledFigures) -> bool:
+        """Whether it does; an unstable loop does not."""
+        change = abs(figures.bandwidth / self.bandwidth - 1.0)
+        return figures.stable and figures.sensitivity_peak <= self.peak and change <= self.tolerance
+
+
+def loop_at(
+    plant: StateSpace, controller: StateSpace, conversion: Conversion, period: float, delay: float
+) -> SampledFigures:
+    """The figures of the sampled loop; an unstable one's where K has no such discretisation."""
+    try:
+        K = discretise(controller, conversion, period, delay)
+    except ValueError:
+        return SampledFigures(False, np.inf, np.nan, np.nan, np.nan)
+    return sampled_figures(sensitivity_loop(sampled_plant(plant, period, delay), K))
+
+
+def needed_rate(
+    met: Callable[[float], bool], bandwidth_hz: float, also: Sequence[float] = ()
+) -> float | None:
+    """The least rate in Hz from which on every rate tried meets, None where the fastest does not.
+
+    Tried are, from 4000 ω_b down to 4 ω_b, those of `nice_rate`, their geometric means and `also`;
+    the least is bracketed to 0.1 %. A rate below one that fails is never called enough.
+    """
+    low, high = SLOWEST * bandwidth_hz, FASTEST * bandwidth_hz
+    round_ones = [nice_rate(low)]
+    while round_ones[-1] < high:
+        round_ones.append(nice_rate(round_ones[-1] * 1.01))
+    between = [float(np.sqrt(a * b)) for a, b in pairwise(round_ones)]
+    good, bad = None, np.nan
+    for rate in sorted({*round_ones, *between, *also}, reverse=True):
+        if not met(rate):
+            bad = rate
+            break
+        good = rate
+    if good is None or np.isnan(bad):
+        return good
+    while good / bad > 1.0 + CLOSE:
+        middle = float(np.sqrt(good * bad))
+        if met(middle):
+            good = middle
+        else:
+            bad = middle
+    return good
+
+
+def nice_rate(rate: float) -> float:
+    """The next rate of the series 1, 1.25, 1.6, 2, 2.5, 3.2, 4, 5, 6.4, 8 times a power of ten.
+
+    >>> nice_rate(8123.0), nice_rate(10000.0)
+    (10000.0, 10000.0)
+    """
+    power = 10.0 ** np.floor(np.log10(rate))
+    return float(next(power * nice for nice in NICE if power * nice >= rate * (1.0 - 1e-12)))

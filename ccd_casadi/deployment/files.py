@@ -1,0 +1,155 @@
+"""What a deployment leaves in its folder: deploy.json, controller.json, design.mat."""
+
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.result import versions, write_json
+from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.reduction import Reduced
+from ccd_casadi.deployment.sections import Root, Section, sections_of
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.interchange import DesignFile, named_controller, named_plant, write_mat
+from ccd_casadi.synthesis.synthesis import DesignFigures
+
+DESIGN_FILES = ("controller.json", "design.mat")
+
+
+def write_files(folder: Path, run: FinishedRun, found: Deployment, seed: int) -> None:
+    """deploy.json always; controller and .mat file only of a loop that is stable."""
+    write_json(folder / "deploy.json", deployment_dict(run, found, seed))
+    if not found.sampled.stable:
+        return
+    write_json(folder / "controller.json", controller_dict(found))
+    K, held = found.realisation.system, found.plant
+    systems = {
+        "plant": named_plant(run.plant.plant_si()),
+        "controller": named_controller(run.controller),
+        "controller_reduced": named_controller(found.reduced),
+        "controller_discrete": named_controller(StateSpace(K.A, K.B, K.C, K.D), K.period),
+        "plant_discrete": named_plant(StateSpace(held.A, held.B, held.C, held.D), held.period),
+    }
+    theta = dict(zip(run.problem.names, run.theta, strict=True))
+    units = dict(zip(run.problem.names, run.problem.units, strict=True))
+    write_mat(folder / "design.mat", DesignFile(systems, theta, units))
+
+
+def controller_dict(found: Deployment) -> dict[str, Any]:
+    """The deployed difference equation; matrices row-major, SI."""
+    K = found.realisation.system
+    return {
+        "A": K.A.tolist(),
+        "B": K.B.tolist(),
+        "C": K.C.tolist(),
+        "D": K.D.tolist(),
+        "blocks": list(found.realisation.blocks),
+        "period": K.period,
+        "rate_hz": found.rate_hz,
+        "delay": found.delay,
+        "saturation": found.realisation.saturation,
+        "input": "e = r - y",
+        "output": "u",
+        "equation": "u[k] = C x[k] + D e[k], x[k+1] = A x[k] + B e[k]",
+        "units": "SI, time in s",
+    }
+
+
+def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str, Any]:
+    """deploy.json: every figure of the way; frequencies in Hz."""
+    sampled, measured = found.sampled, found.measured
+    return {
+        "status": "verified" if found.passed else "not_verified",
+        "rate_hz": found.rate_hz,
+        "needed_rate_hz": found.needed_hz,
+        "delay": found.delay,
+        "method": found.conversion.label,
+        "order": found.order,
+        "criterion": {
+            "S_max": run.problem.inner.S_max,
+            "reduced_peak": found.limits.peak,
+            "reduced_low": found.limits.low,
+            "reduced_norm": found.limits.norm,
+            "reduced_bandwidth_hz": found.limits.bandwidth / HZ,
+            "sampled_peak": found.target.peak,
+            "sampled_bandwidth_tolerance": found.target.tolerance,
+        },
+        "full": _figures(run.figures),
+        "reduced": _figures(found.reduced_figures),
+        "sampled": {
+            "stable": sampled.stable,
+            "spectral_radius": sampled.spectral_radius,
+            "sensitivity_peak": sampled.sensitivity_peak,
+            "sensitivity_peak_hz": sampled.sensitivity_peak_frequency / HZ,
+            "bandwidth_hz": sampled.bandwidth / HZ,
+        },
+        "simulated": None
+        if measured is None
+        else {
+            "sensitivity_peak": measured.sensitivity_peak,
+            "sensitivity_peak_hz": measured.sensitivity_peak_frequency / HZ,
+            "bandwidth_hz": measured.bandwidth / HZ,
+            "periods": measured.periods,
+            "leftover": measured.leftover,
+        },
+        "methods": {trial.conversion.label: trial.needed_hz for trial in found.trials},
+        "channels": [_channel(item, run.figures.bandwidth) for item in found.orders],
+        "theta": dict(zip(run.problem.names, run.theta, strict=True)),
+        "versions": versions(),
+        "seed": seed,
+    }
+
+
+def _figures(figures: DesignFigures) -> dict[str, Any]:
+    return {
+        "stable": figures.certificate.stable,
+        "sensitivity_peak": figures.sensitivity_peak,
+        "sensitivity_peak_hz": figures.sensitivity_peak_frequency / HZ,
+        "sensitivity_low": figures.sensitivity_low,
+        "bandwidth_hz": figures.bandwidth / HZ,
+        "norm": figures.gamma,
+    }
+
+
+def _channel(item: ChannelOrders, bandwidth: float) -> dict[str, Any]:
+    K = item.chosen.controller
+    scalar = K.D.shape == (1, 1)
+    return {
+        "name": item.channel.name,
+        "outputs": item.channel.outputs.tolist(),
+        "inputs": item.channel.inputs.tolist(),
+        "full_order": item.rows[0].order,
+        "order": item.chosen.order,
+        "method": item.chosen.method.value,
+        "smallest_order_at_S_max": item.strict.order,
+        "orders": [_row(row) for row in item.rows],
+        "sections": _sections(K, bandwidth) if scalar else None,
+    }
+
+
+def _row(row: Reduced) -> dict[str, Any]:
+    reason = row.figures.outcome.value
+    return {"order": row.order, "method": row.method.value, "reason": reason} | _figures(
+        row.figures
+    )
+
+
+def _sections(K: StateSpace, bandwidth: float) -> dict[str, Any]:
+    found = sections_of(K, bandwidth)
+    return {
+        "gain": found.gain,
+        "gain_at_bandwidth": found.gain_at_bandwidth,
+        "sections": [_section(section) for section in found.sections],
+    }
+
+
+def _section(section: Section) -> dict[str, Any]:
+    def root(value: Root | None) -> dict[str, float | None] | None:
+        return None if value is None else {"hz": value.hz, "damping": value.damping}
+
+    return {
+        "kind": section.kind,
+        "zero": root(section.zero),
+        "pole": root(section.pole),
+        "depth_db": section.depth_db,
+    }

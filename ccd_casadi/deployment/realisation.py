@@ -1,0 +1,110 @@
+"""The difference equation that is deployed: block-diagonal, its order of operations fixed.
+
+Controller poles lie close to z = 1 at high sampling rates, where the coefficients of a companion
+form, or of a long cascade, lose digits. Here A is block-diagonal (control.bdschur on SLICOT's
+MB03RD, the transformation's condition bounded): blocks of one real pole or one complex pair,
+larger ones only where poles nearly coincide. Each pole then is as exact as its own block's four
+numbers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import control
+import numpy as np
+
+from ccd_casadi.deployment.channels import Channel, assemble
+from ccd_casadi.deployment.sampled import DiscreteStateSpace
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
+
+CONDITION = 1e4  # most of the block-diagonalising transformation's entries
+
+
+@dataclass(frozen=True)
+class Realisation:
+    """x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k in SI; A block-diagonal with these `blocks`.
+
+    With a `saturation` in N every u is clipped to ± it; there is no anti-windup.
+    """
+
+    system: DiscreteStateSpace
+    blocks: tuple[int, ...]
+    saturation: float | None = None
+
+    @property
+    def block_entries(self) -> Array:
+        """The diagonal blocks of A, each row by row, one after the other."""
+        pieces, i = [np.zeros(0)], 0
+        for n in self.blocks:
+            pieces.append(self.system.A[i : i + n, i : i + n].ravel())
+            i += n
+        return np.concatenate(pieces)
+
+
+def realise(
+    channels: Sequence[Channel],
+    controllers: Sequence[DiscreteStateSpace],
+    saturation: float | None = None,
+) -> Realisation:
+    """The controllers of all channels as one block-diagonal system from e to u."""
+    parts, blocks = [], []
+    for controller in controllers:
+        part, sizes = _block_diagonal(controller)
+        parts.append(part)
+        blocks += sizes
+    whole = assemble(channels, parts)
+    system = DiscreteStateSpace(whole.A, whole.B, whole.C, whole.D, controllers[0].period)
+    return Realisation(system, tuple(blocks), saturation)
+
+
+def _block_diagonal(K: DiscreteStateSpace) -> tuple[StateSpace, list[int]]:
+    if not len(K.A):
+        return StateSpace(K.A, K.B, K.C, K.D), []
+    A, T, sizes = control.bdschur(K.A, condmax=CONDITION)
+    B, C = np.linalg.solve(T, K.B), K.C @ T
+    start = 0
+    for size in sizes:
+        states = slice(start, start + size)
+        b, c = np.linalg.norm(B[states]), np.linalg.norm(C[:, states])
+        if b > 0.0 and c > 0.0:  # states of like size on input and output
+            B[states] *= np.sqrt(c / b)
+            C[:, states] *= np.sqrt(b / c)
+        A[states, :start] = A[states, start + size :] = 0.0
+        start += size
+    return StateSpace(A, B, C, K.D), [int(size) for size in sizes]
+
+
+def difference_equation(realisation: Realisation, errors: Array) -> Array:
+    """u_k (k, m) for errors e_k (k, p), from rest, in exactly the C code's order of operations.
+
+    Sums start at zero and run over the states, then the inputs, without fused operations: the
+    result equals that of the C code bit by bit.
+    """
+    K = realisation.system
+    A, B, C, D = (part.tolist() for part in (K.A, K.B, K.C, K.D))
+    x = [0.0] * len(A)
+    limit = realisation.saturation
+    answers = []
+    for e in np.asarray(errors, float).tolist():
+        u = []
+        for row_c, row_d in zip(C, D, strict=True):
+            total = 0.0
+            for gain, value in zip(row_c, x, strict=True):
+                total += gain * value
+            for gain, value in zip(row_d, e, strict=True):
+                total += gain * value
+            u.append(total if limit is None else min(max(total, -limit), limit))
+        following, start = [], 0
+        for size in realisation.blocks:
+            for i in range(start, start + size):
+                total = 0.0
+                for j in range(start, start + size):
+                    total += A[i][j] * x[j]
+                for gain, value in zip(B[i], e, strict=True):
+                    total += gain * value
+                following.append(total)
+            start += size
+        x = following
+        answers.append(u)
+    return np.array(answers).reshape(len(answers), len(C))

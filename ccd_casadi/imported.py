@@ -1,0 +1,61 @@
+"""`python -m ccd_casadi.imported FOLDER`: result files or matrices at samples into modes.csv."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from ccd_casadi.plants.imported.matrices import read_rows, reduced_table
+from ccd_casadi.plants.imported.modal_table import ModalTable, write_modal_table
+from ccd_casadi.plants.imported.results import results_table
+from ccd_casadi.support.command_line import ExitCode, run, run_parser
+from ccd_casadi.support.errors import PlantError, UserError
+
+
+def _table(folder: Path, options: argparse.Namespace) -> ModalTable:
+    columns = read_rows(folder / "index.csv")[0]
+    if "results" in columns:
+        return results_table(folder)
+    if "mass" not in columns:
+        words = "has neither a column results nor the columns mass and stiffness; add one"
+        raise PlantError(f"{folder / 'index.csv'}: {words}")
+    return reduced_table(folder, options.modes, options.static_correction)
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """The command itself."""
+    folder: Path = options.run
+    try:
+        table = _table(folder, options)
+    except PlantError as error:  # it names the file at fault, and there is no case
+        raise UserError(str(error)) from error
+    out = options.out or folder
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_modal_table(out / "modes.csv", table)
+    except OSError as error:
+        raise UserError(
+            f"{out}: cannot be written: {error.strerror}; choose another --out"
+        ) from None
+    if not options.quiet:
+        N, r = table.omega.shape
+        print(f"{out / 'modes.csv'}: {N} samples of {r} modes, {', '.join(table.names)}")
+    return ExitCode.DONE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.imported",
+        "A modal table from result files or matrices; see docs/own_finite_elements.md.",
+        metavar="FOLDER",
+        about="the folder with index.csv and dofs.csv",
+    )
+    arguments.add_argument("--modes", type=int, default=10, metavar="N", help="of matrices: 10")
+    arguments.add_argument(
+        "--static-correction", action="store_true", help="of matrices: exact static compliance"
+    )
+    return run(command, arguments, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

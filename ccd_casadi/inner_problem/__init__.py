@@ -1,0 +1,1 @@
+"""The inner problem: ω_b*(θ), the largest bandwidth over the weights' break frequencies."""

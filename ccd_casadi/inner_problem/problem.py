@@ -1,0 +1,286 @@
+"""A co-design problem: everything that determines the true ω_b*(θ), and the way to ask for it.
+
+It is made of plain values, so that it can be sent to a worker process, hashed, and written
+beside the samples that it determines.
+"""
+
+import hashlib
+import importlib.util
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
+from ccd_casadi.plants.differenced import own_plant
+from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.plant import ModelFunction, Plant, build_plant, mechanics
+from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
+from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.user_code import limited, require_user_code
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.weights import Weights
+
+NUMERICS = 6  # raised whenever a change of ours moves the numbers that a sample holds
+
+
+@dataclass(frozen=True)
+class PlantSource:
+    """Where the model comes from: a known name or `file.py:function`, and its options."""
+
+    model: str | None
+    file: str | None
+    function: str | None
+    options: tuple[tuple[str, object], ...]
+    seconds: float = 60.0  # that a function may take; no part of what the plant is
+    content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
+
+    def pinned(self) -> "PlantSource":
+        """The same, with the hash of its file's content: a process must not keep an older one."""
+        if self.file is None or self.content is not None:
+            return self
+        try:
+            content = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
+        except OSError as error:
+            raise PlantError(f"{self.file}: cannot be read: {error.strerror}") from None
+        return replace(self, content=content)
+
+    def identity(self) -> dict[str, object]:
+        """What determines the plant; a file counts by its content, not by where it lies."""
+        digest = self.pinned().content
+        options = dict(self.options)
+        data = DATA.get(self.model or "")
+        if data is not None:
+            digest = _digest(Path(str(options.pop(data, ""))))
+        return {
+            "model": self.model,
+            "function": self.function,
+            "source": digest,
+            "options": options,
+        }
+
+
+@dataclass(frozen=True)
+class RobustSet:
+    """Plants on which the loop has to be stable and ‖S‖∞ within S_max.
+
+    Frequencies of the flexible modes times 1 + s, `shifts` values of s evenly over ±`shift`, and
+    with every one of them damping times each factor of `damping`. The controller is designed on the
+    plant shifted by `design_shift`.
+    """
+
+    shift: float
+    shifts: int
+    damping: tuple[float, ...]
+    design_shift: float
+
+    def perturbations(self, shifts: int | None = None) -> tuple[Perturbation, ...]:
+        """The set; `shifts` of them for a denser one."""
+        values = np.linspace(-self.shift, self.shift, self.shifts if shifts is None else shifts)
+        factors = sorted({1.0, *self.damping})
+        return tuple(Perturbation(float(s), z) for s in values for z in factors)
+
+
+@dataclass(frozen=True)
+class CoDesignProblem:
+    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout.
+
+    Made by `problem_of`; `dataclasses.replace` makes variants of it:
+
+    >>> import ccd_casadi as ccd
+    >>> from dataclasses import replace
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> heavier = replace(problem, lower=(60.0, 60.0), start=(65.0, 65.0))
+    """
+
+    source: PlantSource
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    start: tuple[float, ...]
+    w1: float
+    w2: float
+    weights: Weights
+    inner: InnerProblem
+    suspension: Suspension
+    method: str = "search"  # how the inner problem is solved: "search" or "sweep"
+    robust: RobustSet | None = None
+
+    def identity(self) -> dict[str, object]:
+        """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
+
+        S_max, S_low, bounds and the objective are not in it: the samples answer any of them.
+        """
+        w, robust = self.weights, self.robust
+        perturbed = {} if robust is None else {"robust": vars(robust)}
+        return {
+            "numerics": NUMERICS,
+            "plant": self.source.identity(),
+            "theta": list(self.names),
+            "suspension": [self.suspension.frequency_hz, self.suspension.damping_ratio],
+            "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u],
+            "omega_low": self.inner.omega_low,
+            "gamma_backoff": self.inner.gamma_backoff,
+            **perturbed,
+        }
+
+    def inner_identity(self) -> dict[str, object]:
+        """What else determines ω_b*(θ)."""
+        inner = self.inner
+        return {
+            "S_max": inner.S_max,
+            "S_low": inner.S_low,
+            "omega_S": list(inner.omega_S),
+            "omega_T": list(inner.omega_T),
+            "sweep_points": list(inner.sweep_points),
+            "method": self.method,
+        }
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of every file in a folder, by name and content."""
+    found = hashlib.sha256()
+    for file in [path] if path.is_file() else sorted(item for item in path.glob("*")):
+        if file.is_file():
+            content = hashlib.sha256(file.read_bytes()).hexdigest()
+            found.update(f"{'' if file == path else file.name}\0{content}\n".encode())
+    return found.hexdigest()
+
+
+def plant_of(problem: CoDesignProblem) -> Plant:
+    """The plant, built once in a process.
+
+    Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
+    """
+    if problem.source.model is not None:
+        return _shipped_plant(problem.source, problem.names)
+    require_user_code(f"{problem.source.file}:{problem.source.function}")
+    return _own_plant(problem.source.pinned(), problem.names, problem.lower, problem.upper)
+
+
+@lru_cache(maxsize=8)
+def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+    if source.model in BUILDERS:
+        return BUILDERS[source.model](names, **dict(source.options))
+    assert source.model is not None
+    return build_plant(MODELS[source.model], names, dict(source.options))
+
+
+@lru_cache(maxsize=8)
+def _own_plant(
+    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
+) -> Plant:
+    return own_plant(_own_function(source), names, dict(source.options), lower, upper)
+
+
+class _PlantFile(SourceFileLoader):
+    """A plant's file, read once: what runs is the text that was hashed.
+
+    Bytecode beside it is neither used nor written: it could be of an older text, or of another.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("user_plant_" + path.stem, str(path))
+        self._text = path.read_bytes()
+        self.digest = hashlib.sha256(self._text).hexdigest()
+
+    def get_data(self, path: str) -> bytes:
+        return self._text
+
+    def path_stats(self, path: str) -> Mapping[str, Any]:
+        raise OSError("no bytecode")
+
+
+def _own_function(source: PlantSource) -> ModelFunction:
+    assert source.file is not None
+    assert source.function is not None
+    path = Path(source.file)
+    loader = _PlantFile(path)
+    if loader.digest != source.content:
+        raise UserError(f"{path}: was changed since the case was read; give the command again")
+    spec = importlib.util.spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    late = PlantError(
+        f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
+        "mend it, or give it longer with plant_seconds in a table [limits]"
+    )
+    try:
+        limited(loader.exec_module, source.seconds, late)(module)
+        function = limited(getattr, source.seconds, late)(module, source.function, None)
+    except PlantError:
+        raise
+    except Exception as error:
+        raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
+    if not callable(function):
+        raise UserError(f"{path}: defines no function {source.function}; check plant.function")
+    return limited(function, source.seconds, late)
+
+
+def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
+    """The scaled plant M_K G(jω₀ω) at θ, with its family where the problem is a robust one.
+
+    Raises PlantError where the model is no plant at θ.
+
+    >>> import ccd_casadi as ccd
+    >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
+    (209.2, (4, 4))
+    """
+    system = mechanics(plant_of(problem), theta)
+
+    def scaled(*perturbation: Perturbation) -> ScaledPlant:
+        modal = modal_plant(system, problem.suspension, *perturbation)
+        return scale_plant(modal, problem.weights.M_K)
+
+    nominal, robust = scaled(), problem.robust
+    if robust is None:
+        return nominal
+    design = nominal if robust.design_shift == 0.0 else scaled(Perturbation(robust.design_shift))
+    others = (p for p in robust.perturbations() if p != Perturbation())
+    return replace(nominal, family=PlantFamily(design, tuple(scaled(p) for p in others)))
+
+
+def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
+    """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
+
+        max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper)
+
+    An infeasible θ is a result without `optimum` that says what falls short.
+
+    >>> import ccd_casadi as ccd
+    >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(best.bandwidth / ccd.HZ, 2), best.active
+    (58.23, ('S_max', 'omega_T lower'))
+    """
+    solve = sweep_inner if problem.method == "sweep" else search_inner
+    return solve(scaled_plant(problem, theta), problem.weights, problem.inner)
+
+
+def true_design(
+    problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
+) -> Sensitivities:
+    """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)
+    >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
+    (True, [-0.21, -0.138])
+    """
+    return evaluate(
+        scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
+    )
+
+
+def box(problem: CoDesignProblem) -> tuple[Array, Array]:
+    """Lower and upper bounds of θ as arrays."""
+    return np.array(problem.lower), np.array(problem.upper)

@@ -1,0 +1,134 @@
+"""The inner problem by derivatives: the global optimum in a tenth of a sweep's syntheses.
+
+A few designs spread over the box, each with exact derivatives, determine an interpolant of
+ln ω_b, ln‖S‖∞ and ln σ_max(S(jω_low)); its constrained maxima are synthesised and added until
+the interpolant has no better place to offer. A local constrained solve then ends on the true
+functions, as after a sweep.
+"""
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import label, maximum_position
+
+from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, refine
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures
+from ccd_casadi.synthesis.weights import Weights
+from surrogates import Kernel
+from surrogates.covariance import covariance
+
+INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
+FINE = 81  # points a side on which the interpolant is searched
+ADDED = 8  # designs that the interpolant may ask for
+BUDGET = 40  # syntheses in all, the local solve included
+LENGTHS = np.array([0.35, 0.6])  # correlation lengths as fractions of the box
+
+
+def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> InnerResult:
+    """ω_b*(θ) from derivatives, at most some forty syntheses."""
+    bounds = np.log([problem.omega_S, problem.omega_T])
+    width = bounds[:, 1] - bounds[:, 0]
+    grids = [np.linspace(0.0, 1.0, n) for n in INITIAL]
+    points = [np.array([a, b]) for a in grids[0] for b in grids[1]]
+    designs = [_design(plant, weights, problem, bounds, point) for point in points]
+    fine = np.linspace(0.0, 1.0, FINE)
+    mesh = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
+    for _ in range(ADDED):
+        usable = [i for i, design in enumerate(designs) if design.figures.certified]
+        if not usable:
+            break
+        X = np.array([points[i] for i in usable])
+        Y = np.array([_values(designs[i]) for i in usable])
+        dY = np.array([_slopes(designs[i], width) for i in usable])
+        new = _next_point(problem, mesh, _interpolate(X, Y, dY, mesh), X, designs)
+        if new is None:
+            break
+        points.append(new)
+        designs.append(_design(plant, weights, problem, bounds, new))
+    rows = [design.figures for design in designs]
+    return refine(plant, weights, problem, rows, _starts(problem, rows), BUDGET - len(rows))
+
+
+def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
+    """The best feasible design, and the best one that is within 2 % of feasible."""
+    near = sorted(
+        (row for row in rows if row.certified and _excess(problem, row) < 0.02),
+        key=lambda row: -row.bandwidth,
+    )
+    feasible = [row for row in near if problem.feasible(row)]
+    chosen = feasible[:1] or near[:1]
+    if not chosen:
+        chosen = sorted(
+            (row for row in rows if row.certified), key=lambda row: _excess(problem, row)
+        )[:1]
+    return [(row.omega_S, row.omega_T) for row in chosen]
+
+
+def _excess(problem: InnerProblem, row: DesignFigures) -> float:
+    return max(
+        np.log(row.sensitivity_peak / problem.S_max), np.log(row.sensitivity_low / problem.S_low)
+    )
+
+
+def _design(
+    plant: ScaledPlant, weights: Weights, problem: InnerProblem, bounds: Array, point: Array
+) -> Sensitivities:
+    x = bounds[:, 0] + point * (bounds[:, 1] - bounds[:, 0])
+    omega = np.clip(np.exp(x), *np.array([problem.omega_S, problem.omega_T]).T)
+    return evaluate(plant, weights, problem, (float(omega[0]), float(omega[1])))
+
+
+def _values(design: Sensitivities) -> Array:
+    return np.array([np.log(design.values[0]), design.values[1], design.values[2]])
+
+
+def _slopes(design: Sensitivities, width: Array) -> Array:
+    slopes = design.to_break_frequencies[:3].copy()
+    slopes[0] /= design.values[0]
+    return slopes * width
+
+
+def _interpolate(X: Array, Y: Array, dY: Array, at: Array) -> Array:
+    """Gaussian radial-basis interpolant of values and gradients; columns of Y at the points.
+
+    Its lengths are given, and one factor serves all outputs, so that the covariance alone is
+    taken from `surrogates`.
+    """
+    x, one = X / LENGTHS, np.ones(X.shape[1])
+    K = covariance(Kernel.RBF, x, x, one, gradients_of_a=True, gradients_of_b=True)
+    K[np.diag_indices_from(K)] += 1e-8
+    mean = Y.mean(axis=0)
+    data = np.vstack([Y - mean] + [dY[:, :, i] * LENGTHS[i] for i in range(X.shape[1])])
+    weights = cho_solve(cho_factor(K), data)
+    return mean + covariance(Kernel.RBF, at / LENGTHS, x, one, gradients_of_b=True) @ weights
+
+
+def _next_point(
+    problem: InnerProblem, mesh: Array, predicted: Array, X: Array, designs: list[Sensitivities]
+) -> Array | None:
+    """The best predicted point over the connected parts of the predicted feasible set.
+
+    None when every part's best is no better than the incumbent or next to a known design.
+    """
+    levels = np.log([problem.S_max, problem.S_low])
+    inside = ((predicted[:, 1:3] <= levels).all(axis=1)).reshape(FINE, FINE)
+    best = max(
+        (np.log(d.figures.bandwidth) for d in designs if problem.feasible(d.figures)),
+        default=-np.inf,
+    )
+    if not inside.any():
+        excess = (predicted[:, 1:3] - levels).max(axis=1)
+        candidates = [int(np.argmin(excess))] if best == -np.inf else []
+    else:
+        parts, count = label(inside)
+        merit = predicted[:, 0].reshape(FINE, FINE)
+        places = maximum_position(merit, parts, range(1, count + 1))
+        candidates = [int(i * FINE + j) for i, j in places]
+        candidates = [i for i in candidates if predicted[i, 0] > best + 1e-4]
+        candidates.sort(key=lambda i: -predicted[i, 0])
+    for index in candidates:
+        if np.abs(X - mesh[index]).max(axis=1).min() > 0.6 / (FINE - 1):
+            return mesh[index]
+    return None

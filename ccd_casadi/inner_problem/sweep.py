@@ -1,0 +1,260 @@
+"""The inner problem: the largest certified bandwidth at a fixed θ.
+
+    ω_b*(θ) = max over (ω_S, ω_T) of ω_b   s.t.  ‖S‖∞ <= S_max,  σ_max(S(jω_low)) <= S_low
+    (paper, equation (8))
+
+The feasible set can be disconnected. The paper's sweep covers the box; every local maximum of
+the sweep, feasible or nearly so, then starts a local constrained solve with exact derivatives.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
+from ccd_casadi.synthesis.weights import Weights
+
+# The local solves aim this far inside a constraint, so that what they return satisfies it.
+MARGIN = 1e-9
+ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
+
+
+@dataclass(frozen=True)
+class InnerProblem:
+    """Constraints and search box of the inner problem; frequencies in rad/s."""
+
+    S_max: float
+    S_low: float
+    omega_low: float
+    omega_S: tuple[float, float]
+    omega_T: tuple[float, float]
+    gamma_backoff: float = 1.02
+    sweep_points: tuple[int, int] = (20, 20)
+
+    def feasible(self, figures: DesignFigures) -> bool:
+        """Certified, inside the box and within both bounds on S."""
+        return (
+            figures.certified
+            and figures.sensitivity_peak <= self.S_max
+            and figures.sensitivity_low <= self.S_low
+        )
+
+    def axes(self) -> tuple[Array, Array]:
+        """Logarithmic sweep grids of ω_S and ω_T."""
+        return (
+            np.geomspace(*self.omega_S, self.sweep_points[0]),
+            np.geomspace(*self.omega_T, self.sweep_points[1]),
+        )
+
+
+class InnerStatus(StrEnum):
+    """Whether the inner problem has a certified feasible design; the value says it in words."""
+
+    SOLVED = "solved"
+    INFEASIBLE = "no certified design meets S_max and S_low in the box of omega_S and omega_T"
+
+
+@dataclass(frozen=True)
+class InnerResult:
+    """The optimum (None if infeasible), what binds there, and every synthesis on the way.
+
+    `violation` is the least one in ln S_max and ln S_low of any certified design; zero if solved.
+    """
+
+    status: InnerStatus
+    optimum: Sensitivities | None
+    active: tuple[str, ...]
+    rows: tuple[DesignFigures, ...]
+    syntheses: int
+    shortfall: str = ""
+    violation: float = 0.0
+
+    @property
+    def bandwidth(self) -> float:
+        """ω_b* in rad/s; NaN where infeasible."""
+        return np.nan if self.optimum is None else self.optimum.figures.bandwidth
+
+
+def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> InnerResult:
+    """The paper's sweep over the whole box, refined to the continuous optimum."""
+    omega_S, omega_T = problem.axes()
+    rows = sweep(
+        plant,
+        weights,
+        omega_S,
+        omega_T,
+        omega_low=problem.omega_low,
+        gamma_backoff=problem.gamma_backoff,
+    )
+    return refine(plant, weights, problem, rows, sweep_starts(problem, rows))
+
+
+def refine(
+    plant: ScaledPlant,
+    weights: Weights,
+    problem: InnerProblem,
+    rows: Sequence[DesignFigures],
+    starts: Iterable[tuple[float, float]],
+    limit: int = 40,
+) -> InnerResult:
+    """Local constrained solves from `starts` (rad/s); the best feasible design of all wins.
+
+    `limit` bounds the syntheses of each local solve.
+    """
+    tried = list(rows)
+    best: Sensitivities | None = None
+    for start in starts:
+        for step in local_solve(plant, weights, problem, start, limit):
+            tried.append(step.figures)
+            if problem.feasible(step.figures) and (
+                best is None or step.figures.bandwidth > best.figures.bandwidth
+            ):
+                best = step
+    swept = (row for row in rows if problem.feasible(row))
+    for row in sorted(swept, key=lambda row: -row.bandwidth):
+        if best is not None and best.figures.bandwidth >= row.bandwidth:
+            break
+        other = evaluate(plant, weights, problem, (row.omega_S, row.omega_T))
+        tried.append(other.figures)
+        if problem.feasible(other.figures):  # not where its derivatives are lost
+            best = other
+            break
+    if best is None:
+        least = min((_violation(problem, row) for row in tried if row.certified), default=np.inf)
+        words = shortfall(problem, tried)
+        status = InnerStatus.INFEASIBLE
+        return InnerResult(status, None, (), tuple(tried), len(tried), words, least)
+    active = active_constraints(problem, best.figures)
+    return InnerResult(InnerStatus.SOLVED, best, active, tuple(tried), len(tried))
+
+
+def evaluate(
+    plant: ScaledPlant, weights: Weights, problem: InnerProblem, point: tuple[float, float]
+) -> Sensitivities:
+    """One certified synthesis with derivatives at (ω_S, ω_T) in rad/s."""
+    return sensitivities(
+        plant,
+        weights.at(*point),
+        omega_low=problem.omega_low,
+        gamma_backoff=problem.gamma_backoff,
+    )
+
+
+def sweep_starts(
+    problem: InnerProblem, rows: Sequence[DesignFigures], limit: int = 6
+) -> list[tuple[float, float]]:
+    """Local maxima of ln ω_b - 3·violation over the sweep grid, best first.
+
+    Designs a little outside the bounds count too: a feasible sliver may lie between grid points.
+    """
+    n_S, n_T = problem.sweep_points
+    merit = np.full((n_S + 2, n_T + 2), -np.inf)
+    merit[1:-1, 1:-1] = np.array([_merit(problem, row) for row in rows]).reshape(n_S, n_T)
+    found = []
+    for i in range(1, n_S + 1):
+        for j in range(1, n_T + 1):
+            here = merit[i, j]
+            if np.isfinite(here) and here >= merit[i - 1 : i + 2, j - 1 : j + 2].max():
+                row = rows[(i - 1) * n_T + j - 1]
+                found.append((here, (row.omega_S, row.omega_T)))
+    found.sort(key=lambda item: -item[0])
+    return [point for _, point in found[:limit]]
+
+
+def _violation(problem: InnerProblem, row: DesignFigures) -> float:
+    return max(
+        0.0,
+        float(np.log(row.sensitivity_peak / problem.S_max)),
+        float(np.log(row.sensitivity_low / problem.S_low)),
+    )
+
+
+def _merit(problem: InnerProblem, row: DesignFigures) -> float:
+    if not row.certified:
+        return -np.inf
+    return float(np.log(row.bandwidth)) - 3.0 * _violation(problem, row)
+
+
+def local_solve(
+    plant: ScaledPlant,
+    weights: Weights,
+    problem: InnerProblem,
+    start: tuple[float, float],
+    limit: int = 40,
+) -> list[Sensitivities]:
+    """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way."""
+    bounds = np.log([problem.omega_S, problem.omega_T])
+    seen: dict[tuple[float, float], Sensitivities] = {}
+
+    class Uncertified(Exception):
+        pass
+
+    def at(x: Array) -> Sensitivities:
+        clipped = np.clip(x, bounds[:, 0], bounds[:, 1])
+        key = (float(clipped[0]), float(clipped[1]))
+        if key not in seen:
+            if len(seen) >= limit:
+                raise Uncertified
+            point = np.clip(np.exp(clipped), *np.array([problem.omega_S, problem.omega_T]).T)
+            seen[key] = evaluate(plant, weights, problem, (float(point[0]), float(point[1])))
+        if not seen[key].figures.certified:
+            raise Uncertified
+        return seen[key]
+
+    levels = np.log([problem.S_max, problem.S_low]) - MARGIN
+    try:
+        minimize(
+            lambda x: -np.log(at(x).values[0]),
+            np.log(start),
+            jac=lambda x: -at(x).to_break_frequencies[0] / at(x).values[0],
+            bounds=bounds,
+            constraints={
+                "type": "ineq",
+                "fun": lambda x: levels - at(x).values[1:3],
+                "jac": lambda x: -at(x).to_break_frequencies[1:3],
+            },
+            method="SLSQP",
+            options={"ftol": 1e-9, "maxiter": 30},
+        )
+    except Uncertified:
+        pass  # what was reached before the edge of the certified region still counts
+    return list(seen.values())
+
+
+def active_constraints(problem: InnerProblem, figures: DesignFigures) -> tuple[str, ...]:
+    """Names of the constraints and range ends that bind at a design."""
+    values = {
+        "S_max": figures.sensitivity_peak / problem.S_max,
+        "S_low": figures.sensitivity_low / problem.S_low,
+        "omega_S lower": problem.omega_S[0] / figures.omega_S,
+        "omega_S upper": figures.omega_S / problem.omega_S[1],
+        "omega_T lower": problem.omega_T[0] / figures.omega_T,
+        "omega_T upper": figures.omega_T / problem.omega_T[1],
+    }
+    return tuple(name for name, ratio in values.items() if ratio >= 1.0 - ACTIVE)
+
+
+def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
+    """Which constraint cannot be met and by how much, from every synthesis tried."""
+    certified = [row for row in rows if row.certified]
+    if not certified:
+        reasons = sorted({row.outcome.value for row in rows})
+        return "no synthesis was certified: " + "; ".join(reasons)
+    peak = min(row.sensitivity_peak for row in certified)
+    low = min(row.sensitivity_low for row in certified)
+    if peak > problem.S_max:
+        return f"S_max = {problem.S_max:g} cannot be met: the least peak of S found is {peak:.4g}"
+    if low > problem.S_low:
+        return f"S_low = {problem.S_low:g} cannot be met: the least |S(j omega_low)| is {low:.4g}"
+    nearest = min(certified, key=lambda row: _violation(problem, row))
+    return (
+        f"S_max = {problem.S_max:g} and S_low = {problem.S_low:g} cannot be met together: the "
+        f"nearest design has a peak of {nearest.sensitivity_peak:.4g} and "
+        f"|S(j omega_low)| = {nearest.sensitivity_low:.4g}"
+    )

@@ -1,0 +1,70 @@
+"""The true inner quantities as a CasADi function with exact Jacobian, for any nlpsol.
+
+    (θ, ln ω_S, ln ω_T) -> (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt)
+
+Each evaluation is one certified synthesis with its total derivatives. Where a design is not
+certified the values are NaN, which makes IPOPT shorten its step. Hessians are not available:
+use a quasi-Newton method (`ipopt.hessian_approximation = "limited-memory"`).
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.synthesis.derivatives import Sensitivities
+
+
+class TrueQuantities(VectorCallback):
+    """(θ, ln ω_S, ln ω_T) -> ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt, with exact Jacobian.
+
+    A casadi.Callback: keep a reference to it as long as anything built on it is in use. A design
+    that is not certified is NaN, on which IPOPT shortens its step.
+
+    >>> import ccd_casadi as ccd
+    >>> import numpy as np
+    >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case("runs/two_mass.toml")))
+    >>> x = [60.0, 60.0, *np.log([800.0 * ccd.HZ, 40.0 * ccd.HZ])]
+    >>> round(float(quantities(x)[0]) / ccd.HZ, 2)
+    55.66
+    """
+
+    def __init__(
+        self,
+        problem: CoDesignProblem,
+        record: Callable[[Array, Sensitivities], None] | None = None,
+    ) -> None:
+        """`record` is told every true synthesis (x, design)."""
+        self.problem = problem
+        self.record = record
+        self.designs: dict[bytes, Sensitivities] = {}
+        count = len(problem.names) + 2
+        super().__init__("true_quantities", count, 4, self.values, self.jacobian_at)
+
+    def at(self, x: Array) -> Sensitivities:
+        """The design at x = (θ, ln ω_S, ln ω_T); repeated points cost nothing."""
+        x = np.asarray(x, float).ravel()
+        key = x.tobytes()
+        if key not in self.designs:
+            omega = np.exp(x[-2:])
+            inner = self.problem.inner
+            # exp(log(bound)) may miss the bound by a rounding error
+            omega_S = float(np.clip(omega[0], *inner.omega_S))
+            omega_T = float(np.clip(omega[1], *inner.omega_T))
+            design = true_design(self.problem, tuple(x[:-2]), omega_S, omega_T)
+            self.designs[key] = design
+            if self.record is not None:
+                self.record(x, design)
+        return self.designs[key]
+
+    def values(self, x: Array) -> Array:
+        """(4,) values, NaN where the design is not certified."""
+        design = self.at(x)
+        return design.values if design.figures.certified else np.full(4, np.nan)
+
+    def jacobian_at(self, x: Array) -> Array:
+        """(4, n_θ + 2) derivatives."""
+        design = self.at(x)
+        return np.hstack([design.to_theta, design.to_break_frequencies])

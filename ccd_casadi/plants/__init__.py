@@ -1,0 +1,1 @@
+"""Plants as CasADi expressions of θ or finite elements, their modes, and scaled state space."""

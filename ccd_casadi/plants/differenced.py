@@ -1,0 +1,260 @@
+"""A plant whose function takes numbers only: its derivatives are differences, and it says so.
+
+At θ_i the derivative is that of the polynomial of degree 4 through five values spaced
+h = `STEP` of the box, which stay inside the box. The parabola through three of them, with twice
+the step, is the cross-check: their difference bounds the error from above.
+"""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plants.plant import (
+    Mechanics,
+    ModelFunction,
+    Plant,
+    build_plant,
+    check_keys,
+    check_shapes,
+    check_sizes,
+    checked_ratio,
+)
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.errors import PlantError
+
+STEP = 1e-3  # share of the box: h⁴ is 1e-12, rounding is magnified a thousandfold
+REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask for the same θ
+AGREEMENT = 1e-9  # relative; a function gives the same numbers for numbers and for symbols
+
+
+def own_plant(
+    model: ModelFunction,
+    names: Sequence[str],
+    options: Mapping[str, Any],
+    lower: Sequence[float],
+    upper: Sequence[float],
+) -> Plant:
+    """A user's model as CasADi expressions; as numbers with differences where it has none.
+
+    The expressions must give the numbers that the model returns for numbers, in the middle of the
+    box: `math.sqrt` or `float` of a symbol is silently nan. Raises what `build_plant` raises where
+    the model takes neither symbols nor numbers.
+    """
+    numeric = DifferencedModel(model, names, options, lower, upper)
+    middle = 0.5 * (np.asarray(lower) + np.asarray(upper))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # CasADi's notice on NumPy functions
+            plant = build_plant(model, names, options)
+    except Exception as error:
+        if isinstance(error, PlantError) and error.__cause__ is None:
+            raise  # it was traced, and is no plant
+        try:
+            numeric.values(middle)
+        except Exception:
+            raise error from None  # it takes no numbers either: what was wrong first is told
+        return numeric.plant(f"{type(error).__name__}: {error}")
+    try:
+        expected = numeric.values(middle)
+    except Exception:
+        return plant  # the symbols are all it takes
+    found = plant.evaluate(middle)
+    for one, other in zip(_matrices(found), _matrices(expected), strict=True):
+        size = np.abs(other).max(initial=0.0)
+        if np.isfinite(size) and not np.abs(one - other).max(initial=0.0) <= AGREEMENT * size:
+            return numeric.plant("its expressions differ from the numbers that it returns")
+    return plant
+
+
+class _Values:
+    """What a model returns at one θ, as arrays when they are asked for; `scalars` are f and λ."""
+
+    def __init__(self, result: Mapping[str, Any]) -> None:
+        check_keys(result)
+        self._result = result
+        constraints = dict(result.get("constraints", {}))
+        self.constraint_names = tuple(constraints)
+        self.scalars = np.array(
+            [
+                _number(key, value)
+                for key, value in {"hardware_cost": result["hardware_cost"], **constraints}.items()
+            ]
+        )
+
+    @cached_property
+    def system(self) -> Mechanics:
+        """M, D, K, B, C, with derivatives to no parameter."""
+        result = self._result
+        sparse = [ca.DM(result[key]) for key in ("mass", "stiffness", "input", "output")]
+        check_sizes(sparse[0].shape[0], sparse[2].shape[1], sparse[3].shape[0])
+        M, K, B, C = (_array(matrix) for matrix in sparse)
+        D = _array(result["damping"]) if "damping" in result else np.zeros_like(M)
+        check_shapes(M, D, K, B, C)
+        ratio = checked_ratio(result.get("damping_ratio"))
+        none = tuple(np.zeros((0, *matrix.shape)) for matrix in (M, D, K, B, C))
+        return Mechanics(M, D, K, B, C, ratio, none)  # type: ignore[arg-type]
+
+
+class DifferencedModel:
+    """A numeric model as θ -> Mechanics with derivatives by differences; the box scales the steps.
+
+    Raises PlantError where the model returns no plant, or one of another shape than before.
+    """
+
+    def __init__(
+        self,
+        model: ModelFunction,
+        names: Sequence[str],
+        options: Mapping[str, Any],
+        lower: Sequence[float],
+        upper: Sequence[float],
+    ) -> None:
+        self._model, self._options = model, dict(options)
+        self.names = tuple(names)
+        self.lower, self.upper = np.array(lower, float), np.array(upper, float)
+        self._read = lru_cache(maxsize=REMEMBERED)(self._call)
+
+    def plant(self, reason: str) -> Plant:
+        """The plant of the model; `reason` says why its function cannot be traced."""
+        middle = self._at(0.5 * (self.lower + self.upper))
+        count = len(self.names)
+        width = self.upper - self.lower
+
+        def inside(unit: Array) -> Array:
+            return self.lower + width * unit
+
+        callback = VectorCallback(
+            "differences",
+            count,
+            middle.scalars.size,
+            lambda unit: self._at(inside(unit)).scalars,
+            lambda unit: self.scalar_slopes(inside(unit)) * width,
+            hessians=True,
+        )
+        theta = ca.MX.sym("theta", count)
+        both = callback((theta - self.lower) / width)
+        lam = both[1:] if middle.scalars.size > 1 else ca.MX(0, 1)
+        self._keep = callback  # CasADi holds no reference to it
+        short = " ".join(reason.split())[:120]
+
+        def notes(theta: Sequence[float]) -> tuple[str, ...]:
+            return (
+                f"the plant function takes numbers only ({short}): its derivatives are "
+                f"differences over {STEP:g} of the box, at most {self.error(theta):.1e} wrong "
+                "(relative, from a second step)",
+            )
+
+        return Plant(
+            names=self.names,
+            constraint_names=middle.constraint_names,
+            evaluate=self,
+            hardware=ca.Function("hardware", [theta], [both[0], lam]),
+            outputs=middle.system.C.shape[0],
+            inputs=middle.system.B.shape[1],
+            exact_hessian=False,
+            values=self.values,
+            notes=notes,
+        )
+
+    def __call__(self, theta: Sequence[float] | Array) -> Mechanics:
+        """M, D, K, B, C and their derivatives at θ."""
+        here = self._at(theta)
+        ratio = here.system.damping_ratio
+
+        def parts(item: _Values) -> tuple[Array, ...]:
+            if item.system.damping_ratio != ratio:
+                words = "damping_ratio changes with theta; return damping, a matrix"
+                raise PlantError(f"{words}, in its place")
+            return _matrices(item.system)
+
+        slopes = self._slopes(theta, parts, 4)
+        return Mechanics(
+            *_matrices(here.system), ratio, tuple(slopes)  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def values(self, theta: Sequence[float] | Array) -> Mechanics:
+        """M, D, K, B, C at θ, with derivatives to no parameter."""
+        return self._at(theta).system
+
+    def scalar_slopes(self, theta: Array) -> Array:
+        """∂(f, λ)/∂θ, one row a scalar."""
+        return self._slopes(theta, lambda item: (item.scalars,), 4)[0].T
+
+    def error(self, theta: Sequence[float] | Array) -> float:
+        """The largest difference of both formulas, over the largest derivative of its matrix."""
+
+        def parts(item: _Values) -> tuple[Array, ...]:
+            return (*_matrices(item.system), item.scalars)
+
+        width = self.upper - self.lower
+        worst = 0.0
+        sizes = [np.abs(part).max(initial=0.0) for part in parts(self._at(theta))]
+        pairs = zip(self._slopes(theta, parts, 4), self._slopes(theta, parts, 2), strict=True)
+        for (fine, coarse), size in zip(pairs, sizes, strict=True):
+            share = width.reshape(-1, *[1] * (fine.ndim - 1))
+            gap = np.abs((fine - coarse) * share).max(initial=0.0)
+            largest = max(np.abs(fine * share).max(initial=0.0), 1e-6 * size)
+            worst = max(worst, float(gap / largest) if gap > 0.0 else 0.0)
+        return worst
+
+    def _slopes(
+        self,
+        theta: Sequence[float] | Array,
+        parts: Callable[[_Values], tuple[Array, ...]],
+        order: int,
+    ) -> list[Array]:
+        """Derivatives of every part, a leading axis over θ; `order` 4, or 2 with twice the step."""
+        point = np.asarray(theta, float)
+        base = parts(self._at(point))
+        rows: list[list[Array]] = []
+        for i, width in enumerate(self.upper - self.lower):
+            h = STEP * width
+            centre = np.clip(point[i], self.lower[i] + 2.0 * h, self.upper[i] - 2.0 * h)
+            offsets = np.array([-2.0, -1.0, 0.0, 1.0, 2.0] if order == 4 else [-2.0, 0.0, 2.0])
+            away = (point[i] - centre) / h
+            weights = _derivative_weights(offsets, away) / h
+            found = []
+            for offset in offsets:
+                moved = point.copy()
+                moved[i] = point[i] if offset == away else centre + offset * h
+                found.append(parts(self._at(moved)))
+            # The weights sum to zero: without the value at θ a constant has no slope at all.
+            columns = (np.array(column) for column in zip(*found, strict=True))
+            rows.append(
+                [np.tensordot(weights, c - b, 1) for c, b in zip(columns, base, strict=True)]
+            )
+        return [np.array(column) for column in zip(*rows, strict=True)]
+
+    def _at(self, theta: Sequence[float] | Array) -> _Values:
+        return self._read(tuple(float(value) for value in theta))
+
+    def _call(self, theta: tuple[float, ...]) -> _Values:
+        return _Values(self._model(dict(zip(self.names, theta, strict=True)), **self._options))
+
+
+def _number(key: str, value: Any) -> float:
+    if isinstance(value, int | float):
+        return float(value)
+    if ca.DM(value).shape != (1, 1):
+        raise PlantError(f"{key} is {ca.DM(value).shape}, not a scalar; return one number")
+    return float(ca.DM(value))
+
+
+def _array(value: Any) -> Array:
+    return np.array(ca.DM(value), dtype=float)
+
+
+def _matrices(system: Mechanics) -> tuple[Array, Array, Array, Array, Array]:
+    return system.M, system.D, system.K, system.B, system.C
+
+
+def _derivative_weights(offsets: Array, at: float) -> Array:
+    """Weights of f at `offsets` whose sum is the interpolating polynomial's derivative at `at`."""
+    powers = np.arange(offsets.size)
+    system = (offsets - at) ** powers[:, None]  # row k: ((x - at)^k), of which only k = 1 slopes
+    return np.linalg.solve(system, (powers == 1).astype(float))

@@ -1,0 +1,104 @@
+"""What limits a loop, read off the plant alone: modes, transmission zeros, where effort ends."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.kernels.frequency import prepare, response
+from ccd_casadi.plants.modal import ModalPlant
+from ccd_casadi.plants.scaling import ScaledPlant, transmission_zeros
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One mode of the undamped plant; driven and measured: its gains over the largest."""
+
+    frequency_hz: float
+    damping_ratio: float
+    rigid: bool
+    driven: float
+    measured: float
+
+
+@dataclass(frozen=True)
+class Zero:
+    """A transmission zero: |z| in Hz, its damping ratio (negative: right half-plane), and its dip.
+
+    `dip`: the plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    dip: float
+
+
+@dataclass(frozen=True)
+class PlantFacts:
+    """A plant at one θ. `effort_hz`: where M_K σ_r(G) first falls below 1; nan if nowhere.
+
+    σ_r is the r-th singular value, r the number of rigid-body modes where there are fewer of them
+    than inputs and outputs: what is held by a spring anyway needs no force at low frequency.
+    """
+
+    theta: tuple[float, ...]
+    modes: tuple[Mode, ...]
+    zeros: tuple[Zero, ...]
+    effort_hz: float
+
+
+def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
+    """The facts of a plant at one θ, from its modes and its scaled state space."""
+    effort = _effort_hz(modal, scaled)
+    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort), effort)
+
+
+def _modes(modal: ModalPlant) -> tuple[Mode, ...]:
+    b = np.linalg.norm(modal.B, axis=1)
+    c = np.linalg.norm(modal.C, axis=0)
+    zeta = np.diag(modal.D) / (2.0 * np.sqrt(np.diag(modal.K)))
+    return tuple(
+        Mode(float(w) / HZ, float(z), bool(r), float(drive), float(seen))
+        for w, z, r, drive, seen in zip(
+            modal.natural, zeta, modal.rigid, b / b.max(), c / c.max(), strict=True
+        )
+    )
+
+
+def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
+    """The first frequency at which M_K σ_r(G) falls through 1."""
+    order = min(plant.B.shape[1], plant.C.shape[0])
+    order = min(order, int(modal.rigid.sum()) or order)
+    G = prepare(plant.A, plant.B, plant.C)
+    grid = plant.grid[plant.grid > 1e-4]
+    gain = np.array(
+        [np.linalg.svd(response(G, w), compute_uv=False)[order - 1] for w in grid]
+    ).clip(1e-300)
+    below = np.flatnonzero((gain[1:] < 1.0) & (gain[:-1] >= 1.0))
+    if not below.size:
+        return float("nan")
+    i = int(below[0])
+    x, y = np.log(grid[i : i + 2]), np.log(gain[i : i + 2])
+    return float(np.exp(x[0] - y[0] * (x[1] - x[0]) / (y[1] - y[0])) * plant.omega_0 / HZ)
+
+
+def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
+    """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
+    limit = 3.0 * effort_hz * HZ / plant.omega_0
+    found = []
+    for zero in transmission_zeros(plant.A, plant.B, plant.C):
+        size = abs(zero)
+        if zero.imag < 0.0 or not 1e-3 * limit < size < limit:
+            continue
+        gain = np.exp(
+            np.interp(np.log(size * np.array([0.7, 1.0, 1.4])), np.log(plant.grid), _log(plant))
+        )
+        dip = gain[1] / np.sqrt(gain[0] * gain[2])
+        damping = -zero.real / size
+        found.append(Zero(float(size * plant.omega_0 / HZ), float(damping), float(dip)))
+    return tuple(sorted(found, key=lambda zero: zero.frequency_hz))
+
+
+def _log(plant: ScaledPlant) -> Array:
+    return np.asarray(np.log(np.maximum(plant.gain, 1e-300)))

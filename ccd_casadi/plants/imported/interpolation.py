@@ -1,0 +1,204 @@
+"""A modal table as a smooth function of θ, with exact derivatives and the error of rows left out.
+
+In the frame of `frames` the entries of ln K, ln D, B and C are interpolated one by one (by
+polynomials, or radial basis functions where these predict left-out rows better). The matrix
+logarithm makes K = exp(ln K) positive definite at every θ, and frequencies, which follow powers
+of lengths and masses, nearly linear. Source: Arsigny et al., SIAM J. Matrix Anal. Appl. 29 (2007),
+for log-Euclidean interpolation; the derivative of exp is that of Daleckii and Krein.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import comb
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plants.imported.frames import Frame, frames
+from ccd_casadi.plants.imported.modal_table import ModalTable
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+from surrogates import Kind, Surrogate, SurrogateFitError, fit, to_casadi
+
+GOOD = 1e-3  # of an entry's range: below it a polynomial is not compared with radial functions
+DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
+FREQUENCIES = 120
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Worst errors over the rows, each predicted without it (relative)."""
+
+    frequency: float
+    response: float
+    worst_row: int
+
+
+class InterpolatedModes:
+    """θ -> Mechanics (M = I) between the samples of a modal table; `left_out` is its error.
+
+    Frequencies below `rigid_below` (rad/s) are rigid-body modes. Raises PlantError where samples
+    differ in their number of these, or are too few for a polynomial of degree 1.
+    """
+
+    def __init__(self, table: ModalTable, rigid_below: float) -> None:
+        counts = (table.omega < rigid_below).sum(axis=1)
+        if np.ptp(counts) > 0:
+            s = int(counts.argmin())
+            words = ", ".join(
+                f"{n} = {v:g}" for n, v in zip(table.names, table.theta[s], strict=True)
+            )
+            raise PlantError(
+                f"the sample {words} has {counts[s]} rigid-body modes, another {counts.max()}; "
+                "mend the table, or rigid_below_hz"
+            )
+        self.table, self.rigid = table, int(counts[0])
+        damping = table.zeta[:, self.rigid :]
+        if damping.size and damping.min() <= 0.0:
+            raise PlantError("a flexible mode has no damping; give a damping ratio above 0")
+        self.ratio = float(damping.flat[0]) if damping.size and np.ptp(damping) == 0.0 else None
+        tried = [self._fitted(frame) for frame in frames(table, self.rigid)]
+        best = min(range(len(tried)), key=lambda i: tried[i][2].response)
+        self.frame, members, self.left_out = tried[best]
+        theta = ca.MX.sym("theta", len(table.names))
+        y = to_casadi(members, std=False)(theta)
+        self._entries = ca.Function("entries", [theta], [y, ca.jacobian(y, theta)])
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        """M, D, K, B, C and their derivatives at θ."""
+        y, slopes = (np.array(value) for value in self._entries(np.asarray(theta, float)))
+        values = self._matrices(y.ravel(), self.frame)
+        along = [self._matrices(column, self.frame) for column in slopes.T]
+        r, count = self.table.omega.shape[1], len(along)
+        K, dK = self._exponential(values[0], np.array([item[0] for item in along]))
+        D, dD = np.zeros((r, r)), np.zeros((count, r, r))
+        if self.ratio is None:
+            D, dD = self._exponential(values[1], np.array([item[1] for item in along]))
+        return Mechanics(
+            np.eye(r),
+            D,
+            K,
+            values[2],
+            values[3],
+            self.ratio,
+            (
+                np.zeros((count, r, r)),
+                dD,
+                dK,
+                np.array([item[2] for item in along]),
+                np.array([item[3] for item in along]),
+            ),
+        )
+
+    def row(self, index: int) -> Mechanics:
+        """The modal model of one sample as it stands in the table."""
+        table, r, n = self.table, self.table.omega.shape[1], len(self.table.names)
+        lam = np.where(np.arange(r) < self.rigid, 0.0, table.omega[index] ** 2)
+        D = np.zeros((r, r))
+        if self.ratio is None:
+            D = np.diag(2.0 * table.zeta[index] * np.sqrt(lam))
+        B, C = table.inputs[index].copy(), table.outputs[index].T.copy()
+        M, K = np.eye(r), np.diag(lam)
+        none = tuple(np.zeros((n, *part.shape)) for part in (M, D, K, B, C))
+        return Mechanics(M, D, K, B, C, self.ratio, none)  # type: ignore[arg-type]
+
+    def nearest(self, theta: Sequence[float]) -> tuple[int, float]:
+        """The nearest sample, and how far it is (the largest share of the table's range)."""
+        low, high = self.table.theta.min(axis=0), self.table.theta.max(axis=0)
+        width = np.where(high > low, high - low, 1.0)
+        distance = np.abs((self.table.theta - np.asarray(theta)) / width).max(axis=1)
+        return int(distance.argmin()), float(distance.min())
+
+    def _fitted(self, frame: Frame) -> tuple[Frame, list[Surrogate], LeftOut]:
+        table = self.table
+        Y = np.array([self._vector(s, frame) for s in range(len(table.theta))])
+        members = [fit_entry(table.theta, column) for column in Y.T]
+        predicted = Y - np.array([member.left_out for member in members]).T
+        return frame, members, self._left_out(Y, predicted, frame)
+
+    def _pairs(self, frame: Frame) -> list[tuple[int, int]]:
+        """Entries of ln K that are not zero in the frame, upper triangle."""
+        groups = [group for group in frame.groups if group[0] >= self.rigid]
+        return [(i, j) for group in groups for i in group for j in group if i <= j]
+
+    def _vector(self, s: int, frame: Frame) -> Array:
+        """Sample s in the frame as one vector: ln K, ln D where it is not modal, B, C."""
+        table, Q, flexible = self.table, frame.Q[s], slice(self.rigid, None)
+        omega, zeta = table.omega[s, flexible], table.zeta[s, flexible]
+        logarithms = [2.0 * np.log(omega)]
+        if self.ratio is None:
+            logarithms.append(np.log(2.0 * zeta * omega))
+        parts = []
+        for values in logarithms:
+            full = (Q[flexible, flexible] * values) @ Q[flexible, flexible].T
+            parts.append([full[i - self.rigid, j - self.rigid] for i, j in self._pairs(frame)])
+        parts += [(Q @ table.inputs[s]).ravel(), (Q @ table.outputs[s]).ravel()]
+        return np.concatenate(parts)
+
+    def _matrices(self, y: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
+        """ln K, ln D (flexible modes), B and C of such a vector."""
+        pairs, r = self._pairs(frame), self.table.omega.shape[1]
+        logarithms = np.zeros((2, r - self.rigid, r - self.rigid))
+        start = 0
+        for k in range(1 if self.ratio is not None else 2):
+            for (i, j), value in zip(pairs, y[start : start + len(pairs)], strict=True):
+                logarithms[k, i - self.rigid, j - self.rigid] = value
+                logarithms[k, j - self.rigid, i - self.rigid] = value
+            start += len(pairs)
+        m = self.table.inputs.shape[2]
+        B = y[start : start + r * m].reshape(r, m)
+        C = y[start + r * m :].reshape(r, -1).T
+        return logarithms[0], logarithms[1], B, C
+
+    def _exponential(self, L: Array, dL: Array) -> tuple[Array, Array]:
+        """exp(L) and its derivatives on the flexible modes, zero on the rigid ones."""
+        r, a = self.table.omega.shape[1], self.rigid
+        full, slopes = np.zeros((r, r)), np.zeros((len(dL), r, r))
+        lam, E = np.linalg.eigh(L)
+        gap = lam[:, None] - lam[None, :]
+        # (e^a - e^b)/(a - b) = e^b (e^(a-b) - 1)/(a - b), which expm1 gives to rounding
+        ratio = np.divide(np.expm1(gap), gap, out=np.ones_like(gap), where=gap != 0.0)
+        divided = np.exp(lam)[None, :] * ratio
+        full[a:, a:] = (E * np.exp(lam)) @ E.T
+        slopes[:, a:, a:] = E @ (divided * (E.T @ dL @ E)) @ E.T
+        return full, 0.5 * (slopes + slopes.transpose(0, 2, 1))
+
+    def _left_out(self, Y: Array, predicted: Array, frame: Frame) -> LeftOut:
+        frequency, response = np.zeros(len(Y)), np.zeros(len(Y))
+        for s, (true, found) in enumerate(zip(Y, predicted, strict=True)):
+            L = self._matrices(found, frame)[0]
+            if L.size:
+                omega = np.exp(0.5 * np.linalg.eigvalsh(L))
+                frequency[s] = np.abs(omega / self.table.omega[s, self.rigid :] - 1.0).max()
+            one, other = (self._response(y, frame) for y in (true, found))
+            sizes = np.linalg.norm(one, axis=(1, 2))
+            response[s] = (np.linalg.norm(other - one, axis=(1, 2)) / sizes).max()
+        return LeftOut(float(frequency.max()), float(response.max()), int(response.argmax()))
+
+    def _response(self, y: Array, frame: Frame) -> np.ndarray:
+        """G at s = (0.1 + j) ω over the band of the modes, undamped."""
+        L, _, B, C = self._matrices(y, frame)
+        K, _ = self._exponential(L, np.zeros((0, *L.shape)))
+        flexible = self.table.omega[:, self.rigid :]
+        low, high = (flexible.min(), flexible.max()) if flexible.size else (1.0, 10.0)
+        s = (DAMPED + 1j) * np.geomspace(0.3 * low, 1.2 * high, FREQUENCIES)
+        inverse = np.linalg.inv(K + (s**2)[:, None, None] * np.eye(len(K)))
+        return np.asarray(C @ inverse @ B)
+
+
+def fit_entry(theta: Array, values: Array) -> Surrogate:
+    """One entry over θ, by a polynomial, or by radial functions where these predict better.
+
+    Radial functions choose among many shapes: on few samples the best left-out error is luck.
+    """
+    bounds = {"lower": theta.min(axis=0), "upper": theta.max(axis=0)}
+    try:
+        best: Surrogate = fit(theta, values, kind=Kind.POLYNOMIAL, **bounds)
+        enough = len(theta) >= 2 * comb(theta.shape[1] + 3, 3)
+        if enough and best.loo.rms > GOOD * np.ptp(values) > 0.0:
+            other = fit(theta, values, kind=Kind.RADIAL_BASIS, **bounds)
+            best = min(best, other, key=lambda member: member.loo.rms)
+    except (SurrogateFitError, ValueError) as error:
+        raise PlantError(f"the samples cannot be interpolated: {error}; add samples") from error
+    return best

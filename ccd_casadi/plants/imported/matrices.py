@@ -1,0 +1,224 @@
+"""M(θ) and K(θ) as files at samples of θ, reduced to modes.
+
+The folder holds `index.csv`, one row a sample: the parameters of θ, `mass` and `stiffness` (file
+names: Matrix Market .mtx, .npz, or .mat with one matrix in it), `damping` (modal ratio),
+`hardware_cost`, `constraint:NAME`; and `dofs.csv`: `kind` (in, out or shape), `name`, `dof`
+(row of the matrices, from 0) and `gain`, as many rows a name as it takes.
+"""
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat, mmread
+from scipy.linalg import eigh, qr
+from scipy.sparse import csc_array, issparse
+from scipy.sparse import load_npz as load_sparse
+from scipy.sparse.linalg import eigsh, splu
+
+from ccd_casadi.plants.imported.modal_table import ModalTable
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+COLUMNS = ("kind", "name", "dof", "gain")
+SHIFT = 1e-9  # of the largest stiffness over mass: K + s M is regular with rigid-body modes too
+SYMMETRIC = 1e-9
+POINTS = 2  # shape values kept for matching, as a multiple of the modes
+
+
+def reduced_table(folder: Path, modes: int, static_correction: bool = False) -> ModalTable:
+    """The modal table of the lowest `modes` of every sample in a folder.
+
+    With `static_correction` the responses (K + s M)⁻¹ [B, Cᵀ] join the modes as a Ritz basis, so
+    that the compliance at low frequency is that of the full model. Raises PlantError where a file
+    is missing, foreign, not symmetric or of another size than its fellows.
+    """
+    index, dofs = read_rows(folder / "index.csv"), read_rows(folder / "dofs.csv", COLUMNS)
+    if modes < 1:
+        raise PlantError(f"modes = {modes}; keep at least 1")
+    known = ("mass", "stiffness", "damping", "hardware_cost")
+    names = [n for n in index[0] if n not in known and not n.startswith("constraint:")]
+    constraints = [n for n in index[0] if n.startswith("constraint:")]
+    for key in ("mass", "stiffness", "damping"):
+        if key not in index[0]:
+            raise PlantError(f"{folder / 'index.csv'}: has no column {key}; add it")
+    found, bases, sizes = [], [], set()
+    for row in index:
+        M, K = (_matrix(folder / row[key]) for key in ("mass", "stiffness"))
+        if M.shape != K.shape:
+            raise PlantError(f"{folder / row['mass']}: is {M.shape}, stiffness {K.shape}")
+        B, C, _ = (_selected(folder, dofs, kind, M.shape[0]) for kind in ("in", "out", "shape"))
+        extra = np.hstack([B, C]) if static_correction else None
+        omega, basis = modes_of(M, K, modes, extra)
+        found.append((omega, basis.T @ B, basis.T @ C))
+        bases.append(basis)
+        sizes.add(M.shape[0])
+    shapes = _shape_values(folder, dofs, bases, sizes)
+
+    def number(row: Mapping[str, str], key: str) -> float:
+        return number_in(folder / "index.csv", key, row.get(key, "0"))
+
+    counts = {len(omega) for omega, _, _ in found}
+    r = min(counts)
+    return ModalTable(
+        names=tuple(names),
+        input_names=named(folder, dofs, "in"),
+        output_names=named(folder, dofs, "out"),
+        constraint_names=tuple(name.split(":", 1)[1] for name in constraints),
+        theta=np.array([[number(row, name) for name in names] for row in index]),
+        omega=np.array([omega[:r] for omega, _, _ in found]),
+        zeta=np.array([[number(row, "damping")] * r for row in index]),
+        inputs=np.array([b[:r] for _, b, _ in found]),
+        outputs=np.array([c[:r] for _, _, c in found]),
+        shapes=shapes[:, :r],
+        cost=np.array([number(row, "hardware_cost") for row in index]),
+        constraints=np.array([[number(row, name) for name in constraints] for row in index]),
+    )
+
+
+def modes_of(
+    M: csc_array, K: csc_array, count: int, extra: Array | None = None
+) -> tuple[Array, Array]:
+    """ω (r,) in rad/s and mass-normalised shapes (n, r) of the lowest modes of K φ = ω² M φ.
+
+    `extra` (n, k) are forces whose static responses are added to the basis. A small model is solved
+    densely; a large one by shift-inverted Lanczos iteration.
+    """
+    n = M.shape[0]
+    if n <= 3 * count + 20:
+        lam, basis = eigh(K.toarray(), M.toarray())
+        lam, basis = lam[:count], basis[:, :count]
+    else:
+        shift = SHIFT * float(K.diagonal().max() / M.diagonal().max())
+        lam, basis = eigsh(K, count, M, sigma=-shift, which="LM", v0=np.ones(n))
+        if extra is not None:
+            static = splu(csc_array(K + shift * M)).solve(extra)
+            static -= basis @ (basis.T @ (M @ static))  # what the modes do not hold already
+            scale = np.sqrt(np.maximum((static * (M @ static)).sum(axis=0), 0.0))
+            static = static[:, scale > 0.0] / scale[scale > 0.0]
+            U, R, _ = qr(static, mode="economic", pivoting=True)
+            keep = np.abs(np.diag(R)) > 1e-8 * abs(R[0, 0])
+            basis = np.hstack([basis, U[:, keep]])
+            lam, turn = eigh(basis.T @ (K @ basis), basis.T @ (M @ basis))
+            basis = basis @ turn
+    order = np.argsort(lam)
+    lam, basis = lam[order], basis[:, order]
+    basis = basis / np.sqrt((basis * (M @ basis)).sum(axis=0))
+    return np.sqrt(np.maximum(lam, 0.0)), basis
+
+
+def _shape_values(
+    folder: Path, dofs: list[dict[str, str]], bases: list[Array], sizes: set[int]
+) -> Array:
+    """Shapes at the dofs named for it; else, on one mesh, where they tell the modes best apart."""
+    r = min(basis.shape[1] for basis in bases)
+    if any(row["kind"] == "shape" for row in dofs):
+        chosen = [_selected(folder, dofs, "shape", len(basis)) for basis in bases]
+        return np.array([(basis.T @ S)[:r] for basis, S in zip(bases, chosen, strict=True)])
+    if len(sizes) > 1:
+        return np.zeros((len(bases), r, 0))
+    _, _, pivots = qr(bases[0].T, mode="economic", pivoting=True)
+    rows = np.sort(pivots[: POINTS * r])
+    return np.array([basis[rows].T[:r] for basis in bases])
+
+
+def _selected(folder: Path, dofs: list[dict[str, str]], kind: str, size: int) -> Array:
+    """(n, k) columns that pick the dofs of each name of this kind."""
+    names = named(folder, dofs, kind)
+    found = np.zeros((size, len(names)))
+    for row in dofs:
+        if row["kind"] == kind:
+            place = folder / "dofs.csv"
+            dof, gain = number_in(place, "dof", row["dof"]), number_in(place, "gain", row["gain"])
+            if dof != int(dof) or not 0 <= dof < size:
+                words = f"{dof:g} is no row of a matrix of {size}; count from 0"
+                raise PlantError(f"{place}: dof: {words}")
+            found[int(dof), names.index(row["name"])] += gain
+    return found
+
+
+def named(folder: Path, dofs: Sequence[Mapping[str, str]], kind: str) -> tuple[str, ...]:
+    """Names of this kind in dofs.csv. Raises PlantError where there is no input or no output."""
+    names = tuple(dict.fromkeys(row["name"] for row in dofs if row["kind"] == kind))
+    if kind != "shape" and not names:
+        raise PlantError(f"{folder / 'dofs.csv'}: names no {kind}; add a row of kind {kind}")
+    return names
+
+
+def _matrix(path: Path) -> csc_array:
+    """A real symmetric matrix from .mtx, .npz (sparse, or one array) or .mat (one matrix)."""
+    try:
+        if path.suffix == ".mtx":
+            value = mmread(path)
+        elif path.suffix == ".npz":
+            value = _from_npz(path)
+        elif path.suffix == ".mat":
+            held = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
+            if len(held) != 1:
+                raise PlantError(f"{path}: holds {', '.join(held) or 'nothing'}; save one matrix")
+            value = next(iter(held.values()))
+        else:
+            raise PlantError(f"{path}: is no .mtx, .npz or .mat; save the matrix as one of these")
+    except PlantError:
+        raise
+    except Exception as error:  # whatever a reader makes of a damaged or foreign file
+        words = " ".join(str(error).split())[:200]
+        raise PlantError(f"{path}: cannot be read: {words}; save the matrix again") from None
+    try:
+        matrix = csc_array(value if issparse(value) else np.asarray(value), dtype=float)
+    except (ValueError, TypeError) as error:
+        raise PlantError(f"{path}: is no real matrix: {error}") from None
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise PlantError(f"{path}: is {matrix.shape}, not square; save the whole matrix")
+    if not np.isfinite(matrix.data).all() or not matrix.nnz:
+        raise PlantError(f"{path}: is empty or not finite; save the matrix again")
+    gap = abs(matrix - matrix.T)
+    if gap.max() > SYMMETRIC * abs(matrix).max():
+        raise PlantError(f"{path}: is not symmetric; save both triangles")
+    return matrix
+
+
+def _from_npz(path: Path) -> object:
+    with np.load(path, allow_pickle=False) as file:
+        if "format" not in file.files:
+            if len(file.files) != 1:
+                words = ", ".join(file.files) or "nothing"
+                raise PlantError(f"{path}: holds {words}; save one matrix")
+            return file[file.files[0]]
+    return load_sparse(path)
+
+
+def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The rows of a small CSV file, with these columns only if given (gain: 1 where missing).
+
+    Raises PlantError where it cannot be read or has other columns.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [line for line in file if line.strip() and not line.startswith("#")]
+        reader = csv.DictReader(lines, skipinitialspace=True)
+        rows = [{str(k).strip(): str(v).strip() for k, v in row.items()} for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise PlantError(f"{path}: cannot be read: {error}; add it") from None
+    if not rows or any("None" in row or "None" in row.values() for row in rows):
+        raise PlantError(f"{path}: holds no rows, or other cells than its header; mend it")
+    if columns:
+        for row in rows:
+            row.setdefault("gain", "1")
+            if set(row) != set(columns) or row["kind"] not in ("in", "out", "shape"):
+                words = f"needs the columns {', '.join(columns)}, kind one of in, out, shape"
+                raise PlantError(f"{path}: {words}; see docs/own_finite_elements.md")
+    return rows
+
+
+def number_in(path: Path, key: str, text: str) -> float:
+    """A cell as a finite number. Raises PlantError."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise PlantError(f"{path}: {key}: {text[:40]!r} is no number; give one") from None
+    if not math.isfinite(value):
+        raise PlantError(f"{path}: {key}: {text[:40]!r} is not finite; give a number")
+    return value

@@ -1,0 +1,169 @@
+"""A table of modal models at samples of θ: what any finite-element program can export as CSV.
+
+One row a mode of a sample. Columns: the parameters of θ (any other name than these), `mode`,
+`frequency_hz`, `damping` (ratio), `in:NAME` and `out:NAME` (the mode's displacement along each
+actuator's force and each sensor), optionally `shape:NAME` (displacements elsewhere, for matching
+only), `modal_mass` (1 where mode shapes are mass-normalised), `hardware_cost`, `constraint:NAME`.
+"""
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+KNOWN = ("mode", "frequency_hz", "damping", "modal_mass", "hardware_cost")
+PREFIXES = ("in:", "out:", "shape:", "constraint:")
+
+
+@dataclass(frozen=True)
+class ModalTable:
+    """N samples of r modes, mass-normalised: theta (N, n), omega (N, r) rad/s, zeta (N, r).
+
+    inputs (N, r, m), outputs (N, r, p) and shapes (N, r, q) are displacements in 1/√kg; cost (N,)
+    is f and constraints (N, k) are λ at the samples. Modes are in order of frequency.
+    """
+
+    names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    constraint_names: tuple[str, ...]
+    theta: Array
+    omega: Array
+    zeta: Array
+    inputs: Array
+    outputs: Array
+    shapes: Array
+    cost: Array
+    constraints: Array
+
+
+def read_modal_table(path: Path) -> ModalTable:
+    """The table in a CSV file. Raises PlantError naming the line, column and remedy."""
+    header, rows = _read(path)
+    groups = {prefix: [name for name in header if name.startswith(prefix)] for prefix in PREFIXES}
+    theta_names = [name for name in header if name not in KNOWN and not name.startswith(PREFIXES)]
+    for name in ("mode", "frequency_hz", "damping"):
+        if name not in header:
+            raise PlantError(f"{path}: has no column {name}; add it")
+    for prefix, what in (("in:", "actuator"), ("out:", "sensor")):
+        if not groups[prefix]:
+            raise PlantError(f"{path}: has no column {prefix}NAME; add one for each {what}")
+    if not theta_names:
+        raise PlantError(f"{path}: has no column of theta; add one for each parameter")
+    samples: dict[tuple[float, ...], list[dict[str, float]]] = {}
+    for row in rows:
+        samples.setdefault(tuple(row[name] for name in theta_names), []).append(row)
+    counts = {theta: len(modes) for theta, modes in samples.items()}
+    if len(set(counts.values())) > 1:
+        few = min(counts, key=lambda theta: counts[theta])
+        words = ", ".join(f"{n} = {v:g}" for n, v in zip(theta_names, few, strict=True))
+        raise PlantError(
+            f"{path}: the sample {words} has {counts[few]} modes, another has "
+            f"{max(counts.values())}; give every sample as many"
+        )
+    ordered = [sorted(modes, key=lambda row: row["frequency_hz"]) for modes in samples.values()]
+
+    def block(names: Sequence[str]) -> Array:
+        values = np.array([[[row[name] for name in names] for row in modes] for modes in ordered])
+        values = values.reshape(len(ordered), len(ordered[0]), len(names))
+        masses = np.array([[row.get("modal_mass", 1.0) for row in modes] for modes in ordered])
+        return np.asarray(values / np.sqrt(masses)[:, :, None])
+
+    def of_sample(name: str, default: float) -> Array:
+        table = np.array([[row.get(name, default) for row in modes] for modes in ordered])
+        if (np.abs(table - table[:, :1]) > 1e-9 * np.abs(table[:, :1])).any():
+            raise PlantError(f"{path}: {name} differs between the modes of a sample; give one")
+        return np.asarray(table[:, 0])
+
+    columns = [of_sample(name, 0.0) for name in groups["constraint:"]]
+    return ModalTable(
+        names=tuple(theta_names),
+        input_names=_stripped(groups["in:"]),
+        output_names=_stripped(groups["out:"]),
+        constraint_names=_stripped(groups["constraint:"]),
+        theta=np.array(list(samples)),
+        omega=2.0 * np.pi * np.array([[row["frequency_hz"] for row in modes] for modes in ordered]),
+        zeta=np.array([[row["damping"] for row in modes] for modes in ordered]),
+        inputs=block(groups["in:"]),
+        outputs=block(groups["out:"]),
+        shapes=block(groups["shape:"]),
+        cost=of_sample("hardware_cost", 0.0),
+        constraints=np.array(columns).T.reshape(len(samples), len(columns)),
+    )
+
+
+def write_modal_table(path: Path, table: ModalTable) -> None:
+    """Write a table that `read_modal_table` gives back, numbers to the last digit."""
+    groups = {
+        "in:": (table.input_names, table.inputs),
+        "out:": (table.output_names, table.outputs),
+        "shape:": (tuple(str(i + 1) for i in range(table.shapes.shape[2])), table.shapes),
+    }
+    names = [prefix + name for prefix, (own, _) in groups.items() for name in own]
+    extra = ["hardware_cost", *("constraint:" + name for name in table.constraint_names)]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*table.names, "mode", "frequency_hz", "damping", *names, *extra])
+        for s, theta in enumerate(table.theta):
+            for i in range(table.omega.shape[1]):
+                shapes = np.concatenate([values[s, i] for _, values in groups.values()])
+                row = [*theta, i + 1, table.omega[s, i] / (2.0 * np.pi), table.zeta[s, i], *shapes]
+                writer.writerow([_word(v) for v in (*row, table.cost[s], *table.constraints[s])])
+
+
+def _word(value: float) -> str:
+    return repr(int(value)) if isinstance(value, int) else repr(float(value))
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, float]]]:
+    """Header and rows of numbers; lines that start with # are remarks."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PlantError(f"{path}: cannot be read: {error}; name a CSV file in UTF-8") from None
+    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    numbered = [(i, line) for i, line in numbered if not line.startswith("#")]
+    try:
+        parsed = list(csv.reader(line for _, line in numbered))
+    except csv.Error as error:
+        raise PlantError(f"{path}: is no CSV: {error}; separate numbers by commas") from None
+    if len(parsed) < 2:
+        raise PlantError(f"{path}: holds no rows; give a header and one row a mode")
+    header = [name.strip() for name in parsed[0]]
+    if len(set(header)) < len(header) or not all(header):
+        raise PlantError(f"{path}: line {numbered[0][0]}: a column's name is empty or twice there")
+    return header, [
+        _row(path, number, header, cells)
+        for (number, _), cells in zip(numbered[1:], parsed[1:], strict=False)
+    ]
+
+
+def _row(path: Path, number: int, header: list[str], cells: list[str]) -> dict[str, float]:
+    place = f"{path}: line {number}"
+    if len(cells) != len(header):
+        raise PlantError(f"{place}: has {len(cells)} columns, the header {len(header)}; mend it")
+    row = {}
+    for name, cell in zip(header, cells, strict=True):
+        try:
+            row[name] = float(cell)
+        except ValueError:
+            raise PlantError(f"{place}: {name}: {cell[:40]!r} is no number; give one") from None
+        if not math.isfinite(row[name]):
+            raise PlantError(f"{place}: {name}: {cell[:40]!r} is not finite; give a number")
+    if row.get("frequency_hz", 0.0) < 0.0:
+        raise PlantError(f"{place}: frequency_hz: is negative; give 0 for a rigid-body mode")
+    if not 0.0 <= row.get("damping", 0.0) < 1.0:
+        raise PlantError(f"{place}: damping: is {row['damping']:g}; give a ratio from 0 to 1")
+    if not row.get("modal_mass", 1.0) > 0.0:
+        raise PlantError(f"{place}: modal_mass: is not positive; give kg")
+    return row
+
+
+def _stripped(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name.split(":", 1)[1] for name in names)

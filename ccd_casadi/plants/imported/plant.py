@@ -1,0 +1,101 @@
+"""Finite-element models of the user's own as the case file names them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plants.imported.interpolation import InterpolatedModes, fit_entry
+from ccd_casadi.plants.imported.matrices import reduced_table
+from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
+from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.support.errors import PlantError
+from surrogates import to_casadi
+
+NEAREST = "the nearest sample as it stands"
+
+
+def modal_table(names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1) -> Plant:
+    """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
+    if not table:
+        raise PlantError('modal_table needs table = "modes.csv", relative to the case file')
+    return plant_of_table(read_modal_table(Path(table)), names, rigid_below_hz, Path(table).name)
+
+
+def sampled_matrices(
+    names: Sequence[str],
+    folder: str = "",
+    modes: int = 10,
+    static_correction: bool = False,
+    rigid_below_hz: float = 0.1,
+) -> Plant:
+    """The plant interpolated between M and K given as files (see `matrices`), reduced to modes."""
+    if not folder:
+        raise PlantError('sampled_matrices needs folder = "fe", relative to the case file')
+    table = reduced_table(Path(folder), modes, static_correction)
+    return plant_of_table(table, names, rigid_below_hz, Path(folder).name)
+
+
+def plant_of_table(
+    table: ModalTable, names: Sequence[str], rigid_below_hz: float, source: str
+) -> Plant:
+    """Any modal table as the plant that the design loop asks for.
+
+    Raises PlantError where the table's parameters are not those of the case.
+    """
+    if sorted(names) != sorted(table.names):
+        raise PlantError(
+            f"{source} has the parameters {', '.join(table.names)}, the case "
+            f"{', '.join(names)}; make them agree"
+        )
+    order = [table.names.index(name) for name in names]
+    table = _reordered(table, order)
+    try:
+        modes = InterpolatedModes(table, 2.0 * np.pi * rigid_below_hz)
+    except PlantError as error:
+        raise PlantError(f"{source}: {error}") from error
+    scalars = [fit_entry(table.theta, row) for row in (table.cost, *table.constraints.T)]
+    theta = ca.MX.sym("theta", len(names))
+    both = to_casadi(scalars, std=False)(theta)
+    lam = both[1:] if len(scalars) > 1 else ca.MX(0, 1)
+    return Plant(
+        names=tuple(names),
+        constraint_names=table.constraint_names,
+        evaluate=modes,
+        hardware=ca.Function("hardware", [theta], [both[0], lam]),
+        outputs=table.outputs.shape[2],
+        inputs=table.inputs.shape[2],
+        references={NEAREST: partial(_nearest_row, modes)},
+        notes=partial(_notes, modes, tuple(names), source),
+        domain=(table.theta.min(axis=0), table.theta.max(axis=0)),
+    )
+
+
+def _nearest_row(modes: InterpolatedModes, theta: Sequence[float]) -> Mechanics:
+    return modes.row(modes.nearest(theta)[0])
+
+
+def _notes(
+    modes: InterpolatedModes, names: tuple[str, ...], source: str, theta: Sequence[float]
+) -> tuple[str, ...]:
+    index, distance = modes.nearest(theta)
+    place = ", ".join(
+        f"{name}={value:g}" for name, value in zip(names, modes.table.theta[index], strict=True)
+    )
+    frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
+    count = len(modes.table.theta)
+    return (
+        f"designs are verified on the model interpolated between the {count} samples of {source}, "
+        f"as no other is known between them ({modes.frame.name}); a sample left out is predicted "
+        f"to {frequency:.2g} % in frequency and {response:.2g} % in response at worst",
+        f"this theta lies {100 * distance:.2g} % of the samples' range from the nearest sample, "
+        f"{place}; analyse its own finite-element model before it is built",
+    )
+
+
+def _reordered(table: ModalTable, order: Sequence[int]) -> ModalTable:
+    names = tuple(table.names[i] for i in order)
+    return replace(table, names=names, theta=table.theta[:, list(order)])

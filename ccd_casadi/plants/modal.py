@@ -1,0 +1,153 @@
+"""Modal form of a plant, its rigid-body suspension and modal damping, with derivatives.
+
+Both are functions of the matrix M⁻¹K: K_s = M h(M⁻¹K) and D_s = M g(M⁻¹K), where h and g act
+on the eigenvalues λ = ω². Their derivatives follow from divided differences,
+
+    dh(Λ)_ij = h[λ_i, λ_j] dΛ_ij    (Daleckii and Krein),
+
+which is exact at double eigenvalues too. Rigid-body poles on the axis would make the
+mixed-sensitivity problem singular; the suspension puts them at (ω_r, ζ_r).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
+
+
+@dataclass(frozen=True)
+class Suspension:
+    """Where the rigid-body poles are put: frequency in Hz and damping ratio."""
+
+    frequency_hz: float = 0.1
+    damping_ratio: float = 0.7
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.
+
+    Mode shapes stay. Modal damping ratios are multiplied by `damping`, or a given damping matrix,
+    which a shift leaves alone.
+    """
+
+    shift: float = 0.0
+    damping: float = 1.0
+
+
+NOMINAL = Perturbation()
+
+
+@dataclass(frozen=True)
+class ModalPlant:
+    """q̈ + D q̇ + K q = B u, y = C q in mass-normalised modal coordinates at one θ, SI.
+
+    `natural` holds the natural frequencies in rad/s before the suspension, `rigid` marks the
+    rigid-body modes, `modes` the mode shapes as columns. The `d…` arrays are derivatives to θ,
+    leading axis θ, in coordinates frozen at this θ, where M = I but dM is not zero.
+    """
+
+    K: Array
+    D: Array
+    B: Array
+    C: Array
+    natural: Array
+    rigid: np.ndarray
+    modes: Array
+    dM: Array
+    dK: Array
+    dD: Array
+    dB: Array
+    dC: Array
+
+
+def modal_plant(
+    system: Mechanics, suspension: Suspension, perturbation: Perturbation = NOMINAL
+) -> ModalPlant:
+    """Mass-normalised modal coordinates, with suspension and modal damping.
+
+    Raises PlantError where a stiffness is negative: the plant must be stable once suspended.
+    """
+    lam, modes = eigh(system.K, system.M)
+    w_r = 2.0 * np.pi * suspension.frequency_hz
+    threshold = max((RIGID_RATIO**2) * lam[-1], (1e-3 * w_r) ** 2)
+    if lam[0] < -threshold:
+        raise PlantError("the stiffness matrix has a negative eigenvalue; the plant is not stable")
+    rigid = np.abs(lam) <= threshold
+    lam = np.where(rigid, 0.0, lam)
+    modes = _aligned(modes, lam, rigid, system.C)
+    root = np.sqrt(lam)
+    ratio = 1.0 + perturbation.shift
+    h = np.where(rigid, w_r**2, ratio**2 * lam)
+    given = system.damping_ratio is None
+    zeta = 0.0 if given else float(system.damping_ratio or 0.0)
+    zeta *= perturbation.damping * ratio  # of the model's own root, so that g is a function of λ
+    g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
+
+    def to_modal(matrix: Array) -> Array:
+        return modes.T @ matrix @ modes
+
+    D_given = perturbation.damping * to_modal(system.D)
+    dM, dD, dK, dB, dC = system.derivatives
+    dM, dK = to_modal(dM), to_modal(dK)
+    dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I
+    dh = dM * h + _divided_differences(lam, h, rigid, np.full_like(lam, ratio**2)) * dA
+    slope_g = np.divide(zeta, root, out=np.zeros_like(root), where=~rigid)
+    dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
+    C = system.C @ modes
+    seen = np.linalg.norm(C, axis=0)
+    C[:, seen <= 1e-12 * seen.max()] = 0.0
+    return ModalPlant(
+        K=np.diag(h),
+        D=D_given + np.diag(g),
+        B=modes.T @ system.B,
+        C=C,
+        natural=ratio * root,
+        rigid=rigid,
+        modes=modes,
+        dM=dM,
+        dK=dh,
+        dD=perturbation.damping * to_modal(dD) + dg,
+        dB=modes.T @ dB,
+        dC=dC @ modes,
+    )
+
+
+def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:
+    """Rotate modes of one frequency so that what the sensors do not see stands alone.
+
+    Any orthogonal basis of an eigenspace is one of modes. In the singular vectors of its outputs
+    a direction that is not measured has c = 0 exactly; spread over several modes it would leave
+    the Riccati solution singular in a direction that rounding makes up.
+    """
+    modes = modes.copy()
+    n = lam.size
+    start = 0
+    while start < n:
+        end = start + 1
+        while end < n and (
+            (rigid[start] and rigid[end])
+            or (not rigid[start] and lam[end] - lam[end - 1] <= 1e-9 * lam[end])
+        ):
+            end += 1
+        if end - start > 1:
+            _, _, Vh = np.linalg.svd(C @ modes[:, start:end])
+            modes[:, start:end] = modes[:, start:end] @ Vh.T
+        start = end
+    return modes
+
+
+def _divided_differences(lam: Array, values: Array, rigid: np.ndarray, slope: Array) -> Array:
+    """h[λ_i, λ_j]; among rigid modes zero, since they stay rigid at every θ."""
+    gap = lam[:, None] - lam[None, :]
+    close = np.abs(gap) <= 1e-9 * np.maximum(lam[:, None], lam[None, :])
+    safe = np.where(close, 1.0, gap)
+    mean_slope = 0.5 * (slope[:, None] + slope[None, :])
+    out = np.where(close, mean_slope, (values[:, None] - values[None, :]) / safe)
+    return np.where(rigid[:, None] & rigid[None, :], 0.0, out)

@@ -1,0 +1,209 @@
+"""The plant M(θ)ẍ + D(θ)ẋ + K(θ)x = B(θ)u, y = C(θ)x as CasADi expressions of θ.
+
+A model is a function of theta (a mapping of names to floats or CasADi symbols) and keyword
+options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one of `damping` or
+`damping_ratio`, `hardware_cost` and optionally `constraints` (name to scalar, met where <= 0).
+(Paper, equations (1) and (2).)
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+ModelFunction = Callable[..., Mapping[str, Any]]
+
+_REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
+# Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
+LARGEST = {"mass": 1000, "input": 100, "output": 100}
+LARGEST_ENTRY = 1e100  # its square is still a double
+_KNOWN = {*_REQUIRED, "damping", "damping_ratio", "constraints"}
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """M, D, K (n, n), B (n, m), C (p, n) at one θ in SI, with their derivatives to θ.
+
+    `derivatives` holds ∂M, ∂D, ∂K, ∂B, ∂C as arrays with a leading axis over θ.
+    With `damping_ratio` given, D is the modal damping still to be made of it, here zero.
+    """
+
+    M: Array
+    D: Array
+    K: Array
+    B: Array
+    C: Array
+    damping_ratio: float | None
+    derivatives: tuple[Array, Array, Array, Array, Array]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A model bound to its parameters: what the design loop asks of any plant.
+
+    `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
+    `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
+    plant modelled more closely, by name: a design is certified on them again, not optimised.
+    `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
+    result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
+    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
+    """
+
+    names: tuple[str, ...]
+    constraint_names: tuple[str, ...]
+    evaluate: Callable[[Sequence[float]], Mechanics]
+    hardware: ca.Function
+    outputs: int
+    inputs: int
+    references: Mapping[str, Callable[[Sequence[float]], Mechanics]] = field(default_factory=dict)
+    exact_hessian: bool = True
+    values: Callable[[Sequence[float]], Mechanics] | None = None
+    notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
+    domain: tuple[Array, Array] | None = None
+
+
+def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
+    """Trace `model` once with CasADi symbols and check what it returns.
+
+    Raises PlantError with a remedy where a key is missing or unknown, or a shape is wrong.
+
+    >>> from ccd_casadi.plants.two_mass import two_mass
+    >>> plant = build_plant(two_mass, ["m1", "m2"], {"zeta": 0.01})
+    >>> mechanics(plant, (60.0, 50.0)).M.diagonal().tolist(), hardware_cost(plant, (60.0, 50.0))
+    ([60.0, 50.0], 110.0)
+    """
+    theta = ca.SX.sym("theta", len(names))
+    try:
+        result = model({name: theta[i] for i, name in enumerate(names)}, **options)
+    except TypeError as error:
+        raise PlantError(f"the plant model does not take its options: {error}") from error
+    except KeyError as error:
+        raise PlantError(f"the plant model asks for a theta that the case lacks: {error}") from None
+    check_keys(result)
+    M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
+    n = M.shape[0]
+    check_sizes(n, B.shape[1], C.shape[0])
+    D = ca.SX(result["damping"]) if "damping" in result else ca.SX.zeros(n, n)
+    check_shapes(M, D, K, B, C)
+    damping_ratio = checked_ratio(result.get("damping_ratio"))
+    constraints = dict(result.get("constraints", {}))
+    scalars = {"hardware_cost": result["hardware_cost"], **constraints}
+    for key, value in scalars.items():
+        if ca.SX(value).shape != (1, 1):
+            raise PlantError(f"{key} is {ca.SX(value).shape}, not a scalar; return one number")
+    lam = ca.vertcat(*constraints.values()) if constraints else ca.SX(0, 1)
+    dense = [ca.densify(matrix) for matrix in (M, D, K, B, C)]
+    slopes = [ca.densify(ca.jacobian(ca.vec(matrix), theta)) for matrix in dense]
+    matrices = ca.Function("matrices", [theta], dense + slopes)
+    return Plant(
+        names=tuple(names),
+        constraint_names=tuple(constraints),
+        evaluate=partial(_from_casadi, matrices, damping_ratio),
+        hardware=ca.Function("hardware", [theta], [result["hardware_cost"], lam]),
+        outputs=C.shape[0],
+        inputs=B.shape[1],
+    )
+
+
+def check_keys(result: Mapping[str, Any]) -> None:
+    """Raise PlantError unless a model's result has the keys of a plant and no others."""
+    missing = [key for key in _REQUIRED if key not in result]
+    if missing:
+        raise PlantError(f"the plant model returns no {', '.join(missing)}; add it")
+    unknown = sorted(set(result) - _KNOWN)
+    if unknown:
+        raise PlantError(f"the plant model returns unknown {', '.join(unknown)}; drop it")
+    if ("damping" in result) == ("damping_ratio" in result):
+        raise PlantError("the plant model must return either damping or damping_ratio; give one")
+
+
+def check_sizes(states: int, inputs: int, outputs: int) -> None:
+    """Raise PlantError where a plant is too large to be meant."""
+    for key, size in {"mass": states, "input": inputs, "output": outputs}.items():
+        if size > LARGEST[key]:
+            words = f"at most {LARGEST[key]} are taken; reduce it to what matters (its first modes)"
+            raise PlantError(f"{key} has {size} rows or columns, of which {words}")
+
+
+def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
+    """Raise PlantError unless M, D, K are (n, n), B (n, m) and C (p, n)."""
+    n = M.shape[0]
+    for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
+        if matrix.shape != (n, n):
+            raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
+    if B.shape[0] != n or C.shape[1] != n:
+        raise PlantError(f"input is {B.shape} and output {C.shape}; expected (n, m), (p, n), n={n}")
+
+
+def checked_ratio(ratio: Any) -> float | None:
+    """A model's damping_ratio as a number, or None. Raises PlantError outside (0, 1)."""
+    if ratio is not None and not 0.0 < float(ratio) < 1.0:
+        raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
+    return None if ratio is None else float(ratio)
+
+
+def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
+    """The plant's matrices and exact derivatives at θ; without derivatives where that is cheaper.
+
+    Raises PlantError where they are not finite, M or K not symmetric, or M not positive definite.
+    """
+    cheaper = plant.values is not None and not derivatives
+    system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
+    M, K = system.M, system.K
+    values = (M, system.D, K, system.B, system.C, *system.derivatives)
+    if not all(np.isfinite(value).all() for value in values):
+        raise PlantError(f"the plant is not finite at theta = {theta_words(plant, theta)}")
+    if max(np.abs(value).max(initial=0.0) for value in values) > LARGEST_ENTRY:
+        place = f"at theta = {theta_words(plant, theta)}"
+        words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}; choose other units"
+        raise PlantError(words)
+    for name, matrix in (("mass", M), ("stiffness", K)):
+        gap = np.abs(matrix - matrix.T)
+        if gap.max() > 1e-9 * np.abs(matrix).max():
+            i, j = np.unravel_index(int(gap.argmax()), gap.shape)
+            entries = (
+                f"row {i + 1}, column {j + 1} is {matrix[i, j]:g}, its mirror {matrix[j, i]:g}"
+            )
+            words = f"{name} is not symmetric at theta = {theta_words(plant, theta)}"
+            raise PlantError(f"{words}: {entries}; make it symmetric")
+    try:
+        np.linalg.cholesky(M)
+    except np.linalg.LinAlgError:
+        least = float(np.linalg.eigvalsh(M)[0])
+        words = f"mass is not positive definite at theta = {theta_words(plant, theta)}"
+        remedy = "give every coordinate a mass, or narrow the bounds of theta"
+        raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
+    return system
+
+
+def _from_casadi(
+    matrices: ca.Function, damping_ratio: float | None, theta: Sequence[float]
+) -> Mechanics:
+    values = [np.array(value) for value in matrices(np.asarray(theta, float))]
+    M, D, K, B, C = values[:5]
+    slopes = tuple(
+        value.reshape(matrix.shape[1], matrix.shape[0], len(theta)).transpose(2, 1, 0).copy()
+        for matrix, value in zip(values[:5], values[5:], strict=True)
+    )
+    return Mechanics(M, D, K, B, C, damping_ratio, slopes)  # type: ignore[arg-type]
+
+
+def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:
+    """f(θ)."""
+    return float(plant.hardware(np.asarray(theta, float))[0])
+
+
+def constraint_values(plant: Plant, theta: Sequence[float] | Array) -> Array:
+    """λ(θ), one value a name of `plant.constraint_names`; met where <= 0."""
+    return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
+
+
+def theta_words(plant: Plant, theta: Sequence[float]) -> str:
+    """θ as `name=value, name=value`."""
+    return ", ".join(f"{name}={value:g}" for name, value in zip(plant.names, theta, strict=True))

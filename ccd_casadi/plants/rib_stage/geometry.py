@@ -1,0 +1,161 @@
+"""The rib-reinforced stage: parameters, lengths, mass and the room its bays must keep.
+
+The stage is ours. The paper gives neither side length nor ribs nor bounds; this family was
+fitted to its two published points, (1.02 kg, 250.0 Hz) and (0.59 kg, 110.5 Hz).
+
+A square 6061-T6 plate, side L, carries square ribs on its upper face: a frame along the edges
+(t_o thick), ribs at ±x_i (t_i) and one through the centre (t_c), alike along x and y, all of
+height H above the plate of thickness h. From the centre outwards the intervals of an axis are
+
+    t_c/2 | b_2 = x_i - t_i/2 - t_c/2 | t_i | b_1 = L/2 - x_i - t_o - t_i/2 | t_o,
+
+affine in θ. Origin at the centre of the lower face, z upwards. SI units throughout.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
+
+NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")
+LOWER = (1e-3, 3e-3, 3e-3, 3e-3, 6e-3, 67.5e-3)
+UPPER = (4e-3, 8e-3, 8e-3, 8e-3, 20e-3, 95e-3)
+AXIS_LENGTHS = ("t_c/2", "b_2", "t_i", "b_1", "t_o")  # from the centre outwards
+IS_RIB = (True, False, True, False, True)
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic linear elasticity: E in Pa, Poisson's ratio, density in kg/m³; 6061-T6."""
+
+    young: float = 68.9e9
+    poisson: float = 0.33
+    density: float = 2700.0
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A magnet or target: mass in kg without rotary inertia, fixed to the lower face at (x, y)."""
+
+    x: float
+    y: float
+    mass: float
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What of the stage does not change with θ: side in m, material, added masses, least bay."""
+
+    side: float = 0.3
+    material: Material = field(default_factory=Material)
+    point_masses: tuple[PointMass, ...] = ()
+    least_bay: float = 8e-3
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass (kg), centre of gravity (m) and inertia tensor about it (kg m²), rows x, y, z.
+
+    Entries are floats or CasADi expressions, as θ is.
+    """
+
+    mass: Any
+    centre: tuple[Any, Any, Any]
+    inertia: tuple[tuple[Any, Any, Any], ...]
+
+
+def corners(geometry: Geometry) -> tuple[Point, ...]:
+    """The four corners of the lower face, counter-clockwise from (+, +)."""
+    a = 0.5 * geometry.side
+    return ((a, a), (-a, a), (-a, -a), (a, -a))
+
+
+def axis_lengths(geometry: Geometry) -> tuple[Array, Array]:
+    """(5,) and (5, 6): lengths of an axis' intervals from the centre outwards are l₀ + S θ."""
+    offset = np.array([0.0, 0.0, 0.0, 0.5 * geometry.side, 0.0])
+    slope = np.zeros((5, 6))
+    t_o, t_i, t_c, x_i = (NAMES.index(name) for name in ("t_o", "t_i", "t_c", "x_i"))
+    slope[0, t_c] = 0.5
+    slope[1, [x_i, t_i, t_c]] = 1.0, -0.5, -0.5
+    slope[2, t_i] = 1.0
+    slope[3, [x_i, t_o, t_i]] = -1.0, -1.0, -0.5
+    slope[4, t_o] = 1.0
+    return offset, slope
+
+
+def height_lengths() -> tuple[Array, Array]:
+    """(2,) and (2, 6): plate thickness and rib height, as `axis_lengths`."""
+    slope = np.zeros((2, 6))
+    slope[0, NAMES.index("h")] = slope[1, NAMES.index("H")] = 1.0
+    return np.zeros(2), slope
+
+
+def bays(geometry: Geometry, theta: Sequence[Any]) -> tuple[Any, Any]:
+    """Widths (b_1, b_2) of the outer and the inner bay in m; floats or CasADi symbols."""
+    _, t_o, t_i, t_c, _, x_i = _six(theta)
+    return 0.5 * geometry.side - x_i - t_o - 0.5 * t_i, x_i - 0.5 * t_i - 0.5 * t_c
+
+
+def constraints(geometry: Geometry, theta: Sequence[Any]) -> dict[str, Any]:
+    """λ(θ) = 1 - b/b_least for both bays, without unit, met where <= 0."""
+    outer, inner = bays(geometry, theta)
+    return {"bay_1": 1.0 - outer / geometry.least_bay, "bay_2": 1.0 - inner / geometry.least_bay}
+
+
+def mass(geometry: Geometry, theta: Sequence[Any]) -> Any:
+    """Mass in kg, ρ (L² h + (L² - W²) H) + point masses, W the sum of an axis' bays.
+
+    >>> theta = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)
+    >>> f"{mass(Geometry(), theta):.4f}"
+    '1.0189'
+    """
+    return mass_properties(geometry, theta).mass
+
+
+def mass_properties(geometry: Geometry, theta: Sequence[Any]) -> MassProperties:
+    """Mass, centre of gravity and inertia in closed form, exact for the stage as drawn."""
+    h, _, t_i, t_c, H, x_i = _six(theta)
+    L, rho = geometry.side, geometry.material.density
+    outer, inner = bays(geometry, theta)
+    W = 2.0 * (outer + inner)
+    inner_end, outer_start = 0.5 * t_c + inner, x_i + 0.5 * t_i
+    # ∫y² over an axis' bays; ribs are the square less bays times bays
+    square = (inner_end**3 - (0.5 * t_c) ** 3) + ((outer_start + outer) ** 3 - outer_start**3)
+    plate, ribs = rho * L**2 * h, rho * (L**2 - W**2) * H
+    second = rho * (h * L**4 / 12.0 + H * (L**4 / 12.0 - W * 2.0 * square / 3.0))
+    first_z = plate * h / 2.0 + ribs * (h + H / 2.0)
+    second_z = plate * h**2 / 3.0 + ribs * (h**2 + h * H + H**2 / 3.0)
+    added = geometry.point_masses  # all at z = 0
+    total = plate + ribs + sum(p.mass for p in added)
+    x = sum(p.mass * p.x for p in added) / total
+    y = sum(p.mass * p.y for p in added) / total
+    z = first_z / total
+    xx = second + sum(p.mass * p.x**2 for p in added) - total * x * x
+    yy = second + sum(p.mass * p.y**2 for p in added) - total * y * y
+    zz = second_z - total * z * z
+    xy = sum(p.mass * p.x * p.y for p in added) - total * x * y
+    xz, yz = -total * x * z, -total * y * z
+    inertia = ((yy + zz, -xy, -xz), (-xy, xx + zz, -yz), (-xz, -yz, xx + yy))
+    return MassProperties(total, (x, y, z), inertia)
+
+
+def has_square_symmetry(geometry: Geometry) -> bool:
+    """Whether the point masses look the same after any mirror or quarter turn of the square."""
+
+    def table(points: list[tuple[float, float, float]]) -> list[tuple[float, ...]]:
+        heavy = [p for p in points if p[2] != 0.0]
+        return sorted(tuple(round(v, 12) + 0.0 for v in p) for p in heavy)
+
+    here = [(p.x, p.y, p.mass) for p in geometry.point_masses]
+    mirrored = [(-x, y, m) for x, y, m in here]
+    swapped = [(y, x, m) for x, y, m in here]
+    return table(here) == table(mirrored) == table(swapped)
+
+
+def _six(theta: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(theta[i] for i in range(len(NAMES)))

@@ -1,0 +1,223 @@
+"""The scaled plant: time, force and state units in which every loop looks alike.
+
+Time is counted in 1/ω₀ with ω₀² = M_K ‖C‖ ‖B‖ (mass-normalised), the frequency at which M_K
+times the inertial compliance is about one; force in M_K times the unit of y. So the scaled
+plant M_K G(jω₀ω) has no units and does not change when the user's units do.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eig, matrix_balance
+
+from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.plants.channels import Channel, find_channels
+from ccd_casadi.plants.modal import ModalPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """ẋ = A x + B v, z = C x + D v."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+
+@dataclass(frozen=True)
+class ScaledChannel:
+    """One block of a block-diagonal plant: Uᵀ G V = C(s - A)⁻¹B, its grid and least gain there.
+
+    `states` are those of the whole plant; U = `outputs` (p, k), V = `inputs` (m, k).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    grid: Array
+    gain: Array
+    states: np.ndarray
+    outputs: Array
+    inputs: Array
+
+
+@dataclass(frozen=True)
+class PlantFamily:
+    """A plant off its model: what the controller is designed on, and what it has to hold on.
+
+    All have the ω₀, the force and the drive of the plant that they belong to.
+    """
+
+    design: "ScaledPlant"
+    perturbed: tuple["ScaledPlant", ...]
+
+
+@dataclass(frozen=True)
+class ScaledPlant:
+    """State space (A, B, C) of M_K G(jω₀ω), what its kernels need, and the way back to SI.
+
+    `grid` are frequencies over ω₀ that resolve every resonance and transmission zero, `gain`
+    the least singular value of the scaled plant there. `dA`, `dB`, `dC` are derivatives to θ
+    with ω₀ and the coordinates frozen. `channels` are the blocks of an exactly block-diagonal
+    plant (see `channels`), empty where it is not. With a `family` a synthesis is one for all of
+    it, and the peak of S the largest on any of it, this plant included.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    omega_0: float
+    force: float
+    grid: Array
+    gain: Array
+    natural: Array
+    dA: Array
+    dB: Array
+    dC: Array
+    channels: tuple[ScaledChannel, ...] = ()
+    family: PlantFamily | None = None
+
+    def plant_si(self) -> StateSpace:
+        """The plant, force to displacement, time in s."""
+        w0 = self.omega_0
+        D = np.zeros((self.C.shape[0], self.B.shape[1]))
+        return StateSpace(w0 * self.A, w0 / self.force * self.B, self.C.copy(), D)
+
+    def controller_si(self, A: Array, B: Array, C: Array) -> StateSpace:
+        """A controller of the scaled plant, error in to force out, time in s."""
+        D = np.zeros((C.shape[0], B.shape[1]))
+        return StateSpace(self.omega_0 * A, self.omega_0 * B, self.force * C, D)
+
+
+def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
+    """Scale a modal plant for weights with this M_K; M_K in N/m (force over displacement).
+
+    Raises PlantError where no mode is both driven and measured.
+    """
+    b = np.linalg.norm(modal.B, axis=1)
+    c = np.linalg.norm(modal.C, axis=0)
+    omega_0 = float(np.sqrt(M_K * np.linalg.norm(b) * np.linalg.norm(c)))
+    if not omega_0 > 0.0:
+        raise PlantError("input or output is zero: no mode is both driven and measured")
+    K, D = modal.K / omega_0**2, modal.D / omega_0
+    drive = M_K / omega_0**2
+    # Stretch x1 = s q so that ẋ1 = s x2 and ẋ2 = -(K/s) x1 weigh alike; mode sizes by a, so
+    # that each mode is driven as strongly as it is measured.
+    s = np.maximum(np.sqrt(np.diag(K)), 1.0)
+    both = (b > 1e-12 * b.max()) & (c > 1e-12 * c.max())
+    a = np.sqrt(np.divide(drive * b * s, c, out=np.ones_like(b), where=both))
+    n, m, p = K.shape[0], modal.B.shape[1], modal.C.shape[0]
+    left, right = 1.0 / a, a
+
+    def lower(M: Array) -> Array:
+        return left[:, None] * M * right
+
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:] = np.diag(s)
+    A[n:, :n] = -lower(K) / s
+    A[n:, n:] = -lower(D)
+    B = np.vstack([np.zeros((n, m)), left[:, None] * drive * modal.B])
+    C = np.hstack([modal.C * right / s, np.zeros((p, n))])
+    count = modal.dM.shape[0]
+    dA, dB = np.zeros((count, 2 * n, 2 * n)), np.zeros((count, 2 * n, m))
+    dC = np.zeros((count, p, 2 * n))
+    for i in range(count):
+        dK = modal.dK[i] / omega_0**2 - modal.dM[i] @ K
+        dD = modal.dD[i] / omega_0 - modal.dM[i] @ D
+        dA[i, n:, :n] = -lower(dK) / s
+        dA[i, n:, n:] = -lower(dD)
+        dB[i, n:] = left[:, None] * drive * (modal.dB[i] - modal.dM[i] @ modal.B)
+        dC[i, :, :n] = modal.dC[i] * right / s
+    grid, gain = _gains(A, B, C)
+    channels = _scaled_channels(find_channels(modal.K, modal.D, modal.B, modal.C), A, B, C)
+    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
+
+
+def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
+    """The scaled plant of any strictly proper state space in SI, for weights with this M_K (N/m).
+
+        ω₀² = M_K ‖C A B‖, the inertial compliance being C A B / s²
+
+    Coordinates are balanced; there are no derivatives and no channels. Raises PlantError for a
+    plant with feedthrough, that is not finite, or that no state drives.
+    """
+    n, m, p = len(system.A), system.B.shape[1], system.C.shape[0]
+    if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C)):
+        raise PlantError("its state space is not finite")
+    if np.any(system.D):
+        raise PlantError("it has a direct feedthrough; a plant is force to displacement, D = 0")
+    inertial = float(np.linalg.norm(system.C @ system.A @ system.B, 2))
+    if not inertial > 0.0:
+        raise PlantError("C A B is zero: no force accelerates what is measured")
+    omega_0 = float(np.sqrt(M_K * inertial))
+    A, B, C = balanced(system.A / omega_0, system.B * (M_K / omega_0), system.C)
+    grid, gain = _gains(A, B, C)
+    poles = np.linalg.eigvals(system.A)
+    natural = np.sort(np.abs(poles[poles.imag >= 0.0]))
+    none = (np.zeros((0, n, n)), np.zeros((0, n, m)), np.zeros((0, p, n)))
+    return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
+
+
+def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
+    """T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two that evens out the states' scales.
+
+    Inputs and outputs keep their units: balancing leaves alone what has an empty row or column.
+    """
+    n, m, p = len(A), B.shape[1], C.shape[0]
+    system = np.zeros((n + m + p, n + m + p))
+    system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
+    even, _ = matrix_balance(system, permute=False)
+    parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
+    A, B, C = (np.ascontiguousarray(part) for part in parts)
+    return A, B, C
+
+
+def _scaled_channels(
+    channels: tuple[Channel, ...], A: Array, B: Array, C: Array
+) -> tuple[ScaledChannel, ...]:
+    if len(channels) < 2:
+        return ()
+    found = []
+    for channel in channels:
+        states = np.concatenate([channel.modes, channel.modes + len(A) // 2])
+        a = np.ascontiguousarray(A[np.ix_(states, states)])
+        b = np.ascontiguousarray(B[states] @ channel.inputs)
+        c = np.ascontiguousarray(channel.outputs.T @ C[:, states])
+        found.append(
+            ScaledChannel(a, b, c, *_gains(a, b, c), states, channel.outputs, channel.inputs)
+        )
+    return tuple(found)
+
+
+def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
+    """The frequency grid, and the least singular value of the plant on it."""
+    grid = _frequency_grid(A, B, C)
+    return grid, plant_gain(A, B, C, grid)
+
+
+def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
+    """A logarithmic grid with points crowded around lightly damped poles and zeros."""
+    roots = np.concatenate([np.linalg.eigvals(A), transmission_zeros(A, B, C)])
+    roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
+    pieces = [np.geomspace(1e-5, 1e5, 121)]
+    flanks = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
+    for root in roots:
+        half = max(abs(root.real), 1e-9 * root.imag)
+        pieces += [root.imag + half * flanks, root.imag - half * flanks[1:]]
+    grid = np.unique(np.concatenate(pieces))
+    return np.ascontiguousarray(grid[(grid >= 1e-5) & (grid <= 1e5)])
+
+
+def transmission_zeros(A: Array, B: Array, C: Array) -> np.ndarray:
+    """Finite invariant zeros of a square plant in its own unit of time; none if not square."""
+    n, m = B.shape
+    if C.shape[0] != m:
+        return np.empty(0, complex)
+    system = np.block([[A, B], [C, np.zeros((m, m))]])
+    shape = np.zeros_like(system)
+    shape[:n, :n] = np.eye(n)
+    values = eig(system, shape, right=False)
+    return values[np.isfinite(values) & (np.abs(values) < 1e5)]

@@ -1,0 +1,308 @@
+"""report.html of a deployment: full, reduced and sampled loop, orders, sections."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import cont2discrete
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.c_code import COMPILE
+from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.sections import Root, sections_of
+from ccd_casadi.deployment.simulation import step_errors
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    facts_html,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+    preformatted,
+    table_html,
+)
+from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import responses
+
+POINTS = 900
+SHOWN = 40  # measured points in the plot, and rows in the tables
+PERIODS = 6.0  # of ω_b that the step is shown for
+
+
+def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
+    """One self-contained page."""
+    title = f"Controller of {run.folder.resolve().name}, deployed"
+    reason = "" if found.passed else "S_max within 5 % and ω_b within 3 % are not both kept"
+    meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
+    sections = [Section("The loop", _loop(run, found)), Section("Figures", _facts(run, found))]
+    if found.sampled.stable:
+        sections.append(Section("Step of the reference", _step(run, found)))
+    sections += [
+        Section("Sampling rate", _rates(found)),
+        Section("Orders", "\n".join(_orders(item, run) for item in found.orders)),
+        Section("As sections", "\n".join(_sections(item, run) for item in found.orders)),
+    ]
+    if found.sampled.stable:
+        sections.append(Section("The code", _code(found)))
+    status = "verified" if found.passed else "not verified"
+    head = header(title, found.passed, status, reason, meta, _conclusion(run, found))
+    path.write_text(page(title, sections, head), encoding="utf-8")
+
+
+def _conclusion(run: FinishedRun, found: Deployment) -> str:
+    K, full = found.sampled, run.figures
+    orders = " + ".join(str(item.chosen.order) for item in found.orders)
+    before = " + ".join(str(item.rows[0].order) for item in found.orders)
+    if not K.stable:
+        return f"At {number(found.rate_hz)} Hz the sampled loop is unstable."
+    return (
+        f"{orders} states instead of {before} (synthesised: {len(run.controller.A)}), at "
+        f"{number(found.rate_hz)} Hz with a delay of "
+        f"{number(1e6 * found.delay, 4)} µs: bandwidth {number(K.bandwidth / HZ)} Hz "
+        f"({_percent(K.bandwidth, full.bandwidth)}), peak of S {number(K.sensitivity_peak)} "
+        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max)."
+    )
+
+
+def _percent(value: float, reference: float) -> str:
+    return f"{round(100.0 * (value / reference - 1.0), 2) + 0.0:+.2f} %"
+
+
+def _loop(run: FinishedRun, found: Deployment) -> str:
+    nyquist = 0.5 * found.rate_hz
+    low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
+    around = run.plant.grid * run.plant.omega_0 / HZ
+    hz = np.unique(np.concatenate([np.geomspace(low, high, POINTS), around]))
+    hz = hz[(hz >= low) & (hz <= high)]
+    gains, controllers = [], []
+    for K in (run.controller, found.reduced):
+        _, k, S = responses(run.plant, K, HZ * hz)
+        gains.append(_gain(S))
+        controllers.append(_gain(k))
+    k = found.realisation.system.response(HZ * hz)
+    G = found.plant.response(HZ * hz)
+    gains.append(_gain(np.linalg.inv(np.eye(G.shape[1]) + G @ k)))
+    controllers.append(_gain(k))
+    colours = (BLUE, GREEN, ORANGE)
+    labels = ("full, continuous", "reduced, continuous", f"sampled at {number(found.rate_hz)} Hz")
+    lines = ("-", "--", "-")
+    curves = [
+        Curve(hz, gain, label, colour, line)
+        for gain, label, colour, line in zip(gains, labels, colours, lines, strict=True)
+    ]
+    if found.measured is not None:
+        at = _spread(found.measured.omega / HZ, low)
+        curves.append(
+            Curve(found.measured.omega[at] / HZ, found.measured.gain[at],
+                  "measured in the simulation", BLACK, "", ".")
+        )  # fmt: skip
+    S_max = run.problem.inner.S_max
+    bandwidth = run.figures.bandwidth / HZ
+    top = Panel(
+        "frequency (Hz)", "σ_max(S) (–)", tuple(curves),
+        levels=(
+            Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY),
+            Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz", True),
+        ),
+        log_x=True, log_y=True, x_range=(low, nyquist), legend="lower right",
+    )  # fmt: skip
+    bottom = Panel(
+        "frequency (Hz)", "σ_max(K) (N/m)",
+        tuple(
+            Curve(hz, gain, "", colour, line)
+            for gain, colour, line in zip(controllers, colours, lines, strict=True)
+        ),
+        log_x=True, log_y=True, x_range=(low, nyquist),
+    )  # fmt: skip
+    svg = figure_lines(
+        [[top], [bottom]], key="deployed-loop", heights=(3.4, 2.4),
+        title="Sensitivity and controller: full, reduced and sampled, over frequency",
+    )  # fmt: skip
+    rows = [int(np.abs(hz - f).argmin()) for f in np.geomspace(low, high, SHOWN)]
+    table = Table(
+        ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
+        tuple(
+            (float(hz[i]), *(float(g[i]) for g in (*gains, *controllers)))
+            for i in sorted(set(rows))
+        ),
+    )
+    caption = (
+        "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
+        f"up to half the sampling rate. There the controller's gain is "
+        f"{controllers[2][-1]:.3g} N/m (reduced: {controllers[1][-1]:.3g}, full: "
+        f"{controllers[0][-1]:.3g}): "
+        "that is what sensor noise and unmodelled resonances meet."
+    )
+    return figure_html(svg, caption, table)
+
+
+def _gain(response: np.ndarray) -> Array:
+    return np.asarray(np.linalg.norm(response, 2, axis=(1, 2)))
+
+
+def _spread(hz: Array, low: float) -> list[int]:
+    """Places of frequencies from `low` on, evenly spread over the axis."""
+    first = int(np.searchsorted(hz, low))
+    wanted = np.geomspace(hz[first], hz[-1], SHOWN)
+    return sorted({first + int(np.abs(hz[first:] - f).argmin()) for f in wanted})
+
+
+def _facts(run: FinishedRun, found: Deployment) -> str:
+    full, small, sampled = run.figures, found.reduced_figures, found.sampled
+    S_max = run.problem.inner.S_max
+
+    def remark(peak: float, bandwidth: float) -> str:
+        return (
+            f"peak {number(peak, 6)} ({_percent(peak, S_max)} of S_max); bandwidth "
+            f"{_percent(bandwidth, full.bandwidth)}"
+        )
+
+    def hz(omega: float) -> str:
+        return f"{number(omega / HZ, 6)} Hz"
+
+    rows = [
+        ("Full", hz(full.bandwidth), remark(full.sensitivity_peak, full.bandwidth)),
+        ("Reduced", hz(small.bandwidth), remark(small.sensitivity_peak, small.bandwidth)),
+        ("Sampled, exact", hz(sampled.bandwidth),
+         remark(sampled.sensitivity_peak, sampled.bandwidth)),
+    ]  # fmt: skip
+    if found.measured is not None:
+        m = found.measured
+        rows.append((
+            "Sampled, simulated", hz(m.bandwidth),
+            f"{remark(m.sensitivity_peak, m.bandwidth)}; multisine, {m.periods} periods, changing "
+            f"by {number(m.leftover, 2)} from one to the next",
+        ))  # fmt: skip
+    rows.append(("Slowest sampled mode", number(sampled.spectral_radius, 8), "must be below 1"))
+    unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
+    words = (
+        "The controller is unstable by itself (its loop is not): close the loop at rest, and open "
+        "it when the actuator saturates."
+    )
+    return facts_html(rows) + (paragraph(words) if unstable else "")
+
+
+def _step(run: FinishedRun, found: Deployment) -> str:
+    direction = found.orders[0].channel.outputs[:, 0]
+    seconds = PERIODS * HZ / run.figures.bandwidth
+    t, errors = step_errors(found.plant, found.realisation.system, direction, seconds)
+    y = 1.0 - errors @ direction
+    curves = [
+        Curve(t_c, y_c, label, colour, line)
+        for (t_c, y_c), label, colour, line in (
+            (_continuous(run, run.controller, direction, seconds), "full", BLUE, "-"),
+            (_continuous(run, found.reduced, direction, seconds), "reduced", GREEN, "--"),
+            ((1e3 * t, y), "sampled", ORANGE, "-"),
+        )
+    ]
+    where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
+    panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves), legend="lower right")
+    svg = figure_lines(
+        [[panel]], key="deployed-step", title="Step of the reference", heights=(3.0,)
+    )
+    rows = np.unique(np.linspace(0, len(t) - 1, SHOWN).astype(int))
+    table = Table(("ms", "y"), tuple((1e3 * float(t[i]), float(y[i])) for i in rows))
+    caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
+    return figure_html(svg, caption, table)
+
+
+def _continuous(
+    run: FinishedRun, K: StateSpace, direction: Array, seconds: float
+) -> tuple[Array, Array]:
+    """Times in ms and the step of the continuous loop, exact at these times."""
+    G = run.plant.plant_si()
+    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+    B = np.vstack([G.B @ K.D, K.B]) @ direction[:, None]
+    C = direction[None, :] @ np.hstack([G.C, np.zeros((len(G.C), len(K.A)))])
+    step = seconds / POINTS
+    times = np.array([1e3 * step * i for i in range(POINTS)])
+    Ad, Bd, _, _, _ = cont2discrete((A, B, C, np.zeros((1, 1))), step, "zoh")
+    x, y = np.zeros((len(A), 1)), []
+    for _ in range(POINTS):
+        y.append(float((C @ x)[0, 0]))
+        x = Ad @ x + Bd
+    return times, np.array(y)
+
+
+def _rates(found: Deployment) -> str:
+    rows = tuple(
+        (
+            trial.conversion.label,
+            "none" if trial.needed_hz is None else number(trial.needed_hz, 4),
+            "used" if trial.conversion == found.conversion else "",
+        )
+        for trial in found.trials
+    )
+    words = (
+        "The least rate from which on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
+        "included. The lead makes up for the phase of hold and delay, and raises the gain at half "
+        "the sampling rate."
+    )
+    return paragraph(words) + table_html(Table(("method", "needed rate, Hz", ""), rows))
+
+
+def _orders(item: ChannelOrders, run: FinishedRun) -> str:
+    head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
+    rows = []
+    for row in item.rows:
+        f = row.figures
+        chosen = "chosen" if row is item.chosen else ""
+        result = chosen if f.certified else f.outcome.value
+        rows.append((
+            row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
+            f.gamma / run.figures.gamma if f.certified else float("nan"), result,
+        ))  # fmt: skip
+    words = (
+        f"Channel {item.channel.name}: of {item.rows[0].order} states {item.chosen.order} are "
+        f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
+        f"above twice its bound; {item.strict.order} keep S_max itself."
+    )
+    table = table_html(Table(head, tuple(rows)))
+    return paragraph(words) + f'<div class="scroll">{table}</div>'
+
+
+def _sections(item: ChannelOrders, run: FinishedRun) -> str:
+    K = item.chosen.controller
+    if K.D.shape != (1, 1):
+        words = "This controller does not fall apart into scalar channels: no sections."
+        return paragraph(words)
+    found = sections_of(K, run.figures.bandwidth)
+    rows = tuple(
+        (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
+    )
+    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
+    words = (
+        f"Channel {item.channel.name}: gain {number(found.gain, 6)} N/m at s = 0, "
+        f"{number(found.gain_at_bandwidth, 6)} N/m at ω_b; every section has the gain 1 at s = 0. "
+        "A negative ζ, or a negative frequency of a single root, is one in the right half plane."
+    )
+    return paragraph(words) + table_html(Table(head, rows))
+
+
+def _depth(value: float | None) -> str:
+    return "" if value is None else number(value, 4)
+
+
+def _root(root: Root | None) -> tuple[str, str]:
+    if root is None:
+        return "", ""
+    return number(root.hz, 5), "" if root.damping is None else number(root.damping, 4)
+
+
+def _code(found: Deployment) -> str:
+    K = found.realisation
+    sizes = f"{K.blocks.count(1)} of one state, {K.blocks.count(2)} of two"
+    larger = len(K.blocks) - K.blocks.count(1) - K.blocks.count(2)
+    words = (
+        f"controller.c holds {len(K.system.A)} states, A block-diagonal ({sizes}"
+        f"{f', {larger} larger' if larger else ''}). Call controller_step every "
+        f"{number(1e6 * K.system.period, 6)} µs. controller_test.c compares it with forces that "
+        "the Python difference equation gave:"
+    )
+    return paragraph(words) + preformatted(f"{COMPILE}\n./controller_test")

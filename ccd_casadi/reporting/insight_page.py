@@ -1,0 +1,80 @@
+"""insight.html: the trade-off around a design, and what it answers to."""
+
+from pathlib import Path
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.insight import natural_hz
+from ccd_casadi.codesign.pareto import Front
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.insight import (
+    caption_front,
+    figure_front,
+    response_sentences,
+    rule_sentence,
+    table_front,
+    table_responses,
+)
+from ccd_casadi.reporting.limits import limit_sentences, table_limits
+from ccd_casadi.reporting.page import (
+    Section,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+    table_html,
+)
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import loop_data
+from surrogates.files import write_whole
+
+
+def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostOptimal) -> Path:
+    """Write insight.html, atomically."""
+    path = folder / "insight.html"
+    write_whole(path, insight_html(run, front, responses))
+    return path
+
+
+def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
+    """The page's text."""
+    problem, figures = run.problem, run.figures
+    bandwidth_hz = figures.bandwidth / HZ
+    cost = float(run.result["hardware_cost"])
+    loop = loop_data(
+        run.plant,
+        run.controller,
+        run.weights,
+        gamma=figures.gamma,
+        bandwidth_hz=bandwidth_hz,
+        omega_low=problem.inner.omega_low,
+    )
+    verified = sum(point.verified for point in front.points)
+    whole = verified == len(front.points)
+    title = f"Insight: {run.case.path.parent.name}"
+    head = header(
+        title,
+        whole,
+        "verified" if whole else "not all verified",
+        f"{verified} of {len(front.points)} points of the front",
+        f"around the design of {run.folder.name}/result.json",
+        f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
+        f"of {number(cost)}. {rule_sentence(loop, natural_hz(run))}",
+    )
+    drawn = figure_front(problem, front, (cost, bandwidth_hz, "this run's design"))
+    words = "\n".join(paragraph(text) for text in response_sentences(responses))
+    limits = "\n".join(
+        paragraph(text) for text in (*limit_sentences(loop), rule_sentence(loop, natural_hz(run)))
+    )
+    sections = [
+        Section(
+            "Weight against bandwidth",
+            figure_html(drawn, caption_front(front), table_front(problem, front)),
+        ),
+        Section(
+            "What the optimum answers to", words + table_html(table_responses(problem, responses))
+        ),
+        Section("What limits the bandwidth", limits + table_html(table_limits(loop))),
+    ]
+    return page(title, sections, head)

@@ -1,0 +1,195 @@
+"""The figures of robustness.html and the tables behind them."""
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Table
+from ccd_casadi.reporting.svg import BLUE, CYCLE, GREY, ORANGE
+from ccd_casadi.robust.move import Move
+from ccd_casadi.robust.perturbed import Line
+from ccd_casadi.robust.structured import StructuredBound
+from ccd_casadi.robust.study import Study
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+SHOWN = 45  # rows of a table
+DRAWN = 1500  # points of a curve in time
+
+
+def gains(found: Study) -> str:
+    """S and T in one panel, GS and KS in one each."""
+    ends = (float(found.hz[0]), float(found.hz[-1]))
+
+    def panel(label: str, *curves: tuple[int, str]) -> Panel:
+        drawn = tuple(
+            Curve(found.hz, found.gains[i], name, CYCLE[k]) for k, (i, name) in enumerate(curves)
+        )
+        return Panel("frequency (Hz)", label, drawn, log_x=True, log_y=True, x_range=ends)
+
+    rows = [
+        [panel("σ_max (–)", (0, "S"), (1, "T"))],
+        [panel("σ_max(GS) (m/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))],
+    ]
+    return figure_lines(rows, key="responses", title="S, T, GS and KS over frequency")
+
+
+def gains_table(found: Study) -> Table:
+    """Some frequencies, the peaks among them."""
+    hz = found.hz
+    wanted = np.concatenate([np.geomspace(hz[0], hz[-1], SHOWN), hz[found.gains.argmax(axis=1)]])
+    rows = sorted({int(np.abs(hz - value).argmin()) for value in wanted})
+    head = ("Hz", "S", "T", "GS m/N", "KS N/m")
+    return Table(head, tuple((float(hz[i]), *map(float, found.gains[:, i])) for i in rows))
+
+
+def perturbed(run: FinishedRun, found: Study) -> str:
+    """Peak and bandwidth over the shift, and over the damping."""
+    S_max = run.problem.inner.S_max
+    rows = []
+    for line, label, factor in (
+        (found.shift, "resonance shift (%)", 100.0),
+        (found.damping, "damping × (–)", 1.0),
+    ):
+        x, peak, bandwidth = _columns(line)
+        # the axis shows what matters about S_max; a loop near instability has any peak
+        top = min(float(np.nanmax(peak)) * 1.05, 3.0 * S_max)
+        limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
+        ends = (factor * float(x[0]), factor * float(x[-1]))
+        curve = Curve(factor * x, np.where(peak <= top, peak, np.nan), marker=".")
+        span = (1.0, max(top, 1.1 * S_max))
+        lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
+        faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
+        rows.append([
+            Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=limit, x_range=ends,
+                  y_range=span),
+            Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
+        ])  # fmt: skip
+    return figure_lines(rows, key="perturbed", title="Peak of S and bandwidth off the model")
+
+
+def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
+    """The ends of a line on which the loop is lost, in grey."""
+    found: list[Band] = []
+    for outer, edge in ((x[0], stable[0]), (x[-1], stable[1])):
+        if outer != edge and np.isnan(peak).any():
+            ends = np.array([outer, edge])
+            label = "" if found else "unstable"
+            found.append(Band(ends, np.full(2, span[0]), np.full(2, span[1]), label, GREY))
+    return tuple(found)
+
+
+def line_table(name: str, line: Line) -> Table:
+    """Every plant of a line."""
+    rows = tuple(
+        (item.place[0], "yes" if item.stable else "NO", item.bandwidth / HZ, item.peak)
+        for item in line.judged
+    )
+    return Table((name, "stable", "ω_b Hz", "‖S‖∞"), rows)
+
+
+def tolerances(run: FinishedRun, found: Study) -> str:
+    """Empirical distributions of peak and bandwidth over the random plants."""
+    judged = found.tolerances.judged
+    peak = np.sort([item.peak for item in judged if item.stable])
+    bandwidth = np.sort([item.bandwidth / HZ for item in judged if item.stable])
+    share = (np.arange(peak.size) + 1.0) / max(len(judged), 1)
+    S_max = run.problem.inner.S_max
+    kept = peak <= 5.0 * S_max
+    limit = (Level(S_max, "S_max", vertical=True), Level(1.0, "all"))
+    panels = [
+        Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak[kept], share[kept]),),
+              levels=limit, y_range=(0.0, 1.08)),
+        Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
+              y_range=(0.0, 1.08)),
+    ]  # fmt: skip
+    return figure_lines([panels], key="tolerances", title="Peak and bandwidth of random hardware")
+
+
+def tolerance_table(found: Study) -> Table:
+    """Quantiles of the plants, the unstable ones counted as infinite peaks."""
+    judged = found.tolerances.judged
+    peaks = np.sort([item.peak for item in judged])
+    bands = np.sort([item.bandwidth / HZ if item.stable else 0.0 for item in judged])
+    rows = []
+    for share in (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0):
+        i = round(share * (len(judged) - 1))
+        rows.append((share, float(peaks[i]), float(bands[i])))
+    return Table(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), tuple(rows))
+
+
+def structured(bound: StructuredBound) -> str:
+    """1/μ is what is allowed of complex errors; the level is what is allowed of real ones."""
+    panel = Panel(
+        "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
+        levels=(
+            Level(1.0 / bound.stiffness, f"real errors, decided at {bound.worst_hz:.4g} Hz"),
+        ),
+        log_x=True, log_y=True,
+        y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
+    )  # fmt: skip
+    return figure_lines([[panel]], key="structured", title="Structured singular value")
+
+
+def structured_table(bound: StructuredBound) -> Table:
+    """The surroundings of the highest peak."""
+    best = np.sort(np.argsort(-bound.mu)[:SHOWN])
+    rows = tuple((float(bound.hz[i]), float(bound.mu[i])) for i in best)
+    return Table(("Hz", "μ, complex errors"), rows)
+
+
+def move(found: Move, key: str) -> str:
+    """Setpoint, error and forces over time, the first part of the tail included."""
+    until = found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+    shown = found.time <= until
+    pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
+    t = 1e3 * found.time[pick]
+    end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)
+    unit, scale = _unit(found.peak_error)
+    window = (
+        Level(scale * found.window, "window", colour=GREY),
+        Level(-scale * found.window, "", colour=GREY),
+    )
+    forces = tuple(
+        Curve(t, found.force[pick, j], f"u{j + 1}" if found.force.shape[1] > 1 else "", colour)
+        for j, colour in zip(range(found.force.shape[1]), CYCLE * 4, strict=False)
+    )
+    error = Curve(t, scale * found.error[pick], colour=ORANGE)
+    near = window if found.window < 3.0 * found.peak_error else ()
+    rows = [
+        [Panel("time (ms)", "position (mm)", (Curve(t, 1e3 * found.position[pick]),)),
+         Panel("time (ms)", "acceleration (m/s²)", (Curve(t, found.acceleration[pick]),))],
+        [Panel("time (ms)", f"error ({unit})", (error,),
+               levels=(end, *near)),
+         Panel("time (ms)", "force (N)", forces)],
+    ]  # fmt: skip
+    return figure_lines(rows, key=key, title="Position, acceleration, error and force of a move")
+
+
+def move_table(found: Move) -> Table:
+    """Some instants."""
+    wanted = np.linspace(0, np.flatnonzero(found.time <= 2.0 * found.duration)[-1], SHOWN)
+    head = ("s", "position m", "acceleration m/s²", "error m", *_names(found.force))
+    rows = tuple(
+        (float(found.time[i]), float(found.position[i]), float(found.acceleration[i]),
+         float(found.error[i]), *map(float, found.force[i])) for i in wanted.astype(int)
+    )  # fmt: skip
+    return Table(head, rows)
+
+
+def _names(force: Array) -> list[str]:
+    return [f"u{j + 1} N" for j in range(force.shape[1])]
+
+
+def _unit(size: float) -> tuple[str, float]:
+    for unit, scale in (("mm", 1e3), ("µm", 1e6)):
+        if size * scale >= 1.0:
+            return unit, scale
+    return "nm", 1e9
+
+
+def _columns(line: Line) -> tuple[Array, Array, Array]:
+    place = np.array([item.place[0] for item in line.judged])
+    peak = np.array([item.peak if item.stable else np.nan for item in line.judged])
+    bandwidth = np.array([item.bandwidth / HZ for item in line.judged])
+    return place, peak, bandwidth

@@ -1,0 +1,253 @@
+"""robustness.html: what the design survives, in figures with the numbers behind them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.reporting import robustness_figures as figures
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    facts_html,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+    table_html,
+)
+from ccd_casadi.robust.margins import DiskMargin
+from ccd_casadi.robust.perturbed import Judged, Line
+from ccd_casadi.robust.study import Study
+from ccd_casadi.support.units import HZ
+from surrogates.files import write_whole
+
+
+def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
+    """Write robustness.html, atomically."""
+    path = folder / "robustness.html"
+    write_whole(path, robustness_html(run, found, seed))
+    return path
+
+
+def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
+    """The page's text."""
+    title = f"Robustness: {run.case.path.parent.name}"
+    lead, *others = conclusion(run, found)
+    head = header(
+        title,
+        found.survives,
+        "stable on all plants" if found.survives else "not stable on all plants",
+        "that were tried; nothing is said of others",
+        f"{theta_words(run.result)} · seed {seed}",
+        lead,
+    )
+    sections = [
+        Section("In short", "\n".join(paragraph(words) for words in others)),
+        _margins(found),
+        _gains(run, found),
+        _perturbed(run, found),
+        _tolerances(run, found),
+        *_structured(found),
+        _move(found),
+    ]
+    return page(title, sections, head)
+
+
+def conclusion(run: FinishedRun, found: Study) -> list[str]:
+    """The findings in sentences, the most important first."""
+    reach, hard, S_max = found.demands.shift, found.tolerances, run.problem.inner.S_max
+    low, high = found.shift.stable
+    words = [
+        f"Stable for resonance shifts of {_share(low, reach)} to {_share(high, reach)}; ‖S‖∞ stays "
+        f"within S_max = {S_max:g} from {_share(found.shift.within[0], reach)} to "
+        f"{_share(found.shift.within[1], reach)}.",
+        f"Damping times {found.demands.damping[0]:g} to {found.demands.damping[1]:g}: "
+        + _damping(found.damping, found.demands.damping)
+        + f" Shift and damping together: worst at {100 * found.box.place[0]:+.2f} % and damping × "
+        f"{found.box.place[1]:.3g}, {_outcome(found.box)}.",
+        f"Hardware within ±{100 * hard.tolerance:g} %: {sum(not j.stable for j in hard.judged)} of "
+        f"{len(hard.judged)} random plants unstable, "
+        f"{sum(j.stable and j.peak > S_max for j in hard.judged)} others above S_max; worst found: "
+        f"{_outcome(hard.worst)}.",
+    ]
+    if hard.failed:
+        words.append(f"{hard.failed} random sets of hardware made no plant and are not counted.")
+    disk = found.margins.outputs
+    words.append(
+        f"Disk margin, all outputs at once: {disk.alpha:.3f} at {number(disk.hz, 4)} Hz, which "
+        f"allows any gain between 1/{disk.gain:.3g} and {disk.gain:.3g} or {disk.phase_deg:.1f}° "
+        f"in every output at once."
+    )
+    if found.structured is not None:
+        bound = found.structured
+        words.append(
+            f"Structured singular value: stable while every modal stiffness errs by less than "
+            f"{100 * bound.stiffness:.3g} % (every frequency by {100 * bound.shift:.3g} %), "
+            "each mode by itself; proven on a grid of frequencies."
+        )
+    words += [_moved(found, i) for i in range(len(found.moves))]
+    return words
+
+
+def _moved(found: Study, i: int) -> str:
+    move = found.moves[i]
+    way = "with mass feedforward" if move.feedforward else "without feedforward"
+    settled = (
+        f"settles {_time(move.settling)} after its end"
+        if np.isfinite(move.settling)
+        else "does not settle while it is watched"
+    )
+    return (
+        f"Move of {found.demands.limits.stroke:g} m in {1e3 * move.duration:.4g} ms {way}: "
+        f"{settled} (±{move.window:g} m), RMS error {move.rms_error:.3g} m, "
+        f"peak {move.peak_error:.3g} m, peak force {max(move.peak_force):.4g} N."
+    )
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
+
+
+def _share(value: float, reach: float) -> str:
+    """A shift in %, and whether that is only as far as was looked."""
+    more = " (the end of what was tried)" if abs(value) >= reach * (1.0 - 1e-9) else ""
+    return f"{100.0 * value:+.2f} %{more}"
+
+
+def _damping(line: Line, ends: tuple[float, float]) -> str:
+    whole = np.allclose(line.stable, ends, rtol=1e-9)
+    stable = "stable throughout" if whole else (
+        f"stable only from {line.stable[0]:.3g} to {line.stable[1]:.3g}"
+    )  # fmt: skip
+    return f"{stable}, within S_max from {line.within[0]:.3g} to {line.within[1]:.3g}."
+
+
+def _outcome(item: Judged) -> str:
+    if not item.stable:
+        return "unstable"
+    return f"peak of S {item.peak:.4g}, ω_b {item.bandwidth / HZ:.4g} Hz"
+
+
+def _margins(found: Study) -> Section:
+    head = (
+        "loop broken at", "gain up", "gain down", "phase °", "crossover Hz", "disk α", "at Hz",
+        "disk gain", "disk phase °",
+    )  # fmt: skip
+
+    def disk(margin: DiskMargin) -> tuple[float, ...]:
+        return margin.alpha, margin.hz, margin.gain, margin.phase_deg
+
+    nothing = float("nan")
+    rows = [
+        (m.name, m.gain_up, m.gain_down, m.phase_deg, m.crossover_hz, *disk(m.disk))
+        for m in found.margins.loops
+    ]
+    for name, margin in (("outputs", found.margins.outputs), ("inputs", found.margins.inputs)):
+        rows.append((f"all {name} at once", *([nothing] * 4), *disk(margin)))
+    words = (
+        "Gains are factors: the nearest above and below 1 at which stability is lost. A disk "
+        "margin covers gain and phase errors at once; it is taken on a grid of frequencies."
+    )
+    return Section("Margins", table_html(Table(head, tuple(rows))) + paragraph(words))
+
+
+def _gains(run: FinishedRun, found: Study) -> Section:
+    names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) m/N", "σ_max(KS) N/m")
+    tops = [
+        (name, number(float(row.max())), f"at {number(float(found.hz[row.argmax()]), 4)} Hz")
+        for name, row in zip(names, found.gains, strict=True)
+    ]
+    n, d = found.noise, found.demands
+    rms = [
+        ("position by sensor noise", n.position_by_noise, f"m RMS for {d.sensor:g} m/√Hz"),
+        ("force by sensor noise", n.force_by_noise, f"N RMS for {d.sensor:g} m/√Hz"),
+        (
+            "position by force noise",
+            n.position_by_disturbance,
+            f"m RMS for {d.disturbance:g} N/√Hz",
+        ),
+        ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
+    ]
+    facts = [(name, ", ".join(number(float(v), 4) for v in values), unit)
+             for name, values, unit in rms]  # fmt: skip
+    drawn = figure_html(
+        figures.gains(found), "Sensitivity, complementary sensitivity, position by a force at the "
+        "actuators (GS), and force by sensor noise (KS).", figures.gains_table(found),
+    )  # fmt: skip
+    return Section(
+        "Disturbance and noise",
+        drawn + facts_html(tops) + "<h3>White noise (one-sided density)</h3>" + facts_html(facts),
+    )
+
+
+def _perturbed(run: FinishedRun, found: Study) -> Section:
+    caption = (
+        "Above: all flexible frequencies shifted together, mode shapes kept. Below: all damping "
+        "multiplied. The controller stays. A gap in a curve is an unstable loop."
+    )
+    drawn = figure_html(
+        figures.perturbed(run, found), caption,
+        figures.line_table("shift", found.shift), figures.line_table("damping ×", found.damping),
+    )  # fmt: skip
+    rows = tuple(
+        (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
+         item.bandwidth / HZ, item.peak) for item in found.modes
+    )  # fmt: skip
+    head = ("mode Hz", "shift %", "stable", "ω_b Hz", "‖S‖∞")
+    modes = "<h3>One mode at a time</h3>" + table_html(Table(head, rows)) if rows else ""
+    return Section("Plants off the model", drawn + modes)
+
+
+def _tolerances(run: FinishedRun, found: Study) -> Section:
+    hard = found.tolerances
+    caption = (
+        f"{len(hard.judged)} plants with every hardware parameter uniformly within "
+        f"±{100 * hard.tolerance:g} % of its value: the share of them below a peak of S, and below "
+        "a bandwidth. A curve that ends below 1 leaves out what is unstable."
+    )
+    theta = ", ".join(
+        f"{name} = {number(value, 6)} {unit}".strip()
+        for name, value, unit in zip(
+            run.problem.names, hard.worst.place, run.problem.units, strict=True
+        )
+    )
+    words = (
+        f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
+    )
+    drawn = figure_html(figures.tolerances(run, found), caption, figures.tolerance_table(found))
+    return Section("Hardware tolerances", drawn + paragraph(words))
+
+
+def _structured(found: Study) -> list[Section]:
+    bound = found.structured
+    if bound is None:
+        return []
+    caption = (
+        "Upper bound of the structured singular value of complex errors δ_i in the modal "
+        f"stiffnesses, one a mode ({bound.modes} in all): at every frequency the loop is stable "
+        "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
+        f"shown, {bound.stiffness:.4g}."
+    )
+    drawn = figure_html(figures.structured(bound), caption, figures.structured_table(bound))
+    return [Section("Structured singular value", drawn)]
+
+
+def _move(found: Study) -> Section:
+    plant = (
+        "with its rigid bodies free"
+        if found.free
+        else "on its soft suspension, without which the loop is not stable"
+    )
+    moves = [
+        figure_html(figures.move(move, f"move{i}"), _moved(found, i), figures.move_table(move))
+        for i, move in enumerate(found.moves)
+    ]
+    words = (
+        f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "
+        f"plant {plant}. It reaches {number(found.setpoint.velocity)} m/s, "
+        f"{number(found.setpoint.acceleration)} m/s² and {number(found.setpoint.jerk)} m/s³."
+    )
+    return Section("A move", paragraph(words) + "\n".join(moves))

@@ -1,0 +1,255 @@
+"""The run report: one self-contained `report.html` about a finished run."""
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ccd_casadi.cases.case import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign.surrogate_quality import recommendation
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.plants.rib_stage.plant import stage_of
+from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
+from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
+from ccd_casadi.reporting.history import (
+    caption_history,
+    figure_history,
+    history_data,
+    table_history,
+)
+from ccd_casadi.reporting.inner_sweep import caption_sweep, sweep_data, table_sweep
+from ccd_casadi.reporting.landscape import (
+    caption_disagreement,
+    caption_landscape,
+    landscape_data,
+    tables_landscape,
+)
+from ccd_casadi.reporting.limits import limit_sentences, table_limits
+from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
+from ccd_casadi.reporting.maps import ThetaPath, figure_landscape, figure_sweep
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    escape,
+    facts_html,
+    figure_html,
+    header,
+    page,
+    paragraph,
+    preformatted,
+    table_html,
+)
+from ccd_casadi.reporting.slices import (
+    caption_slices,
+    figure_slices,
+    slices_data,
+    tables_slices,
+)
+from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_figure
+from ccd_casadi.reporting.true_samples import Truths, read_truths
+from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
+from ccd_casadi.reporting.turntable import with_turntables
+from ccd_casadi.synthesis.loop_responses import loop_data
+from surrogates.files import write_whole
+
+if TYPE_CHECKING:  # solve imports this module
+    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.codesign.verify import VerifiedDesign
+
+STATUS = {
+    "verified": "verified",
+    "not_verified": "not verified",
+    "infeasible": "no feasible design",
+}
+
+
+def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
+    """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
+    path = folder / "report.html"
+    write_whole(path, report_html(folder, case, problem, solution))
+    return path
+
+
+def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> str:
+    """The report's text."""
+    result = solution.result
+    status = result["status"]
+    title = f"Co-design of {case.path.stem}"
+    now = datetime.now().strftime("%Y-%m-%d %H:%M")
+    head = header(
+        title,
+        status == "verified",
+        STATUS[status],
+        _reason(solution),
+        f"{case.path.name} · {result['formulation']} formulation · {now}",
+        conclusion(result),
+    )
+    sections = []
+    if solution.verified is not None:
+        truths = read_truths(folder / "samples.sqlite", problem)
+        sections = [
+            _design(problem, solution),
+            _theta(problem, solution, solution.verified, truths),
+            *stage_sections(problem, {"start": problem.start, "optimum": solution.verified.theta}),
+            *_loop(problem, solution, solution.verified),
+            _history(case, problem, solution, solution.verified),
+            *_trust(solution),
+            _sweep(problem, solution, solution.verified, truths),
+        ]
+    return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
+
+
+def _reason(solution: "Solution") -> str:
+    checks = solution.result.get("checks", {})
+    if solution.result["status"] == "verified":
+        return f"all checks passed: {', '.join(checks).replace('_', ' ')}"
+    return solution.result["reason"]
+
+
+def _design(problem: CoDesignProblem, solution: "Solution") -> Section:
+    binds = binding(problem, solution.result)
+    items = "".join(f"<li>{escape(words)}</li>" for words in binds)
+    what = f"<ul>{items}</ul>" if binds else paragraph("Nothing binds: an interior optimum.")
+    body = (
+        table_html(theta_table(problem, solution.result))
+        + facts_html(design_facts(problem, solution.result))
+        + f"\n<h3>What binds</h3>\n{what}"
+        + "".join(paragraph(f"Note: {words}.") for words in solution.result.get("notes", ()))
+    )
+    return Section("The design", body)
+
+
+def _theta(
+    problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
+) -> Section:
+    outcome = solution.outcome
+    processes, iterates = outcome.surrogates, outcome.iterates
+    best = float(solution.result["bandwidth_hz"])
+    extra = caption_disagreement(problem, processes, truths)
+    if len(problem.names) == 2:
+        radius = iterates[-1].radius if iterates else 1.0
+        land = landscape_data(problem, processes, truths, radius, verified.theta)
+        path = np.array([item.theta for item in iterates]).reshape(-1, 2)
+        paths = [ThetaPath("iterates", path, numbered=True)] if len(path) else []
+        svg = figure_landscape(land, paths, (verified.theta[0], verified.theta[1]))
+        caption = caption_landscape(land, best, lifted=len(processes) == 3) + extra
+        tables = tables_landscape(land)
+        return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables))
+    slices = slices_data(problem, processes, truths, verified.theta)
+    if not any(len(s.near) or np.isfinite(s.bandwidth_hz).any() for s in slices):
+        words = "There is no surrogate, and no design near the optimum to show in its place."
+        return Section("Bandwidth over the hardware", paragraph(words))
+    svg = figure_slices(slices, best)
+    caption = caption_slices(slices, best, lifted=len(processes) == 3) + extra
+    return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables_slices(slices)))
+
+
+def stage_sections(
+    problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
+) -> list[Section]:
+    """Drawing and mode shapes of a rib stage, the last of `thetas` in motion; else nothing."""
+    found = {name: stage_of(plant_of(problem), theta) for name, theta in thetas.items()}
+    stages = {name: item for name, item in found.items() if item is not None}
+    if not stages:
+        return []
+    stage, theta = list(stages.values())[-1]
+    drawn = dimensions_figure(stage.geometry, {name: own for name, (_, own) in stages.items()})
+    return [
+        Section("The stage, before and after", drawn),
+        Section(f"Mode shapes: {list(stages)[-1]}", mode_shape_figure(stage, theta)),
+    ]
+
+
+def _loop(
+    problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
+) -> list[Section]:
+    figures = verified.design.figures
+    loop = loop_data(
+        scaled_plant(problem, verified.theta),
+        verified.design.controller,
+        verified.design.weights,
+        gamma=figures.gamma,
+        bandwidth_hz=float(solution.result["bandwidth_hz"]),
+        omega_low=problem.inner.omega_low,
+    )
+    S_max = problem.inner.S_max
+    gains = figure_html(
+        figure_gains([loop], S_max=S_max), caption_gains(loop, S_max=S_max), table_gains(loop)
+    )
+    limits = "\n".join(paragraph(words) for words in limit_sentences(loop))
+    bode = figure_html(figure_bode(loop), caption_bode(loop), table_bode(loop))
+    return [
+        Section("Closed loop: S, KS and T against their bounds", gains),
+        Section("What limits the bandwidth", limits + table_html(table_limits(loop))),
+        Section("Plant and controller", bode),
+    ]
+
+
+def _history(
+    case: Case, problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
+) -> Section:
+    heading = "Prediction against truth"
+    outcome, result = solution.outcome, solution.result
+    if not outcome.iterates:
+        words = (
+            "There are no rounds to show: "
+            + ("IPOPT worked on the true quantities, nothing was predicted."
+               if result["formulation"] == "direct" else (result["reason"] or "none was run."))
+        )  # fmt: skip
+        return Section(heading, paragraph(words))
+    history = history_data(
+        outcome.iterates,
+        theta=verified.theta,
+        predicted_hz=result["surrogate_bandwidth_hz"],
+        true_hz=result["bandwidth_hz"],
+        objective=result["objective"],
+        w2=problem.w2,
+        tolerance=case.outer.tolerance,
+    )
+    caption = caption_history(history, lifted=len(outcome.surrogates) == 3)
+    table = table_history(history, problem.names)
+    return Section(heading, figure_html(figure_history(history), caption, table))
+
+
+def _trust(solution: "Solution") -> list[Section]:
+    """Nothing where nothing was predicted."""
+    qualities = solution.quality
+    if not qualities:
+        return []
+    words = paragraph(recommendation(qualities))
+    figure = figure_html(figure_trust(qualities), caption_trust(qualities), *data_trust(qualities))
+    return [
+        Section(
+            "Can the surrogate be trusted?", words + table_html(table_trust(qualities)) + figure
+        )
+    ]
+
+
+def _sweep(
+    problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign", truths: Truths
+) -> Section:
+    heading = "The inner problem at the optimum"
+    result = solution.result
+    optimum = (result["omega_S_hz"], result["omega_T_hz"], result["bandwidth_hz"])
+    processes = solution.outcome.surrogates
+    sweep = sweep_data(problem, processes, truths, verified.theta, optimum)
+    if sweep is None:
+        words = f"Too few syntheses at {theta_words(result)} to draw the inner problem there."
+        return Section(heading, paragraph(words))
+    inner = problem.inner
+    caption = caption_sweep(sweep, S_max=inner.S_max, S_low=inner.S_low)
+    return Section(heading, figure_html(figure_sweep(sweep), caption, table_sweep(sweep)))
+
+
+def _provenance(case: Case, solution: "Solution") -> Section:
+    result = solution.result
+    rows = [("seed", str(result["seed"])), *result["versions"].items()]
+    versions = table_html(Table(("what", "version"), tuple((a, str(b)) for a, b in rows)))
+    body = (
+        f"<h3>Seed and versions</h3>\n{versions}\n"
+        f"<h3>The resolved case file</h3>\n{preformatted(case_to_toml(case))}"
+    )
+    return Section("Provenance", body, own_page=True)

@@ -1,0 +1,58 @@
+"""What a run's store knows: true inner problems per θ, and single designs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
+
+NEAR = 1e-6  # share of the box within which a design counts as one at θ
+
+
+@dataclass(frozen=True)
+class Truths:
+    """ω_b*(θ) in Hz where the inner problem was solved (NaN: infeasible), and every design."""
+
+    theta: np.ndarray
+    bandwidth_hz: np.ndarray
+    designs: tuple[Sample, ...]
+
+    def near(self, problem: CoDesignProblem, theta: Sequence[float]) -> tuple[Sample, ...]:
+        """The designs at θ, to within rounding of the box."""
+        width = np.array(problem.upper) - np.array(problem.lower)
+        return tuple(
+            s for s in self.designs if np.abs((np.array(s.theta) - theta) / width).max() <= NEAR
+        )
+
+
+def read_truths(path: Path, problem: CoDesignProblem) -> Truths:
+    """Everything in the store that belongs to this problem (a folder may have seen others)."""
+    designs_hash = problem_hash(problem.identity())
+    inner_hash = problem_hash({"problem": designs_hash, "inner": problem.inner_identity()})
+    count = len(problem.names)
+    thetas, values = [], []
+    with SampleStore(path) as store:
+        rows = [s for s in store.select() if len(s.theta) == count]
+        for theta in dict.fromkeys(sample.theta for sample in rows):
+            known = store.get_result(sample_key(inner_hash, theta, 0.0, 0.0))
+            if known is not None:
+                thetas.append(theta)
+                value = known["bandwidth"]
+                values.append(np.nan if value is None else value / (2.0 * np.pi))
+    ours = tuple(
+        s for s in rows if s.key == sample_key(designs_hash, s.theta, s.omega_S, s.omega_T)
+    )
+    return Truths(np.array(thetas).reshape(-1, count), np.array(values), ours)
+
+
+def feasible(problem: CoDesignProblem, sample: Sample) -> bool:
+    """Certified and within S_max and S_low, to the surrogates' margin."""
+    inner = problem.inner
+    return (
+        sample.certified
+        and sample.sensitivity_peak <= inner.S_max * (1.0 + 1e-9)
+        and sample.sensitivity_low <= inner.S_low * (1.0 + 1e-9)
+    )

@@ -1,0 +1,1 @@
+"""What a finished design survives: margins, perturbed plants, noise, a move."""

@@ -1,0 +1,226 @@
+"""Everything that a finished design is put through, and its figures for robustness.json."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.robust.margins import DiskMargin, Margins, margins
+from ccd_casadi.robust.move import Move, mass_feedforward, simulate
+from ccd_casadi.robust.perturbed import (
+    Judged,
+    Line,
+    Tolerances,
+    damping_line,
+    shift_line,
+    single_modes,
+    system_of,
+    tolerances,
+    worst_in_box,
+)
+from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robust.signals import Noise, closed_loop, gains, noise
+from ccd_casadi.robust.structured import StructuredBound, structured_bound
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import loop_data
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What to try: relative shift and tolerance, damping factors, densities, the move.
+
+    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
+    """
+
+    shift: float = 0.05
+    damping: tuple[float, float] = (0.5, 2.0)
+    tolerance: float = 0.01
+    samples: int = 200
+    sensor: float = 1.0
+    disturbance: float = 1.0
+    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    window: float = 1e-6
+    axis: int = 0
+
+
+@dataclass(frozen=True)
+class Study:
+    """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `free` whether the moves are those
+    of the plant without its suspension, `moves` the move without and with feedforward."""
+
+    demands: Demands
+    hz: Array
+    gains: Array
+    margins: Margins
+    noise: Noise
+    shift: Line
+    damping: Line
+    modes: tuple[Judged, ...]
+    box: Judged
+    tolerances: Tolerances
+    structured: StructuredBound | None
+    setpoint: Setpoint
+    free: bool
+    moves: tuple[Move, ...]
+
+    @property
+    def survives(self) -> bool:
+        """Stable on every plant that was tried."""
+        lines = (*self.shift.judged, *self.damping.judged, *self.modes, self.box)
+        return all(item.stable for item in (*lines, self.tolerances.worst))
+
+
+def robustness(
+    run: FinishedRun, demands: Demands | None = None, seed: int = 0, quiet: bool = True
+) -> Study:
+    """Put a run's controller through all that is demanded; nothing is designed anew."""
+    demands = demands or Demands()
+    bandwidth_hz = run.figures.bandwidth / HZ
+    loop = loop_data(
+        run.plant, run.controller, run.weights, gamma=run.figures.gamma,
+        bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
+    )  # fmt: skip
+    system, d = system_of(run), demands
+    modal = modal_plant(system, run.problem.suspension)
+    profile = setpoint(d.limits)
+    free, moves = _moves(run, profile, d)
+    closed = closed_loop(run.plant.plant_si(), run.controller)
+    return Study(
+        demands=d,
+        hz=loop.hz,
+        gains=gains(loop.plant, loop.controller),
+        margins=margins(run.plant, run.controller, loop.hz, loop.plant, loop.controller),
+        noise=noise(closed, d.sensor, d.disturbance),
+        shift=shift_line(run, system, d.shift),
+        damping=damping_line(run, system, *d.damping),
+        modes=single_modes(run, system, d.shift),
+        box=worst_in_box(run, system, d.shift, d.damping),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
+        structured=structured_bound(run.plant, modal, run.controller, loop.hz),
+        setpoint=profile,
+        free=free,
+        moves=moves,
+    )
+
+
+def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[bool, tuple[Move, ...]]:
+    """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
+    released = replace(run.problem, suspension=Suspension(0.0, 0.0), robust=None)
+    plants = ((True, scaled_plant(released, run.theta)), (False, run.plant))
+    loops = [(free, closed_loop(plant.plant_si(), run.controller)) for free, plant in plants]
+    stable = [item for item in loops if np.linalg.eigvals(item[1].A).real.max() < 0.0]
+    free, loop = stable[0]  # a run that could be read is stable on the suspended plant
+    modal = modal_plant(system_of(run), released.suspension)
+    ahead = mass_feedforward(modal, demands.axis)
+    ways = (None,) if ahead is None else (None, ahead)
+    made = [
+        simulate(
+            loop, profile, axis=demands.axis, forces=forces, window=demands.window,
+            bandwidth_hz=run.figures.bandwidth / HZ,
+        )
+        for forces in ways
+    ]  # fmt: skip
+    return free, tuple(made)
+
+
+def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
+    """robustness.json: SI, and Hz where the name says so; shifts and tolerances are relative."""
+    bound, hard = found.structured, found.tolerances
+    peaks = [item.peak for item in hard.judged if item.stable]
+    names, d = run.problem.names, found.demands
+    limits = vars(d.limits) | {"window": d.window, "axis": d.axis + 1}
+    return {
+        "survives": found.survives,
+        "S_max": run.problem.inner.S_max,
+        "bandwidth_hz": run.figures.bandwidth / HZ,
+        "sensitivity_peak": run.figures.sensitivity_peak,
+        "margins": {
+            "loops": [
+                {key: value for key, value in vars(item).items() if key != "disk"}
+                | {"disk": _disk(item.disk)}
+                for item in found.margins.loops
+            ],
+            "all_outputs": _disk(found.margins.outputs),
+            "all_inputs": _disk(found.margins.inputs),
+        },
+        "gains": {
+            name: {"peak": float(row.max()), "peak_hz": float(found.hz[row.argmax()])}
+            for name, row in zip(("S", "T", "GS", "KS"), found.gains, strict=True)
+        },
+        "noise": {"sensor_density": d.sensor, "force_density": d.disturbance}
+        | {f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
+        "resonance_shift": _line(found.shift, "shift"),
+        "damping": _line(found.damping, "factor"),
+        "single_modes": [
+            {"hz": item.place[0], "shift": item.place[1]} | _judged(item) for item in found.modes
+        ],
+        "worst_shift_and_damping": {"shift": found.box.place[0], "damping": found.box.place[1]}
+        | _judged(found.box),
+        "tolerances": {
+            "tolerance": hard.tolerance,
+            "samples": len(hard.judged) + hard.failed,
+            "no_plant": hard.failed,
+            "unstable": sum(not item.stable for item in hard.judged),
+            "stable_above_S_max": sum(
+                item.stable and item.peak > run.problem.inner.S_max for item in hard.judged
+            ),
+            "peak_quantiles": dict(
+                zip(("50", "95", "100"), np.quantile(peaks, [0.5, 0.95, 1.0]), strict=True)
+            )
+            if peaks
+            else {},
+            "worst": {"theta": dict(zip(names, hard.worst.place, strict=True))}
+            | _judged(hard.worst),
+        },
+        "structured": None
+        if bound is None
+        else {
+            "modes": bound.modes,
+            "mu": 1.0 / bound.stiffness,
+            "mu_complex": float(bound.mu.max()),
+            "hz": bound.worst_hz,
+            "stiffness": bound.stiffness,
+            "shift": bound.shift,
+        },
+        "move": {
+            "limits": limits,
+            "duration": found.setpoint.duration,
+            "reached": {
+                key: getattr(found.setpoint, key) for key in ("velocity", "acceleration", "jerk")
+            },
+            "without_suspension": found.free,
+            "runs": [_move(move) for move in found.moves],
+        },
+    }
+
+
+def _disk(margin: DiskMargin) -> dict[str, float]:
+    return vars(margin) | {"gain": margin.gain, "phase_deg": margin.phase_deg}
+
+
+def _judged(item: Judged) -> dict[str, Any]:
+    return {
+        "stable": item.stable,
+        "bandwidth_hz": item.bandwidth / HZ,
+        "sensitivity_peak": item.peak,
+    }
+
+
+def _line(line: Line, name: str) -> dict[str, Any]:
+    return {
+        "stable_between": list(line.stable),
+        "S_max_between": list(line.within),
+        "plants": [{name: item.place[0]} | _judged(item) for item in line.judged],
+    }
+
+
+def _move(move: Move) -> dict[str, Any]:
+    shown = ("feedforward", "settling", "rms_error", "peak_error", "final_error")
+    return {key: getattr(move, key) for key in shown} | {
+        "peak_force": move.peak_force.tolist(),
+        "rms_force": move.rms_force.tolist(),
+    }

@@ -1,0 +1,91 @@
+"""`python -m ccd_casadi.robustness RUN_DIR`: what a finished design survives."""
+
+import argparse
+from collections.abc import Sequence
+from time import perf_counter
+
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.result import versions, write_json
+from ccd_casadi.robust.setpoint import Limits
+from ccd_casadi.robust.study import Demands, robustness, study_dict
+from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.errors import UserError
+from surrogates.options import number, positive, whole
+
+_DEFAULT = Demands()
+_MOVE = (
+    ("stroke", _DEFAULT.limits.stroke, "m"),
+    ("velocity", _DEFAULT.limits.velocity, "m/s"),
+    ("acceleration", _DEFAULT.limits.acceleration, "m/s²"),
+    ("jerk", _DEFAULT.limits.jerk, "m/s³"),
+    ("snap", _DEFAULT.limits.snap, "m/s⁴"),
+    ("window", _DEFAULT.window, "m; settled when the error stays within"),
+)
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """The command itself."""
+    began = perf_counter()
+    finished = read_run(options.run)
+    outputs = finished.plant.C.shape[0]
+    if options.axis > outputs:
+        raise UserError(f"--axis: is {options.axis}; the plant has outputs 1 to {outputs}")
+    if not options.damping[0] <= 1.0 <= options.damping[1]:
+        low, high = options.damping
+        raise UserError(f"--damping: is {low:g} {high:g}; give a factor up to 1 and one from 1")
+    folder = run_folder(options.run, options.out or options.run)
+    demands = Demands(
+        shift=options.shift / 100.0,
+        damping=tuple(options.damping),
+        tolerance=options.tolerance / 100.0,
+        samples=options.samples,
+        sensor=options.noise,
+        disturbance=options.disturbance,
+        limits=Limits(*(getattr(options, name) for name, _, _ in _MOVE[:-1])),
+        window=options.window,
+        axis=options.axis - 1,
+    )
+    found = robustness(finished, demands, options.seed, options.quiet)
+    answer = study_dict(finished, found)
+    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+    write_json(folder / "robustness.json", answer)
+    from ccd_casadi.reporting.robustness_page import (  # matplotlib is slow
+        conclusion,
+        write_robustness,
+    )
+
+    write_robustness(folder, finished, found, options.seed)
+    if not options.quiet:
+        print("\n".join(conclusion(finished, found)))
+        print(f"written to {folder / 'robustness.json'} and robustness.html")
+    return ExitCode.DONE
+
+
+PERCENT = number(0.0, 50.0, strict=True)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.robustness", "Margins, plants off the model, noise and a move of a design."
+    )
+    add = arguments.add_argument
+    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
+    add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
+        help="factors of the damping; default 0.5 2")  # fmt: skip
+    add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
+        help="of every hardware parameter; default 1")  # fmt: skip
+    add("--samples", type=whole(1), default=200, metavar="N",
+        help="of random hardware; default 200")  # fmt: skip
+    add("--noise", type=positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
+    add("--disturbance", type=positive, default=1.0, metavar="X",
+        help="force at every actuator, N/√Hz; default 1")  # fmt: skip
+    add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
+    for name, default, unit in _MOVE:
+        add(f"--{name}", type=positive, default=default, metavar="X",
+            help=f"of the move, {unit}; default {default:g}")  # fmt: skip
+    return run(command, arguments, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

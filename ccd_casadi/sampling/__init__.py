@@ -1,0 +1,1 @@
+"""True samples: the store, and the sampler that fills it on processes or a cluster."""

@@ -1,0 +1,356 @@
+"""The store of true syntheses: one SQLite file, one row a synthesis, readable without our code.
+
+Rows are keyed by a hash of what determines them, so that a later run finds them again and a
+duplicate is never counted twice. Units of work are written in one transaction. Several processes
+may use the file at once (write-ahead log, busy timeout).
+"""
+
+import hashlib
+import json
+import math
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from numbers import Integral, Real
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from ccd_casadi.support.errors import UserError
+
+SCHEMA = 1
+BUSY_SECONDS = 60.0
+
+
+class SampleStoreError(UserError):
+    """The file is not a usable sample store; the message names it and says what to do."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One synthesis, certified or not; SI, frequencies in rad/s, NaN where there is no figure.
+
+    `gradients` are the flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞,
+    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed.
+    """
+
+    key: str
+    theta: tuple[float, ...]
+    omega_S: float
+    omega_T: float
+    outcome: str
+    reason: str
+    gamma_opt: float
+    gamma_lower_bound: float
+    gamma: float
+    bandwidth: float
+    sensitivity_peak: float
+    sensitivity_peak_frequency: float
+    sensitivity_low: float
+    max_real_pole: float
+    norm: float
+    norm_bound: float
+    certified: bool
+    seconds: float
+    gradients: tuple[float, ...] | None = None
+
+
+_COLUMNS = tuple(field.name for field in fields(Sample))
+_REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
+_TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
+_DAMAGED = "a row is damaged"
+_THETA, _CERTIFIED, _GRADIENTS = map(_COLUMNS.index, ("theta", "certified", "gradients"))
+_TABLES = """
+create table if not exists meta (name text primary key, value text not null);
+create table if not exists problems (hash text primary key, json text not null);
+create table if not exists samples (
+    key text primary key, problem text, theta text not null, omega_S real not null,
+    omega_T real not null, outcome text not null, reason text not null, gamma_opt real,
+    gamma_lower_bound real, gamma real, bandwidth real, sensitivity_peak real,
+    sensitivity_peak_frequency real, sensitivity_low real, max_real_pole real, norm real,
+    norm_bound real, certified integer not null, seconds real, gradients text
+);
+create table if not exists results (
+    key text primary key, problem text not null, theta text not null, json text not null
+);
+create index if not exists samples_of_problem on samples (problem);
+create index if not exists results_of_problem on results (problem);
+"""
+
+
+def problem_hash(problem: Mapping[str, object]) -> str:
+    """SHA-256 of a mapping of plain values; exact in every float, blind to the mapping's order.
+
+    Raises ValueError for NaN and infinity, TypeError for what is no plain value.
+
+    >>> problem_hash({"a": 1, "b": 0.1}) == problem_hash({"b": 0.1, "a": 1.0})
+    True
+    """
+    text = json.dumps(_canonical(problem), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: float) -> str:
+    """The key of one synthesis of a problem, exact in every float."""
+    return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
+
+
+def _canonical(value: object) -> object:
+    if isinstance(value, Mapping):
+        if not all(isinstance(key, str) for key in value):
+            raise TypeError("a name that is no text cannot be part of a key")
+        return {key: _canonical(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, str):
+        return f"'{value}"  # the mark keeps a text apart from the number that it spells
+    if isinstance(value, Integral) and abs(int(value)) > 2**53:
+        return str(int(value))  # no float is exact
+    if isinstance(value, Integral | Real):
+        number = float(value) + 0.0  # -0.0 becomes 0.0
+        if not math.isfinite(number):
+            raise ValueError(f"{number} cannot be part of a key; give finite numbers")
+        return number.hex()
+    raise TypeError(f"{type(value).__name__} cannot be part of a key")
+
+
+class SampleStore:
+    """`with SampleStore(path) as store:`; raises SampleStoreError where the file is unusable."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        with self.worded():
+            self._db = sqlite3.connect(self.path, timeout=BUSY_SECONDS, isolation_level=None)
+            try:
+                self._check()
+                self._write_ahead()
+                self._db.execute("pragma synchronous = normal")
+                with self._transaction():
+                    # one by one: executescript would end the transaction
+                    for statement in _TABLES.split(";"):
+                        self._db.execute(statement)
+                    insert = "insert or ignore into meta values ('schema', ?)"
+                    self._db.execute(insert, (str(SCHEMA),))
+            except BaseException:
+                self._db.close()
+                raise
+
+    def _check(self) -> None:
+        """Refuse, untouched, a database that is not ours or has another schema."""
+        kinds = self._db.execute("select name, type from sqlite_master").fetchall()
+        tables = {name for name, kind in kinds if kind == "table"}
+        if not kinds:
+            return  # new, or being made by another process in one transaction
+        if any(kind in ("trigger", "view") for _, kind in kinds):
+            raise SampleStoreError(
+                f"{self.path}: holds statements (triggers, views) that no store of ours has; "
+                "choose another --out"
+            )
+        if not {"meta", "problems", "samples", "results"} <= tables:
+            raise SampleStoreError(
+                f"{self.path}: is a database of another program; choose another --out"
+            )
+        found = self._db.execute("select * from meta where name = 'schema'").fetchone()
+        columns = {row[1] for row in self._db.execute("pragma table_info(samples)")}
+        schema = None if found is None else found[1]
+        if schema != str(SCHEMA) or not set(_COLUMNS) <= columns:
+            raise SampleStoreError(
+                f"{self.path}: is a sample store of schema {schema}, not {SCHEMA}; "
+                "choose another --out"
+            )
+
+    def _write_ahead(self) -> None:
+        """Switch to the write-ahead log; SQLite does not wait for that lock by itself."""
+        deadline = time.monotonic() + BUSY_SECONDS
+        while True:
+            try:
+                self._db.execute("pragma journal_mode = wal")
+                return
+            except sqlite3.OperationalError as error:
+                if "locked" not in str(error) or time.monotonic() > deadline:
+                    raise
+            time.sleep(0.01)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; every put is already on disk."""
+        self._db.close()
+
+    def put_problem(self, key: str, problem: Mapping[str, object]) -> None:
+        """Keep what a problem hash stands for, so that the file explains itself."""
+        with self.worded(), self._transaction():
+            text = json.dumps(problem, sort_keys=True)
+            self._db.execute("insert or ignore into problems values (?, ?)", (key, text))
+
+    def put(self, samples: Iterable[Sample], problem: str | None = None) -> None:
+        """Write samples in one transaction; known keys stay as they are, but gain gradients."""
+        with self.worded(), self._transaction():
+            self._insert(samples, problem)
+
+    def put_unit(
+        self,
+        samples: Iterable[Sample],
+        result: tuple[str, str, Sequence[float], Mapping[str, object]],
+        problem: str | None = None,
+    ) -> None:
+        """Write a unit's samples and its result (key, problem, θ, payload): all or nothing."""
+        key, owner, theta, payload = result
+        row = (key, owner, json.dumps(list(theta)), json.dumps(payload, sort_keys=True))
+        with self.worded(), self._transaction():
+            self._insert(samples, problem)
+            self._db.execute("insert or ignore into results values (?, ?, ?, ?)", row)
+
+    def get(self, keys: Sequence[str]) -> dict[str, Sample]:
+        """The samples known among `keys`."""
+        found: dict[str, Sample] = {}
+        columns = ", ".join(_COLUMNS)
+        with self.worded():
+            for i in range(0, len(keys), 500):
+                part = list(keys[i : i + 500])
+                marks = ", ".join("?" * len(part))
+                query = f"select {columns} from samples where key in ({marks})"
+                for row in self._db.execute(query, part):
+                    found[row[0]] = _from_row(row)
+        return found
+
+    def get_result(self, key: str) -> dict[str, Any] | None:
+        """The payload of a unit of work, None where it is not known."""
+        with self.worded():
+            row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
+            return None if row is None else _decoded(row[0])
+
+    def select(self, problem: str | None = None) -> list[Sample]:
+        """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
+        where, given = _of(problem)
+        with self.worded():
+            query = f"select {', '.join(_COLUMNS)} from samples {where}"
+            rows = self._db.execute(query, given).fetchall()
+            samples = [_from_row(row) for row in rows]
+        return sorted(samples, key=lambda s: (s.theta, s.omega_S, s.omega_T, s.key))
+
+    def count(self, problem: str | None = None) -> int:
+        """Number of samples (of one problem hash, if given)."""
+        where, given = _of(problem)
+        with self.worded():
+            query = f"select count(*) from samples {where}"
+            return int(self._db.execute(query, given).fetchone()[0])
+
+    def thetas(self, problem: str) -> list[tuple[float, ...]]:
+        """θ of every unit of work of one problem hash, oldest first."""
+        query = "select theta from results where problem = ? order by rowid"
+        with self.worded():
+            return [numbers_of(_decoded(row[0])) for row in self._db.execute(query, (problem,))]
+
+    def keys_with_gradients(self, problem: str) -> list[str]:
+        """Keys of the samples of one problem hash that have gradients, oldest first."""
+        query = "select key from samples where problem = ? and gradients is not null order by rowid"
+        with self.worded():
+            return [row[0] for row in self._db.execute(query, (problem,))]
+
+    def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
+        marks = ", ".join("?" * (len(_COLUMNS) + 1))
+        self._db.executemany(
+            f"insert into samples ({', '.join(_COLUMNS)}, problem) values ({marks}) "
+            "on conflict (key) do update set gradients = excluded.gradients "
+            "where samples.gradients is null and excluded.gradients is not null",
+            [(*_to_row(sample), problem) for sample in samples],
+        )
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        try:
+            self._db.execute("begin immediate")
+            yield
+            self._db.execute("commit")
+        except BaseException:
+            if self._db.in_transaction:  # a full disk has already rolled it back
+                self._db.execute("rollback")
+            raise
+
+    def damaged(self) -> SampleStoreError:
+        """What to raise where a row cannot be what was written."""
+        return SampleStoreError(f"{self.path}: {_DAMAGED}; move it away or choose another --out")
+
+    @contextmanager
+    def worded(self) -> Iterator[None]:
+        """SQLite's errors as one line that says what to do."""
+        try:
+            yield
+        except sqlite3.ProgrammingError:
+            raise  # a mistake of the program, not of the file
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            text = " ".join(str(error).split())
+            if "locked" in text:
+                advice = "another process holds it; wait or stop that one"
+            elif "readonly" in text or "unable to open" in text:
+                advice = "give a writable folder with --out"
+            elif "full" in text:
+                advice = "free some disk space and resume"
+            else:
+                advice = "it is damaged or no sample store; move it away or choose another --out"
+            raise SampleStoreError(f"{self.path}: {text}; {advice}") from error
+
+
+def _of(problem: str | None) -> tuple[str, tuple[str, ...]]:
+    """The rows of one problem hash, or all: a condition that an index answers, and its values."""
+    return ("", ()) if problem is None else ("where problem = ?", (problem,))
+
+
+def _to_row(sample: Sample) -> tuple[object, ...]:
+    row: list[object] = []
+    for name in _COLUMNS:
+        value = getattr(sample, name)
+        if name == "theta" or (name == "gradients" and value is not None):
+            value = json.dumps([None if math.isnan(item) else item for item in value])
+        elif name == "certified":
+            value = int(value)
+        elif isinstance(value, float) and math.isnan(value):
+            value = None
+        row.append(value)
+    return tuple(row)
+
+
+def _from_row(row: Sequence[Any]) -> Sample:
+    values: list[Any] = [
+        math.nan if value is None and name in _REALS else value
+        for name, value in zip(_COLUMNS, row, strict=True)
+    ]
+    values[_THETA] = numbers_of(_decoded(values[_THETA]))
+    values[_CERTIFIED] = bool(values[_CERTIFIED])
+    if values[_GRADIENTS] is not None:
+        values[_GRADIENTS] = numbers_of(_decoded(values[_GRADIENTS]))
+    for name, value in zip(_COLUMNS, values, strict=True):
+        if name in _TEXTS and not isinstance(value, str):
+            raise sqlite3.DatabaseError(_DAMAGED)
+    numbers_of([value for name, value in zip(_COLUMNS, values, strict=True) if name in _REALS])
+    return Sample(*values)
+
+
+def numbers_of(items: Any) -> tuple[float, ...]:
+    """A list of numbers (null: NaN) as it was stored. Raises sqlite3.DatabaseError for others."""
+    if not isinstance(items, list) or not all(
+        item is None or type(item) in (int, float) for item in items
+    ):
+        raise sqlite3.DatabaseError(_DAMAGED)
+    return tuple(math.nan if item is None else float(item) for item in items)
+
+
+def _decoded(text: Any) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise sqlite3.DatabaseError(_DAMAGED) from error

@@ -1,0 +1,1 @@
+"""What every package uses: errors, options of commands, processes, progress, units."""

@@ -1,0 +1,161 @@
+"""What every command shares: its options, its exit codes, and one line for a user's mistake."""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from ccd_casadi.support.errors import PlantError, UserError, one_line
+from ccd_casadi.support.process_pool import WorkerLost, usable_cores
+from ccd_casadi.support.user_code import permit_user_code
+from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
+from surrogates.options import ExitCode as ExitCode
+from surrogates.options import Parser, whole
+
+DEFAULT_CASE = "runs/two_mass.toml"
+_DISK = "see to the disk or choose another --out, then give the same command: it resumes"
+_NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
+_RESUMABLE = "what is sampled is kept; the same command resumes from there"
+
+
+def parser(
+    command: str, description: str, *, case_required: bool = False
+) -> argparse.ArgumentParser:
+    """A parser with the positional CASE and --out, --workers, --seed, --quiet."""
+    result = Parser(prog=f"python -m {command}", description=description)
+    if case_required:
+        result.add_argument("case", metavar="CASE.toml", type=Path, help="the case file")
+    else:
+        result.add_argument(
+            "case",
+            metavar="CASE.toml",
+            nargs="?",
+            type=Path,
+            default=Path(DEFAULT_CASE),
+            help=f"the case file (default: {DEFAULT_CASE})",
+        )
+    _shared(result)
+    return result
+
+
+def _shared(result: argparse.ArgumentParser) -> None:
+    """--out, --workers, --seed, --quiet and --no-user-code, which every command has."""
+    result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
+    result.add_argument(
+        "--workers", metavar="N", type=whole(1), default=usable_cores(),
+        help="worker processes (default: all cores)",
+    )  # fmt: skip
+    result.add_argument("--seed", metavar="N", type=whole(0), default=0, help="default: 0")
+    result.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    result.add_argument(
+        "--no-user-code", action="store_true",
+        help="refuse a case that names a plant function: it is code of who wrote it",
+    )  # fmt: skip
+
+
+def run_parser(
+    command: str,
+    description: str,
+    *,
+    metavar: str = "RUN_DIR",
+    about: str = "the folder of a finished solve",
+) -> argparse.ArgumentParser:
+    """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
+    result = Parser(prog=f"python -m {command}", description=description)
+    result.add_argument("run", metavar=metavar, type=Path, help=about)
+    _shared(result)
+    return result
+
+
+def add_scheduler(arguments: argparse.ArgumentParser) -> None:
+    """Add --scheduler, for commands that sample."""
+    arguments.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="sample on the Dask cluster at tcp://host:port; --workers then has no effect",
+    )  # fmt: skip
+
+
+def run(
+    main: Callable[[argparse.Namespace], ExitCode],
+    arguments: argparse.ArgumentParser,
+    argv: Sequence[str] | None = None,
+) -> int:
+    """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
+    code = ExitCode.INTERRUPTED
+    begun()
+    try:
+        options = arguments.parse_args(argv)
+    except SystemExit as ended:  # after --help or a wrong option
+        return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    try:
+        # One BLAS thread: the matrices are small, and results must not depend on the cores.
+        with (
+            threadpool_limits(limits=1),
+            permit_user_code(not options.no_user_code),
+            ctrl_c_noticed(),
+        ):
+            code = main(options)
+        sys.stdout.flush()  # here, where a reader that went away can still be dealt with
+    except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
+        print(one_line(f"{_place(options)}: plant: {error}"), file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    except UserError as error:
+        print(one_line(error), file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    except WorkerLost as error:
+        print(f"interrupted: {one_line(error)}; {_RESUMABLE}", file=sys.stderr)
+    except MemoryError:
+        print(f"{_place(options)}: {_NO_MEMORY}", file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    except BrokenPipeError:
+        # The reader of stdout went away; point it elsewhere so that the exit stays quiet.
+        # What main concluded stands; if it was cut short, it was interrupted.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:  # the disk is full, or a file became unreadable
+        where = error.filename or _place(options)
+        print(one_line(f"{where}: {error.strerror or error}; {_DISK}"), file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    except BaseException as error:
+        if not was_ctrl_c(error):
+            raise
+        print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
+    return int(code)
+
+
+def _place(options: argparse.Namespace) -> object:
+    """The case file or run folder that a command was given."""
+    return getattr(options, "case", None) or getattr(options, "run", "")
+
+
+def run_folder(case: Path, out: Path | None) -> Path:
+    """Make the run folder: --out, or the case file's path without its suffix.
+
+    Raises UserError where it cannot be made or written.
+    """
+    folder = case.with_suffix("") if out is None else out
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise UserError(f"{folder}: exists and is no folder; choose another --out") from None
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot be made: {error.strerror}; choose another --out"
+        ) from None
+    if not os.access(folder, os.W_OK):
+        raise UserError(f"{folder}: is not writable; choose another --out")
+    return folder
+
+
+def _folder(text: str) -> Path:
+    """A directory that is there and writable, or could be made; nothing is made yet."""
+    place = os.path.abspath(text)
+    while not os.path.lexists(place):
+        place = os.path.dirname(place)
+    if not os.path.isdir(place):
+        raise argparse.ArgumentTypeError(f"{place} is no directory; choose another")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise argparse.ArgumentTypeError(f"{place} is not writable; choose another")
+    return Path(text)

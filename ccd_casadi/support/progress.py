@@ -1,0 +1,96 @@
+"""A progress bar on stderr: done, rate, time left.
+
+By hand: tqdm and rich rewrite one line on a terminal only to fill a log with it elsewhere; here a
+log gets a plain line every few seconds, and a stream that fails ends the printing alone.
+"""
+
+import os
+import sys
+import time
+from types import TracebackType
+from typing import Self, TextIO
+
+WIDTH = 24
+
+
+class Progress:
+    """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
+
+    On a terminal one line is rewritten at most ten times a second; elsewhere a plain line is
+    printed every few seconds and at the end. A stream that fails ends the printing, not the work.
+    """
+
+    def __init__(
+        self, total: int, label: str, quiet: bool = False, stream: TextIO | None = None
+    ) -> None:
+        self.total, self.label, self.note = total, label, ""
+        self.stream = sys.stderr if stream is None else stream
+        self.silent = quiet or total <= 0
+        self.terminal = not self.silent and self.stream.isatty()
+        self.interval = 0.1 if self.terminal else 5.0
+        self.done = 0
+        self._began = self._shown = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._show(end="\n")
+
+    def advance(self, count: int = 1, note: str = "") -> None:
+        """Count `count` more as done; `note` is shown behind the bar until the next one."""
+        self.done += count
+        self.note = note
+        if time.monotonic() - self._shown >= self.interval:
+            self._show(end="" if self.terminal else "\n")
+
+    def line(self) -> str:
+        """The line as it stands, for instance `sampling  37/81 [####----] 12.3/s, 4.0 s left`."""
+        elapsed = time.monotonic() - self._began
+        filled = min(WIDTH, WIDTH * self.done // self.total)
+        text = f"{self.label}  {self.done}/{self.total} [{'#' * filled}{'-' * (WIDTH - filled)}]"
+        if self.done >= self.total:
+            text = f"{text} {duration(elapsed)}"
+        elif self.done and elapsed > 0.0:
+            left = (self.total - self.done) * elapsed / self.done
+            text = f"{text} {self.done / elapsed:.3g}/s, {duration(left)} left"
+        return f"{text}  {self.note}".rstrip()
+
+    def _show(self, end: str) -> None:
+        if self.silent:
+            return
+        self._shown = time.monotonic()
+        text = self.line()
+        if self.terminal:
+            # a line that wraps could not be rewritten in place
+            text = "\r\x1b[2K" + text[: self._columns() - 1]
+        try:
+            self.stream.write(text + end)
+            self.stream.flush()
+        except (OSError, ValueError):
+            self.silent = True  # closed, or a broken pipe
+
+    def _columns(self) -> int:
+        try:
+            return os.get_terminal_size(self.stream.fileno()).columns or 80
+        except (OSError, ValueError):
+            return 80
+
+
+def duration(seconds: float) -> str:
+    """Seconds in words.
+
+    >>> duration(3.2), duration(59.97), duration(250), duration(7300)
+    ('3.2 s', '1 min 00 s', '4 min 10 s', '2 h 01 min')
+    """
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"

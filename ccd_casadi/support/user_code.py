@@ -1,0 +1,102 @@
+"""A user's plant function is code: whether it may run here at all, and for how long.
+
+Everything else in a case file or a run folder is data. Only `problem.py` loads a plant file, and it
+asks here first.
+"""
+
+import functools
+import inspect
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import FrameType
+from typing import Any
+
+from ccd_casadi.support.errors import UserError, described
+
+AGAIN = 1.0  # s after which a function that swallowed the first alarm gets another
+
+_refused: ContextVar[bool] = ContextVar("user_code_refused", default=False)
+
+
+class UserCodeRefused(UserError):
+    """A case names a plant function where none may run."""
+
+
+class _Late(BaseException):
+    """Not an Exception, so that `except Exception` in a user's loop does not swallow it."""
+
+
+@contextmanager
+def permit_user_code(allowed: bool) -> Iterator[None]:
+    """Within the block, plant functions of users run or (--no-user-code) are refused."""
+    token = _refused.set(not allowed)
+    try:
+        yield
+    finally:
+        _refused.reset(token)
+
+
+def require_user_code(function: str) -> None:
+    """Raise UserCodeRefused where a plant function must not run."""
+    if _refused.get():
+        raise UserCodeRefused(
+            f"function = {function} is code, which --no-user-code refuses; "
+            "read it, and leave the option out if you trust it"
+        )
+
+
+@contextmanager
+def time_limit(seconds: float, error: UserError) -> Iterator[None]:
+    """Raise `error` in the block after so many seconds of real time.
+
+    By SIGALRM: in the main thread of a process (every command and every worker of the pool), on
+    systems that have it, and between two Python instructions; elsewhere the block runs as it is.
+    """
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def late(number: int, frame: FrameType | None) -> None:
+        raise _Late
+
+    before = signal.signal(signal.SIGALRM, late)
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+    except _Late:
+        raise error from None
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+
+def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Callable[..., Any]:
+    """The function with a time limit on every call, and with no way out but a value or an error.
+
+    Raises `late` after so many seconds, and UserError where the function would end the process
+    (SystemExit) or raises what cannot even be shown.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        with time_limit(seconds, late):
+            try:
+                value = function(*arguments, **options)
+            except (KeyboardInterrupt, _Late):
+                raise
+            except BaseException as error:
+                words = described(error)
+                if isinstance(error, Exception) and words != type(error).__name__:
+                    raise
+                raise type(late)(f"the function raised {words}; mend it") from None
+        if inspect.iscoroutine(value):
+            value.close()  # else Python warns that nobody awaited it
+            raise type(late)("the function is an async one; write a plain def")
+        return value
+
+    return call

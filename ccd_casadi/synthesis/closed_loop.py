@@ -1,0 +1,111 @@
+"""Measure and certify any controller on any plant: the judge that all back ends share."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from ccd_casadi.kernels.design import assess
+from ccd_casadi.kernels.figures import Figure
+from ccd_casadi.kernels.frequency import prepare, response
+from ccd_casadi.kernels.sensitivity import sensitivity_gain
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome, figures_from_row
+from ccd_casadi.synthesis.weights import Weights
+
+EPS = 2.0**-52
+ROUNDING = 1e-6  # relative: what the conversion to SI may change of a norm and of a bandwidth
+
+
+def measure(
+    plant: ScaledPlant,
+    controller: StateSpace,
+    weights: Weights,
+    *,
+    gamma: float,
+    omega_low: float,
+    gamma_opt: float = np.nan,
+    gamma_lower_bound: float = np.nan,
+) -> DesignFigures:
+    """Rebuild the loop from an SI controller (e in, u out), certify it against `gamma`, measure S.
+
+    The figures end where the certificate fails; ω_low in rad/s.
+    """
+    w0 = plant.omega_0
+    row = np.full(int(Figure.COUNT), np.nan)
+    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
+    row[Figure.LIMITED_BY_BOUND] = 0.0
+    assess(
+        plant.A,
+        plant.B,
+        plant.C,
+        np.ascontiguousarray(controller.A / w0),
+        np.ascontiguousarray(controller.B / w0),
+        np.ascontiguousarray(controller.C / plant.force),
+        np.ascontiguousarray(controller.D / plant.force),
+        weights.scaled(w0),
+        gamma,
+        omega_low / w0,
+        row,
+    )
+    return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+
+
+def handed_out(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
+    """The design, no longer certified where the numbers of its controller in SI do not carry it.
+
+    What is certified in a synthesis is the controller in the plant's own units. Where the loop
+    hangs on digits that doubles do not have (a plant of gain 10¹², for instance), the controller
+    that a user gets is another one: it is certified again as it is given away.
+    """
+    if not made.figures.certified:
+        return made
+    gamma = made.figures.gamma * (1.0 + ROUNDING)
+    rng = np.random.default_rng(0)  # the way to SI and back alone may change no digit at all
+    K = made.controller
+    rounded = StateSpace(
+        *(X * (1.0 + EPS * rng.choice([-1.0, 1.0], X.shape)) for X in (K.A, K.B, K.C, K.D))
+    )
+    again = measure(plant, rounded, made.weights, gamma=gamma, omega_low=omega_low)
+    if again.certified and abs(again.bandwidth / made.figures.bandwidth - 1.0) <= ROUNDING:
+        return made
+    return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
+
+
+def local_peaks(plant: ScaledPlant, controller: StateSpace) -> list[tuple[float, float]]:
+    """Local maxima above 1 of σ_max(S) as (ω in rad/s, gain), in order of frequency."""
+    G, K, Dk = _prepared(plant, controller)
+    grid = np.geomspace(1e-3, 1e3, 3001)
+    gain = np.array([sensitivity_gain(G, K, Dk, omega) for omega in grid])
+    tops = np.flatnonzero((gain[1:-1] > gain[:-2]) & (gain[1:-1] >= gain[2:]) & (gain[1:-1] > 1.0))
+    found = []
+    for i in tops + 1:
+        best = minimize_scalar(
+            lambda x: -sensitivity_gain(G, K, Dk, np.exp(x)),
+            bounds=np.log([grid[i - 1], grid[i + 1]]),
+            method="bounded",
+            options={"xatol": 1e-9},
+        )
+        found.append((float(np.exp(best.x)) * plant.omega_0, float(-best.fun)))
+    return found
+
+
+def responses(
+    plant: ScaledPlant, controller: StateSpace, omega: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """G (k, p, m), K (k, m, p) and S (k, p, p) at jω in SI, for frequencies (k,) in rad/s."""
+    G, K, Dk = _prepared(plant, controller)
+    scaled = np.asarray(omega, float) / plant.omega_0
+    g = np.array([response(G, w) for w in scaled])
+    k = np.array([response(K, w) + Dk for w in scaled])
+    S = np.linalg.inv(np.eye(g.shape[1]) + g @ k)
+    return g / plant.force, k * plant.force, S
+
+
+def _prepared(plant: ScaledPlant, controller: StateSpace) -> tuple:
+    w0, force = plant.omega_0, plant.force
+    G = prepare(plant.A, plant.B, plant.C)
+    parts = (controller.A / w0, controller.B / w0, controller.C / force, controller.D / force)
+    A, B, C, D = (np.ascontiguousarray(part) for part in parts)
+    return G, prepare(A, B, C), D

@@ -1,0 +1,114 @@
+"""Total derivatives of a certified design's figures to θ and to the weights.
+
+The controller, γ_opt and the Riccati solution move with the plant; the paper's own gradient,
+with K held fixed (its equations (10) to (13)), comes along for the baseline.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.kernels.design import failed_row
+from ccd_casadi.kernels.gradients import (
+    DesignPlant,
+    Loop,
+    design_with_gradients,
+    off_design_gradients,
+)
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
+from ccd_casadi.synthesis.weights import Weights
+
+MULTIPLE_GAP = 1e-6  # below this (σ1 - σ2)/σ1 the largest singular value counts as multiple
+_WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """Figures of one design with their gradients.
+
+    `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt.
+    `to_theta` (4, n_θ) per unit of θ; `to_weights` maps a weight's name to the derivatives (4,)
+    to its logarithm. `fixed_controller` (n_θ) is dω_b/dθ with K held fixed.
+    `simple` tells whether σ_max is a simple singular value at the three frequencies; where it is
+    not, the gradient is one of several one-sided ones.
+    """
+
+    figures: DesignFigures
+    values: Array
+    to_theta: Array
+    to_weights: dict[str, Array]
+    fixed_controller: Array
+    simple: tuple[bool, ...]
+
+    @property
+    def to_break_frequencies(self) -> Array:
+        """Derivatives (4, 2) to (ln ω_S, ln ω_T)."""
+        return np.column_stack([self.to_weights["omega_S"], self.to_weights["omega_T"]])
+
+
+def sensitivities(
+    plant: ScaledPlant,
+    weights: Weights,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+    guess: float = 0.0,
+) -> Sensitivities:
+    """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
+
+    What is certified here has finite gradients; where they are not, the outcome says so.
+    With a family the peak is the largest on any of it, its gradient that of the plant that has it.
+    """
+    w0 = plant.omega_0
+    w = weights.scaled(w0)
+    made_on = plant if plant.family is None else plant.family.design
+    arguments = (made_on.A, made_on.B, made_on.C, w, made_on.grid, made_on.gain, gamma_backoff)
+    slopes = (made_on.dA, made_on.dB, made_on.dC)
+    count = plant.dA.shape[0]
+    figures = None
+    try:
+        row, *controller, gradient, fixed, gaps = design_with_gradients(
+            *arguments, omega_low / w0, guess, *slopes, made_on.channels
+        )
+        if plant.family is not None:
+            figures, worst = over_family(plant, weights, row, tuple(controller), omega_low)
+            members = (plant, *plant.family.perturbed)
+            loops = [
+                Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0)
+                for at, omega in (
+                    (plant, figures.bandwidth),
+                    (members[worst], figures.sensitivity_peak_frequency),
+                    (plant, omega_low),
+                )
+            ]
+            gradient, fixed, gaps = off_design_gradients(
+                DesignPlant(*arguments[:3], *slopes, w, gamma_backoff), row, gradient[3],
+                loops if figures.certified else [],
+            )  # fmt: skip
+    except np.linalg.LinAlgError:
+        row, gradient = failed_row(), np.full((4, count + 8), np.nan)
+        fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
+    if figures is None:
+        figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    if figures.certified and not np.isfinite(gradient).all():
+        figures = replace(figures, outcome=Outcome.NO_DERIVATIVES)
+    gradient[0] *= w0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        values = np.array(
+            [
+                figures.bandwidth,
+                np.log(figures.sensitivity_peak),
+                np.log(figures.sensitivity_low),
+                figures.gamma_opt,
+            ]
+        )
+    return Sensitivities(
+        figures=figures,
+        values=values,
+        to_theta=gradient[:, :count],
+        to_weights={name: gradient[:, count + i] * w[i] for i, name in enumerate(_WEIGHTS)},
+        fixed_controller=fixed * w0,
+        simple=tuple(bool(gap > MULTIPLE_GAP) for gap in gaps),
+    )

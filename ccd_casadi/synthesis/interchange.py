@@ -1,0 +1,235 @@
+"""Plants and controllers as `control.StateSpace` and as .mat files, both ways.
+
+Conventions, the same in both: SI, time in s; the plant takes forces u1, u2, … (N) to
+displacements y1, y2, … (m), the controller errors e1, e2, … = r - y (m) to the same forces.
+Closing the loop takes one minus sign: in python-control `control.feedback(G * K, I)`, in MATLAB
+`feedback(G*K, eye(p))`.
+
+A .mat file is MATLAB's version 5 (`load`, `scipy.io.loadmat`): one struct a system with A, B, C, D,
+Ts (s, 0 for continuous time), InputName, OutputName, InputUnit, OutputUnit, and theta,
+theta_names, theta_units. `ss(K.A, K.B, K.C, K.D, K.Ts)` makes it a system.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import scipy.io
+
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+PARTS = ("A", "B", "C", "D")
+LONGEST_NAME = 63  # of a variable in MATLAB
+
+
+@dataclass(frozen=True)
+class NamedSystem:
+    """A state space with named signals; `period` in s, 0 in continuous time."""
+
+    system: StateSpace
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    input_unit: str
+    output_unit: str
+    period: float = 0.0
+
+
+@dataclass(frozen=True)
+class DesignFile:
+    """What a .mat file carries: systems by name, and θ with its units."""
+
+    systems: Mapping[str, NamedSystem]
+    theta: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+def named_plant(plant: StateSpace, period: float = 0.0) -> NamedSystem:
+    """Forces u1, … in N to displacements y1, … in m; `period` in s."""
+    inputs, outputs = _names("u", plant.B.shape[1]), _names("y", plant.C.shape[0])
+    return NamedSystem(plant, inputs, outputs, "N", "m", period)
+
+
+def named_controller(controller: StateSpace, period: float = 0.0) -> NamedSystem:
+    """Errors e1, … = r - y in m to forces u1, … in N; `period` in s."""
+    inputs, outputs = _names("e", controller.B.shape[1]), _names("u", controller.C.shape[0])
+    return NamedSystem(controller, inputs, outputs, "m", "N", period)
+
+
+def to_control(named: NamedSystem, name: str = "") -> control.StateSpace:
+    """The same matrices as `control.StateSpace`, signals named, dt = period."""
+    parts = [getattr(named.system, part).copy() for part in PARTS]
+    signals: dict[str, Any] = {"inputs": list(named.inputs), "outputs": list(named.outputs)}
+    if name:
+        signals["name"] = name
+    return control.ss(*parts, named.period, remove_useless_states=False, **signals)
+
+
+def from_control(system: Any) -> tuple[StateSpace, float]:
+    """Matrices and period in s (0: continuous) of a `control` system, in whatever form it is.
+
+    Raises UserError where it is no linear system, or is discrete without a sampling period.
+    """
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
+        words = "is no control.StateSpace or control.TransferFunction; convert it with control.ss"
+        raise UserError(f"{type(system).__name__}: {words}")
+    if system.dt is True:
+        raise UserError("the system is in discrete time without a period; give it a dt in s")
+    try:
+        space = control.ss(system)
+    except (ValueError, control.ControlMIMONotImplemented) as error:
+        raise UserError(f"the system has no state space: {error}; make it proper") from None
+    parts = (np.array(part, dtype=float) for part in (space.A, space.B, space.C, space.D))
+    return StateSpace(*parts), float(system.dt or 0.0)
+
+
+def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
+    """A plant in SI, force to displacement, ready for synthesis with weights of this M_K (N/m).
+
+    Raises UserError where it is in discrete time, PlantError where it cannot be a plant.
+
+    >>> import control
+    >>> plant = plant_from_control(control.tf([1.0], [2.0, 40.0, 8e4]), M_K=1e5)
+    >>> round(float(plant.natural[0]), 6), plant.A.shape  # rad/s
+    (200.0, (2, 2))
+    """
+    space, period = from_control(system)
+    if period:
+        raise UserError("the plant is in discrete time; give the continuous one")
+    return scale_state_space(space, M_K)
+
+
+def controller_from_control(system: Any) -> StateSpace:
+    """A continuous controller in SI, e = r - y to u. Raises UserError where it is discrete."""
+    space, period = from_control(system)
+    if period:
+        raise UserError("the controller is in discrete time; give the continuous one")
+    return space
+
+
+def write_mat(path: Path, design: DesignFile) -> None:
+    """Write the systems and θ as MATLAB version 5. Raises UserError where that cannot be done."""
+    content: dict[str, Any] = {}
+    for name, named in design.systems.items():
+        if not (name.isidentifier() and name.isascii() and len(name) <= LONGEST_NAME):
+            raise UserError(f"{path}: {name!r} is no name for a variable in MATLAB")
+        content[name] = {
+            **{part: getattr(named.system, part) for part in PARTS},
+            "Ts": named.period,
+            "InputName": _cells(named.inputs),
+            "OutputName": _cells(named.outputs),
+            "InputUnit": named.input_unit,
+            "OutputUnit": named.output_unit,
+        }
+    names = list(design.theta)
+    content["theta"] = np.array([design.theta[name] for name in names]).reshape(-1, 1)
+    content["theta_names"] = _cells(names)
+    content["theta_units"] = _cells([design.units.get(name, "") for name in names])
+    try:
+        scipy.io.savemat(path, content, format="5", oned_as="column", long_field_names=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def read_mat(path: Path) -> DesignFile:
+    """Every struct with A, B, C, D in a .mat file, ours or another's, and θ where it is there.
+
+    Names and units may be missing: they are then u1, …; Ts defaults to 0. Nothing in the file is
+    executed. Raises UserError naming file and variable where something is missing or damaged.
+    """
+    try:
+        with path.open("rb") as stream:
+            content = scipy.io.loadmat(stream, squeeze_me=False, struct_as_record=True)
+    except FileNotFoundError:
+        raise UserError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except NotImplementedError:  # how SciPy refuses the HDF5 files of MATLAB 7.3
+        words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
+        raise UserError(f"{path}: {words}") from None
+    except Exception as error:  # a damaged file fails anywhere inside the reader
+        raise UserError(f"{path}: is no readable .mat file: {_one_line(error)}") from None
+    systems = {
+        name: _system(path, name, value)
+        for name, value in content.items()
+        if isinstance(value, np.ndarray) and value.dtype.names and "A" in value.dtype.names
+    }
+    if not systems:
+        raise UserError(f"{path}: holds no struct with A, B, C, D; save one for each system")
+    names = _strings(content.get("theta_names"))
+    values = np.asarray(content.get("theta", np.zeros(0))).ravel()
+    units = _strings(content.get("theta_units"))
+    if len(names) != len(values) or values.dtype.kind not in "fiu":
+        raise UserError(f"{path}: theta: is not one number for each of theta_names")
+    theta = {name: float(value) for name, value in zip(names, values, strict=True)}
+    return DesignFile(systems, theta, dict(zip(names, units, strict=False)))
+
+
+def _system(path: Path, name: str, value: np.ndarray) -> NamedSystem:
+    if value.size != 1:
+        raise UserError(f"{path}: {name}: is an array of structs; save one struct")
+    struct = {key: value.ravel()[0][key] for key in value.dtype.names or ()}
+    missing = [part for part in PARTS if part not in struct]
+    if missing:
+        raise UserError(f"{path}: {name}: has no {missing[0]}")
+    A, B, C, D = (_matrix(path, f"{name}.{part}", struct[part]) for part in PARTS)
+    n, m, p = A.shape[0], D.shape[1], D.shape[0]
+    if A.shape != (n, n) or B.shape != (n, m) or C.shape != (p, n):
+        sizes = ", ".join(str(part.shape) for part in (A, B, C, D))
+        raise UserError(f"{path}: {name}: the sizes of A, B, C, D do not fit: {sizes}")
+
+    def text(key: str) -> tuple[str, ...]:
+        return _strings(struct.get(key))
+
+    period = 0.0
+    if "Ts" in struct:
+        Ts = _matrix(path, f"{name}.Ts", struct["Ts"])
+        if Ts.size != 1 or Ts[0, 0] < 0.0:
+            raise UserError(f"{path}: {name}.Ts: is no sampling period in s, or 0")
+        period = float(Ts[0, 0])
+    inputs, outputs = text("InputName"), text("OutputName")
+    return NamedSystem(
+        StateSpace(A, B, C, D),
+        inputs if len(inputs) == m else _names("u", m),
+        outputs if len(outputs) == p else _names("y", p),
+        " ".join(text("InputUnit")),
+        " ".join(text("OutputUnit")),
+        period,
+    )
+
+
+def _matrix(path: Path, name: str, value: Any) -> Array:
+    matrix = np.asarray(value)
+    if matrix.ndim != 2 or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
+        raise UserError(f"{path}: {name}: is no finite real matrix")
+    return np.ascontiguousarray(matrix, dtype=float)
+
+
+def _cells(texts: Sequence[str]) -> np.ndarray:
+    """A MATLAB cell column of texts."""
+    cells = np.empty((len(texts), 1), dtype=object)
+    cells[:, 0] = list(texts)
+    return cells
+
+
+def _strings(value: Any) -> tuple[str, ...]:
+    """The texts of a cell array, or of one text."""
+    if value is None:
+        return ()
+    found = []
+    for item in np.asarray(value).ravel():
+        part = np.asarray(item)
+        found.append(str(part.ravel()[0]) if part.size else "")
+    return tuple(found)
+
+
+def _names(letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}{i + 1}" for i in range(count))
+
+
+def _one_line(error: object) -> str:
+    return " ".join(str(error).split())[:120]

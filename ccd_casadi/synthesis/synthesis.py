@@ -1,0 +1,209 @@
+"""Certified mixed-sensitivity H∞ synthesis at one θ and one pair (ω_S, ω_T).
+
+    K* = argmin ‖[W_S S; W_KS KS; W_T T]‖∞        (paper, equation (3))
+
+by one Riccati equation, at γ = gamma_backoff·γ_opt, certified from the rebuilt closed loop.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.kernels.design import assess, design
+from ccd_casadi.kernels.design import sweep as _sweep
+from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.weights import Weights
+
+UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
+LEVEL = 1e-6  # relative: how far above the largest gain found a norm is certified
+
+
+class Outcome(StrEnum):
+    """How a synthesis ended. Only CERTIFIED designs are ever used; the value says why not."""
+
+    CERTIFIED = "certified"
+    GAMMA_NOT_CONVERGED = "the search for gamma_opt did not converge"
+    RICCATI_FAILED = "the Hamiltonian has eigenvalues on the axis: no stabilising Riccati solution"
+    NOT_FINITE = "the controller is not finite"
+    UNSTABLE_LOOP = "the rebuilt closed loop is not stable"
+    NORM_EXCEEDED = "the closed loop's norm exceeds gamma on the frequency grid"
+    LEVEL_TEST_FAILED = "the Hamiltonian test finds a gain above gamma"
+    NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
+    EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
+    PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
+    LOST_IN_ROUNDING = "the controller in SI is not certified again: the loop hangs on lost digits"
+    NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
+    NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
+
+
+_OUTCOMES = {code: Outcome[code.name] for code in Code}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Evidence from the rebuilt loop: stability, and the norm against the bound it had to meet."""
+
+    stable: bool
+    max_real_pole: float  # 1/s
+    norm: float
+    norm_bound: float
+    passed: bool
+
+
+@dataclass(frozen=True)
+class DesignFigures:
+    """What one synthesis gave, in SI (rad/s); NaN where it ended before the figure was known."""
+
+    omega_S: float
+    omega_T: float
+    outcome: Outcome
+    gamma_opt: float
+    gamma_lower_bound: float
+    gamma: float
+    limited_by_bound: bool  # γ_opt = γ_jω, the limit that no controller passes
+    bandwidth: float
+    sensitivity_peak: float
+    sensitivity_peak_frequency: float
+    sensitivity_low: float
+    certificate: Certificate
+
+    @property
+    def certified(self) -> bool:
+        """Whether the design may be used at all."""
+        return self.outcome is Outcome.CERTIFIED
+
+
+@dataclass(frozen=True)
+class Design:
+    """A synthesis with its controller, input e = r - y, output u, in SI."""
+
+    figures: DesignFigures
+    weights: Weights
+    controller: StateSpace
+
+
+def synthesise(
+    plant: ScaledPlant,
+    weights: Weights,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+    guess: float = 0.0,
+) -> Design:
+    """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none).
+
+    With a family it is made on the family's design plant, see `over_family`. A failure is an
+    outcome of its `figures`, no exception.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> weights = problem.weights.at(800.0 * ccd.HZ, 40.0 * ccd.HZ)
+    >>> made = ccd.synthesise(ccd.scaled_plant(problem, (60.0, 60.0)), weights, omega_low=ccd.HZ)
+    >>> made.figures.outcome.value, round(made.figures.bandwidth / ccd.HZ, 2)
+    ('certified', 55.66)
+    """
+    w0 = plant.omega_0
+    made_on = plant if plant.family is None else plant.family.design
+    arguments = (made_on.A, made_on.B, made_on.C, weights.scaled(w0), made_on.grid, made_on.gain)
+    row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, made_on.channels)
+    figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
+    if plant.family is not None:
+        figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
+    return Design(figures, weights, plant.controller_si(Ak, Bk, Ck))
+
+
+def sweep(
+    plant: ScaledPlant,
+    weights: Weights,
+    omega_S: Array,
+    omega_T: Array,
+    *,
+    omega_low: float,
+    gamma_backoff: float = 1.02,
+) -> list[DesignFigures]:
+    """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
+    w0 = plant.omega_0
+    S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
+    w = weights.scaled(w0)
+    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels)
+    if plant.family is not None:
+        points = [weights.at(float(s), float(t)) for s in S for t in T]
+        options = {"omega_low": omega_low, "gamma_backoff": gamma_backoff}
+        return [synthesise(plant, point, **options).figures for point in points]
+    rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
+    return [
+        figures_from_row(rows[i, j], float(s), float(t), w0)
+        for i, s in enumerate(S)
+        for j, t in enumerate(T)
+    ]
+
+
+def over_family(
+    plant: ScaledPlant,
+    weights: Weights,
+    row: Array,
+    controller: tuple[Array, Array, Array],
+    omega_low: float,
+) -> tuple[DesignFigures, int]:
+    """Figures of a scaled controller (A_K, B_K, C_K) on a plant and its perturbed siblings.
+
+    ω_b and σ_max(S(jω_low)) are the plant's own, ‖S‖∞ is the largest of all; second comes which
+    has it, 0 the plant itself. `row` is that of the synthesis on the family's design plant. γ_opt
+    is of that one; the certified norm is of the plant itself, and no optimal one there.
+    """
+    w0 = plant.omega_0
+    if row[Figure.CODE] != Code.CERTIFIED or plant.family is None:
+        return figures_from_row(row, weights.omega_S, weights.omega_T, w0), 0
+    w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
+
+    def assessed(member: ScaledPlant, gamma: float) -> Array:
+        own = row.copy()
+        loop = (member.A, member.B, member.C, *controller, Dk)
+        assess(*loop, w, gamma, omega_low / w0, own)
+        return own
+
+    own = assessed(plant, UNBOUNDED)
+    if own[Figure.CODE] == Code.CERTIFIED:
+        own = assessed(plant, max(row[Figure.GAMMA], (1.0 + LEVEL) * own[Figure.NORM]))
+    worst = 0
+    if own[Figure.CODE] == Code.CERTIFIED:
+        for i, member in enumerate(plant.family.perturbed, 1):
+            other = assessed(member, UNBOUNDED)
+            if other[Figure.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
+                figures = figures_from_row(own, weights.omega_S, weights.omega_T, w0)
+                return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), i
+            if other[Figure.PEAK] > own[Figure.PEAK]:
+                worst = i
+                own[[Figure.PEAK, Figure.PEAK_FREQUENCY]] = other[
+                    [Figure.PEAK, Figure.PEAK_FREQUENCY]
+                ]
+    return figures_from_row(own, weights.omega_S, weights.omega_T, w0), worst
+
+
+def figures_from_row(row: Array, omega_S: float, omega_T: float, omega_0: float) -> DesignFigures:
+    """A kernel's row of scaled figures in SI."""
+    code = Code(int(row[Figure.CODE]))
+    pole = float(row[Figure.MAX_REAL_POLE]) * omega_0
+    return DesignFigures(
+        omega_S=omega_S,
+        omega_T=omega_T,
+        outcome=_OUTCOMES[code],
+        gamma_opt=float(row[Figure.GAMMA_OPT]),
+        gamma_lower_bound=float(row[Figure.GAMMA_LOWER_BOUND]),
+        gamma=float(row[Figure.NORM]),
+        limited_by_bound=bool(row[Figure.LIMITED_BY_BOUND]),
+        bandwidth=float(row[Figure.BANDWIDTH]) * omega_0,
+        sensitivity_peak=float(row[Figure.PEAK]),
+        sensitivity_peak_frequency=float(row[Figure.PEAK_FREQUENCY]) * omega_0,
+        sensitivity_low=float(row[Figure.LOW]),
+        certificate=Certificate(
+            stable=pole < 0.0,
+            max_real_pole=pole,
+            norm=float(row[Figure.NORM]),
+            norm_bound=float(row[Figure.GAMMA]),
+            passed=code in (Code.CERTIFIED, Code.NO_BANDWIDTH),
+        ),
+    )

@@ -1,0 +1,63 @@
+"""The weighting filters W_S, W_KS, W_T of the paper, diagonal for any number of channels."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Parameters of W1, W2, W3 (paper, equations (4) to (6)); frequencies in rad/s.
+
+        W1 = (s/M_S + ω_S)/(s + ω_S A_S)
+        W2 = c_K (s + ω_K)/(M_K (s + c_K ω_K))
+        W3 = (s + ω_T/A_l)/(A_u s + ω_T)
+
+    M_K has the unit of force over displacement (N/m); the others but the frequencies none.
+
+    >>> w = Weights(M_S=2.0, A_S=1e-4, omega_S=100.0, c_K=1e4, omega_K=600.0, M_K=2e7,
+    ...             A_l=1.0, A_u=1e-2, omega_T=250.0)
+    >>> [round(float(v), 4) for v in abs(w.responses(np.array([100.0]))[:, 0])]
+    [1.118, 0.0, 1.077]
+    """
+
+    M_S: float
+    A_S: float
+    omega_S: float
+    c_K: float
+    omega_K: float
+    M_K: float
+    A_l: float
+    A_u: float
+    omega_T: float
+
+    def at(self, omega_S: float, omega_T: float) -> "Weights":
+        """The same weights with other break frequencies, rad/s."""
+        return replace(self, omega_S=omega_S, omega_T=omega_T)
+
+    def scaled(self, omega_0: float) -> NDArray[np.float64]:
+        """The vector that the kernels take: frequencies over ω₀, M_K absorbed in the force."""
+        return np.array(
+            [
+                self.M_S,
+                self.A_S,
+                self.omega_S / omega_0,
+                self.c_K,
+                self.omega_K / omega_0,
+                self.A_l,
+                self.A_u,
+                self.omega_T / omega_0,
+            ]
+        )
+
+    def responses(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """W1, W2, W3 at jω as rows (3, len(omega)); omega in rad/s."""
+        s = 1j * np.asarray(omega)
+        return np.array(
+            [
+                (s / self.M_S + self.omega_S) / (s + self.omega_S * self.A_S),
+                self.c_K * (s + self.omega_K) / (self.M_K * (s + self.c_K * self.omega_K)),
+                (s + self.omega_T / self.A_l) / (self.A_u * s + self.omega_T),
+            ]
+        )

@@ -1,0 +1,125 @@
+"""Ctrl-C at any moment of a command: exit 130 and one line, never a traceback.
+
+Python raises KeyboardInterrupt between two instructions of whatever runs. Three places need care:
+imports (nothing has begun: the process just ends), finalizers (the exception is printed and lost),
+and compiled code (it comes out as another exception, with or without a trace of the first; CasADi's
+solvers swallow it, so `interrupts_kept` holds it until they are done).
+"""
+
+import _thread
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+AGAIN = 0.01  # s
+_pressed = threading.Event()
+_kept = threading.Event()
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    # An exception would come out of whatever is being imported, which may swallow or reword it.
+    os.write(2, b"interrupted before anything was begun\n")
+    os._exit(130)
+
+
+def starting() -> None:
+    """Let Ctrl-C end the process at once, unless somebody handles or ignores it."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
+
+
+def begun() -> None:
+    """Let Ctrl-C raise KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is _leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _press(number: int, frame: FrameType | None) -> None:
+    _pressed.set()
+    signal.default_int_handler(number, frame)
+
+
+@contextmanager
+def ctrl_c_noticed() -> Iterator[None]:
+    """Within the block every Ctrl-C is remembered for `was_ctrl_c`, the last block's that is.
+
+    One that came where nothing can be raised is sent once more.
+    """
+    before, active = sys.unraisablehook, True
+    _pressed.clear()
+    ours = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if ours:
+        signal.signal(signal.SIGINT, _press)
+
+    def again() -> None:
+        if active:
+            _thread.interrupt_main()
+
+    def noticed(unraisable: Any) -> None:
+        if not issubclass(unraisable.exc_type, KeyboardInterrupt):
+            before(unraisable)
+            return
+        # Not from here, where it could not be raised either.
+        timer = threading.Timer(AGAIN, again)
+        timer.daemon = True
+        timer.start()
+
+    sys.unraisablehook = noticed
+    try:
+        yield
+    finally:
+        active = False
+        sys.unraisablehook = before
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def was_ctrl_c(error: BaseException | None) -> bool:
+    """Whether an exception is a KeyboardInterrupt, or was raised in place of one.
+
+    After a Ctrl-C every one counts: libraries drop the interrupt and stumble over its traces.
+    """
+    if _pressed.is_set():
+        return True
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def pending() -> bool:
+    """Whether Ctrl-C was pressed since the current solve began: end what is under way soon."""
+    return _kept.is_set()
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Hold Ctrl-C until the end of the block and raise KeyboardInterrupt there.
+
+    Only the main thread receives signals; elsewhere the block runs as it is.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def keep(number: int, frame: FrameType | None) -> None:
+        _kept.set()
+
+    before = signal.signal(signal.SIGINT, keep)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        held = _kept.is_set()
+        _kept.clear()
+    if held:
+        raise KeyboardInterrupt
