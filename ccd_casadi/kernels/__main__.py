@@ -2,7 +2,6 @@
 
 import time
 
-from ccd_casadi.kernels import gradients as gradients  # imports every kernel
 from ccd_casadi.kernels.compilation import ensure_compiled
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -136,7 +137,8 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 
 def _kernels() -> dict[str, Any]:
-    """Every kernel that has been imported, by module and name."""
+    """Every kernel, by module and name."""
+    import_module(f"{PACKAGE}.gradients")  # with it all the others
     found = {}
     for name, module in list(sys.modules.items()):
         if name.startswith(PACKAGE + "."):
