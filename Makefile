@@ -35,12 +35,16 @@ bench: setup-test
 setup: .venv/.ready
 setup-test: .venv/.ready-test
 
-# The compiled kernels are built once here, so that the first solve does not wait for them.
+# The kernels are compiled once here, so that the first solve does not wait for them; what they need
+# is installed first, the other wheels meanwhile.
 .venv/.ready: requirements.lock pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv
-	$(PIP) -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
-	$(BIN)/python -m ccd_casadi.kernels
+	$(PIP) -c requirements.lock numba scipy
+	$(BIN)/python -m ccd_casadi.kernels & kernels=$$!; \
+	$(PIP) -r requirements.lock && \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e . \
+	|| { kill $$kernels; exit 1; }; \
+	wait $$kernels
 	touch $@
 
 .venv/.ready-test: .venv/.ready requirements-test.lock

@@ -34,7 +34,7 @@ def arguments(item: dict[str, Any]) -> tuple[Array, Array, Array, Array, Array, 
     A, B, C, w = (np.array(item[name]) for name in ("A", "B", "C", "w"))
     poles = np.abs(np.linalg.eigvals(A))
     grid = np.unique(np.concatenate([np.geomspace(1e-5, 1e6, 400), poles]))
-    return A, B, C, w, grid, np.array([plant_gain(A, B, C, omega) for omega in grid])
+    return A, B, C, w, grid, plant_gain(A, B, C, grid)
 
 
 def check_certified(item: dict[str, Any], row: Array, controller: list[Array]) -> None:

@@ -7,8 +7,9 @@ place: a step of order four from one Schur form, whose own terms tell when it is
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import frobenius
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.frequency import response
+from ccd_casadi.kernels.frequency import prepare, response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.lapack import lyapunov_triangular
 from ccd_casadi.kernels.refine import narrow, next_trial
@@ -27,14 +28,12 @@ def lower_bound_squared(w, gain, ω):
     return W1 * R / (W1 + R)
 
 
-@compiled
 def plant_gain(A, B, C, ω):
-    """σ_p(G(jω)), the least gain over output directions (0 where m < p)."""
-    n, m, p = A.shape[0], B.shape[1], C.shape[0]
-    if m < p:
-        return 0.0
-    M = (1j * ω) * np.eye(n) - A
-    return _least_gain(C.astype(np.complex128) @ np.linalg.solve(M, B.astype(np.complex128)))
+    """σ_p(G(jω)), the least gain over output directions (0 where m < p), at every ω of an array."""
+    if B.shape[1] < C.shape[0]:
+        return np.zeros(ω.size)
+    gains = np.linalg.svd(responses(prepare(A, B, C), ω), compute_uv=False)
+    return np.ascontiguousarray(gains[:, -1])
 
 
 @compiled
@@ -87,8 +86,13 @@ def rounding_error(frame, t, d1):
     δH of |δH| = BACKWARD |H| spread evenly over its entries, R has entries of size |δH|/2N.
     """
     H, T11, _, _, _, Z, q, _, _ = frame
-    L = lyapunov_triangular(T11, -np.outer(q, q), False)
-    moved = BACKWARD * np.linalg.norm(H) * np.linalg.norm(L) / (2.0 * q.size)
+    N = q.size
+    Q = np.empty((N, N))
+    for i in range(N):
+        for j in range(N):
+            Q[i, j] = -q[i] * q[j]
+    L = lyapunov_triangular(T11, Q, False)
+    moved = BACKWARD * frobenius(H) * frobenius(L) / (2.0 * N)
     return moved * t / abs(np.dot(q, Z @ q)) * t / (2.0 * (t + d1**2))
 
 
