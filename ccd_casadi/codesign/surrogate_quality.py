@@ -21,8 +21,17 @@ from surrogates.validation import held_out
 
 FOLDS = 10
 LEAST_FOR_ROUGHNESS = 20
-# Q² above which the samples are followed whatever their roughness.
+# Q² above which the samples are followed whatever their roughness; above which a kink is a slight
+# one; and below which the surrogate follows them poorly, smooth or not.
 EXCELLENT = 1.0 - 1e-6
+GOOD = 0.995
+POOR = 0.9
+# A sample this close to the design (share of the box) is the design.
+SAME = 1e-6
+# Left out, the sample at the design is off by more of its deviations than this, and by more than
+# this share of the samples' range: the others do not support the design.
+SIGMAS = 3.0
+SHARE = 1e-3
 # Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
 # fitted is a logarithm.
 OUTPUTS = (
@@ -39,7 +48,8 @@ class Quality:
     true, predicted (n,): each sample in Hz or as a gain, and its prediction without it;
     standardised (n,): the difference over the deviation of the band; coverage: share inside
     nominal 95 % bands. extrapolates: what is amiss at the design, nothing where samples
-    support it.
+    support it. at_design: where the design is itself a sample, the error there without it in `unit`
+    and in predicted deviations; None elsewhere.
     """
 
     name: str
@@ -52,11 +62,44 @@ class Quality:
     coverage: float
     roughness: Roughness
     extrapolates: tuple[str, ...]
+    at_design: tuple[float, float] | None = None
+
+    @property
+    def poor(self) -> bool:
+        """Whether left-out samples are predicted too badly to speak of support."""
+        return not self.kfold.q2 >= POOR
+
+    @property
+    def samples_look(self) -> str:
+        """Smooth, kinked or torn, with how well the surrogate follows them."""
+        if self.poor:
+            return "poorly followed"
+        if self.roughness is Roughness.KINKED and self.kfold.q2 >= GOOD:
+            return "nearly smooth"
+        return self.roughness.value
+
+    @property
+    def unsupported(self) -> str:
+        """Why the samples do not support the design; nothing where they do."""
+        if self.extrapolates:
+            return "; ".join(self.extrapolates)
+        if self.poor:
+            return f"followed to Q² {self.kfold.q2:.3g} only"
+        if self.at_design is not None:
+            error, sigmas = self.at_design
+            unit = 100.0 if self.unit == "%" else float(np.ptp(self.true))
+            if sigmas > SIGMAS and abs(error) > SHARE * unit:
+                return (
+                    f"the design is a sample that the others miss by {abs(error):.3g} {self.unit}, "
+                    f"{sigmas:.1f} deviations"
+                )
+        return ""
 
     @property
     def smooth_enough(self) -> bool:
         """Whether one smooth surrogate suits the samples."""
-        return self.roughness is Roughness.SMOOTH or self.kfold.q2 >= EXCELLENT
+        smooth = self.roughness is Roughness.SMOOTH and not self.poor
+        return smooth or self.kfold.q2 >= EXCELLENT
 
 
 def surrogate_quality(
@@ -74,7 +117,14 @@ def recommendation(qualities: Sequence[Quality]) -> str:
     if not qualities:
         return ""
     said = []
-    rough = [q.name.replace("_", " ") for q in qualities if not q.smooth_enough]
+    poor = [q for q in qualities if q.poor]
+    if poor:
+        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.kfold.q2:.2g})" for q in poor)
+        said.append(
+            f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
+            "surrogate says anything away from the design."
+        )
+    rough = [q.name.replace("_", " ") for q in qualities if not (q.smooth_enough or q.poor)]
     if rough:
         what = ", ".join(rough)
         said.append(
@@ -94,6 +144,9 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             f"At the design the surrogate of {', '.join(beyond)} extrapolates: trust the "
             "verification, and retrain before moving bounds or weights."
         )
+    missed = [q for q in qualities if q.unsupported and not q.extrapolates and not q.poor]
+    for q in missed:
+        said.append(f"{q.name.replace('_', ' ').capitalize()}: {q.unsupported}.")
     return " ".join(said) or "The surrogates follow their samples, and support the design."
 
 
@@ -111,6 +164,9 @@ def quality_dict(qualities: Sequence[Quality]) -> dict[str, Any]:
                 "coverage_95": q.coverage,
                 "roughness": q.roughness.value,
                 "extrapolates": list(q.extrapolates),
+                "left_out_at_design": None
+                if q.at_design is None
+                else {"error": q.at_design[0], "deviations": q.at_design[1]},
             }
             for q in qualities
         },
@@ -134,6 +190,12 @@ def _quality(
     if n >= LEAST_FOR_ROUGHNESS:
         kind = roughness(smoothness_likelihoods(process.X, process.targets[:n], 0.0, seed))
     standardised = residuals / (process.band * deviations)
+    unit_x = (x - process.lower) / (process.upper - process.lower)
+    away = np.abs(process.X - unit_x).max(axis=1)
+    at = int(np.argmin(away))
+    at_design = None
+    if away[at] <= SAME:
+        at_design = (float(factor * residuals[at]), float(abs(standardised[at])))
     return Quality(
         name=name,
         unit=unit,
@@ -145,6 +207,7 @@ def _quality(
         coverage=float(np.mean(np.abs(standardised) <= TWO_SIDED_95)),
         roughness=kind,
         extrapolates=extrapolation(process, samples.X, x).reasons,
+        at_design=at_design,
     )
 
 

@@ -1,0 +1,154 @@
+"""A look at the whole box: is anything better than what a formulation found?
+
+The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
+formulation solved itself counted in. Whatever is better than its neighbours there starts a local
+solve on the true problem (`kinked.descend`); the best end wins. What this excludes is a better
+optimum whose basin one of the points lies in, and no more than that.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import acceptable, objective
+from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.support.arrays import Array
+from surrogates import design
+
+LOCAL_STARTS = 5  # local solves at most, from the best of the points that beat their neighbours
+BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
+SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
+PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
+TRIES = 4
+
+
+@dataclass(frozen=True)
+class BoxLook:
+    """What was looked at: `points` true inner problems of which `feasible` have a design.
+
+    `better`: how many of them beat the J that the formulation came `before` with; `starts` local
+    solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
+    """
+
+    points: int
+    feasible: int
+    better: int
+    starts: int
+    seed: int
+    before: float
+    after: float
+    x: Array | None
+
+    @property
+    def moved(self) -> bool:
+        """Whether something better was found."""
+        return self.x is not None
+
+
+def look_over_box(sampler: Sampler, x: Array, J: float, points: int, seed: int) -> BoxLook:
+    """Look at `points` θ over the box for a J lower than that of x = (θ, ln ω_S, ln ω_T)."""
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    samples = _spread(sampler, points, seed) if points else []
+    feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
+    values = np.array([_objective(problem, sample) for sample in feasible])
+    margin = BETTER * abs(J)
+    best_x, best = None, J
+    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))
+    for sample in starts:
+        begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+        end = descend(problem, quantities, begin)
+        for place in (end, begin):
+            found = quantities.at(place)
+            if acceptable(problem, place, found):
+                value = objective(problem, place, found)
+                if value < best - margin:
+                    best_x, best = place, value
+                break
+    return BoxLook(
+        points=len(samples),
+        feasible=len(feasible),
+        better=int((values < J - margin).sum()),
+        starts=len(starts),
+        seed=seed,
+        before=J,
+        after=best,
+        x=best_x,
+    )
+
+
+def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
+    """Ends of local solves from a few starts around x: the last try where x is not stationary."""
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    lower, upper = box(problem)
+    ends = []
+    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
+        theta = np.clip(x[:-2] + step * (upper - lower), lower, upper)
+        sample = sampler.bandwidths(theta, "perturbed starts")[0]
+        if sample.feasible:
+            begin = np.array([*theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+            end = descend(problem, quantities, begin, settled=1e-13)
+            if acceptable(problem, end, quantities.at(end)):
+                ends.append(end)
+    return ends
+
+
+def _spread(sampler: Sampler, points: int, seed: int) -> list[BandwidthSample]:
+    """The inner problems that the run has solved, and as many more as make up `points`."""
+    lower, upper = box(sampler.problem)
+    solved = list(sampler.solved.values())
+    apart = _apart(np.array([s.theta for s in solved]).reshape(-1, lower.size), upper - lower)
+    known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
+    if len(known) < points:
+        more = design("sobol", lower, upper, points, seed)[len(known) :]
+        plant = plant_of(sampler.problem)
+        more = [theta for theta in more if (constraint_values(plant, theta) <= 0.0).all()]
+        if more:
+            solved = [*solved, *sampler.bandwidths(np.array(more), "looking over the box")]
+            known = [*known, *solved[-len(more) :]]
+    return known
+
+
+def _apart(thetas: Array, width: Array) -> list[bool]:
+    """Which of them are no near repetition of an earlier one: a cluster is one look."""
+    kept: list[int] = []
+    out = []
+    for i, theta in enumerate(thetas):
+        far = all(np.abs((theta - thetas[k]) / width).max() > 0.02 for k in kept)
+        out.append(far)
+        if far:
+            kept.append(i)
+    return out
+
+
+def _starts(
+    problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
+) -> list[BandwidthSample]:
+    """Samples with a lower J than their 2 n_θ nearest neighbours, away from θ; the best first."""
+    if not samples:
+        return []
+    lower, upper = box(problem)
+    unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
+    here = (theta - lower) / (upper - lower)
+    chosen = []
+    for i in np.argsort(values):
+        away = np.abs(unit - unit[i]).max(axis=1)
+        near = np.argsort(away)[1 : 2 * lower.size + 1]
+        if (values[near] >= values[i]).all() and np.abs(unit[i] - here).max() > SAME:
+            chosen.append(samples[i])
+    return chosen[:LOCAL_STARTS]
+
+
+def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
+    return bool((constraint_values(plant_of(problem), sample.theta) <= 1e-9).all())
+
+
+def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
+    cost = hardware_cost(plant_of(problem), sample.theta)
+    return problem.w1 * cost + problem.w2 * sample.bandwidth
