@@ -16,8 +16,7 @@ import numpy as np
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
-from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.plant import build_plant
+from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi

@@ -8,6 +8,7 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.comparison import Comparison, compare, comparison_dict
 from ccd_casadi.codesign.result import write_json
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.reporting.verdict import short
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
@@ -24,6 +25,7 @@ def table(comparison: Comparison) -> str:
         lines.append(
             f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
             f"{f['hardware_cost']:10.4g}{f['syntheses']:11d}{f['seconds']:8.1f}  {f['status']}"
+            + (f" ({short(f)})" if short(f) else "")
         )
     return "\n".join(lines)
 

@@ -11,6 +11,7 @@ from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulati
 from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.registry import SHIPPED
+from ccd_casadi.reporting.verdict import terminal_lines
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -33,6 +34,7 @@ def summary(solution: Solution) -> str:
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
+        *terminal_lines(result),
         f"theta         {theta}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "

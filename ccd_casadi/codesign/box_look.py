@@ -1,9 +1,14 @@
 """A look at the whole box: is anything better than what a formulation found?
 
 The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
-formulation solved itself counted in. Whatever is better than its neighbours there starts a local
-solve on the true problem (`kinked.descend`); the best end wins. What this excludes is a better
-optimum whose basin one of the points lies in, and no more than that.
+formulation solved itself counted in. With surrogates over (θ, ω_S, ω_T) a θ is passed over where
+even their optimistic values,
+
+    ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
+
+do not reach the J at hand; the `CHECKED` most promising of those are solved all the same. Whatever
+is better than its neighbours starts a local solve on the true problem (`kinked.descend`); the best
+end wins. What this excludes is a better optimum whose basin one of the points lies in, and no more.
 """
 
 from collections.abc import Sequence
@@ -13,29 +18,35 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, objective
 from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
-from surrogates import design
+from surrogates import GaussianProcess, design
 
 LOCAL_STARTS = 5  # local solves at most, from the best of the points that beat their neighbours
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
+OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
+CHECKED = 3  # of those passed over that are solved nevertheless
+MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
 
 @dataclass(frozen=True)
 class BoxLook:
-    """What was looked at: `points` true inner problems of which `feasible` have a design.
+    """What was looked at: `points` θ, `solved` by true inner problems, `feasible` of these with a
+    design; the others were passed over, their optimistic surrogates being worse.
 
     `better`: how many of them beat the J that the formulation came `before` with; `starts` local
     solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
     """
 
     points: int
+    solved: int
     feasible: int
     better: int
     starts: int
@@ -50,11 +61,21 @@ class BoxLook:
         return self.x is not None
 
 
-def look_over_box(sampler: Sampler, x: Array, J: float, points: int, seed: int) -> BoxLook:
-    """Look at `points` θ over the box for a J lower than that of x = (θ, ln ω_S, ln ω_T)."""
+def look_over_box(
+    sampler: Sampler,
+    x: Array,
+    J: float,
+    points: int,
+    seed: int,
+    processes: tuple[GaussianProcess, ...] = (),
+) -> BoxLook:
+    """Look at `points` θ over the box for a J lower than that of x = (θ, ln ω_S, ln ω_T).
+
+    `processes`: surrogates of ω_b, ln‖S‖∞ and ln|S(jω_low)| over x, where there are any.
+    """
     problem = sampler.problem
     quantities = TrueQuantities(problem, sampler.record)
-    samples = _spread(sampler, points, seed) if points else []
+    samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
     values = np.array([_objective(problem, sample) for sample in feasible])
     margin = BETTER * abs(J)
@@ -71,7 +92,8 @@ def look_over_box(sampler: Sampler, x: Array, J: float, points: int, seed: int) 
                     best_x, best = place, value
                 break
     return BoxLook(
-        points=len(samples),
+        points=len(samples) + passed_over,
+        solved=len(samples),
         feasible=len(feasible),
         better=int((values < J - margin).sum()),
         starts=len(starts),
@@ -99,20 +121,58 @@ def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
     return ends
 
 
-def _spread(sampler: Sampler, points: int, seed: int) -> list[BandwidthSample]:
-    """The inner problems that the run has solved, and as many more as make up `points`."""
+def _spread(
+    sampler: Sampler, J: float, points: int, seed: int, processes: tuple[GaussianProcess, ...]
+) -> tuple[list[BandwidthSample], int]:
+    """The inner problems that the run has solved, and as many more as make up `points`.
+
+    Second, how many of these were passed over for their surrogates.
+    """
     lower, upper = box(sampler.problem)
     solved = list(sampler.solved.values())
     apart = _apart(np.array([s.theta for s in solved]).reshape(-1, lower.size), upper - lower)
     known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
+    passed_over = 0
     if len(known) < points:
-        more = design("sobol", lower, upper, points, seed)[len(known) :]
         plant = plant_of(sampler.problem)
-        more = [theta for theta in more if (constraint_values(plant, theta) <= 0.0).all()]
+        spread = design("sobol", lower, upper, points, seed)[len(known) :]
+        more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
+        if more and len(processes) == 3:
+            hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
+            order = np.argsort(hopes)
+            keep = [i for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
+            passed_over = len(more) - len(keep)
+            more = [more[i] for i in sorted(keep)]
         if more:
             solved = [*solved, *sampler.bandwidths(np.array(more), "looking over the box")]
             known = [*known, *solved[-len(more) :]]
-    return known
+    return known, passed_over
+
+
+def _optimistic_objective(
+    problem: CoDesignProblem, processes: tuple[GaussianProcess, ...], thetas: Array
+) -> Array:
+    """The least J (n,) that the surrogates do not rule out at each θ (n, n_θ); see the module."""
+    lower, upper = lifted_bounds(problem)
+    axes = [np.linspace(lower[k], upper[k], MESH) for k in (-2, -1)]
+    mesh = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    levels = np.log([problem.inner.S_max, problem.inner.S_low])
+    plant = plant_of(problem)
+    out = np.empty(len(thetas))
+    for i, theta in enumerate(thetas):
+        X = np.hstack([np.tile(theta, (len(mesh), 1)), mesh])
+        bandwidth, *bounded = (process.predict(X, return_std=True) for process in processes)
+        allowed = np.all(
+            [
+                mean - OPTIMISM * std <= level
+                for (mean, std), level in zip(bounded, levels, strict=True)
+            ],
+            axis=0,
+        )
+        hope = bandwidth[0] + OPTIMISM * bandwidth[1]
+        best = float(hope[allowed].max()) if allowed.any() else -np.inf
+        out[i] = problem.w1 * hardware_cost(plant, theta) + problem.w2 * best
+    return out
 
 
 def _apart(thetas: Array, width: Array) -> list[bool]:

@@ -125,7 +125,7 @@ def co_design(
         return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
     verified = verify(sampler, outcome.x)
     J = verified.objective if verified.feasible else np.inf
-    look = look_over_box(sampler, verified.x, J, formulation.box_points, seed)
+    look = look_over_box(sampler, verified.x, J, formulation.box_points, seed, outcome.surrogates)
     rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
     if look.x is not None or (
         len(outcome.iterates) <= rounds

@@ -114,18 +114,19 @@ def optimal(
     else:
         figures |= {
             "box_points": look.points,
+            "box_solved": look.solved,
             "box_feasible": look.feasible,
             "box_better": look.better,
             "box_starts": look.starts,
             "box_seed": look.seed,
             "objective_before": look.before,
         }
-        said = f"none better at {look.points} spread theta, {_count(look.starts, 'local solve')}"
+        how = f"{look.points} spread theta"
+        if look.solved < look.points:
+            how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
+        said = f"none better at {how}"
         if look.moved:
-            said = (
-                f"the formulation ended at J = {look.before:.6g}; moved by a look at "
-                f"{look.points} spread theta"
-            )
+            said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
         known = ", ".join(part for part in (known, said, "gap not known") if part)
     if not residual <= KKT_LEVEL:
         words = f"not optimal: KKT residual {residual:.1e} above {KKT_LEVEL:.0e}; {known}"

@@ -19,6 +19,7 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
@@ -45,6 +46,7 @@ def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
         "that were tried; nothing is said of others",
         f"{theta_words(run.result)} · seed {seed}",
         lead,
+        verdict=verdict_html(run.result),
     )
     sections = [
         Section("In short", "\n".join(paragraph(words) for words in others)),
