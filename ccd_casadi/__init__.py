@@ -34,6 +34,7 @@ _PUBLIC = {
     "compare": "codesign.comparison",
     "deploy": "deployment.pipeline",
     "load_case": "cases.case",
+    "parse_case": "cases.case",
     "plant_from_control": "synthesis.interchange",
     "problem_of": "cases.case",
     "read_run": "cases.run_folder",

@@ -17,6 +17,7 @@ from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.backends.judgement import AGREE, Verdict, verdicts
 from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, every_backend
+from surrogates.options import positive
 
 
 def _problem(
@@ -139,24 +140,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
     for name in ("S", "T"):
         arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=_positive, metavar="X",
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
             help="with the other one; without both the best pair at theta, or the run's",
         )  # fmt: skip
     arguments.add_argument(
-        "--limit", type=_positive, default=60.0, metavar="SECONDS",
+        "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="for each optional back end (default: 60)",
     )  # fmt: skip
     return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """`python -m ccd_casadi.deploy RUN_DIR`: the run's controller as one that can be built."""
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
 
@@ -16,6 +15,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
+from surrogates.options import number, positive
 
 LEADS = {"auto": None, "on": True, "off": False}
 
@@ -99,15 +99,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
     )
     arguments.add_argument(
-        "--rate-hz", metavar="X", type=_positive,
+        "--rate-hz", metavar="X", type=positive,
         help="sampling rate (default: the next round one above what is needed)",
     )  # fmt: skip
     delay = arguments.add_mutually_exclusive_group()
     delay.add_argument(
-        "--delay", metavar="SECONDS", type=_natural, help="from reading y to the new u, in s"
+        "--delay", metavar="SECONDS", type=number(), help="from reading y to the new u, in s"
     )
     delay.add_argument(
-        "--delay-samples", metavar="X", type=_natural, default=Timing.delay_samples,
+        "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
         help="the same in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
@@ -119,27 +119,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="a lead that makes up for hold and delay (default: where it lowers the rate)",
     )  # fmt: skip
     arguments.add_argument(
-        "--saturation", metavar="NEWTON", type=_positive,
+        "--saturation", metavar="NEWTON", type=positive,
         help="clip every u to plus or minus this (default: off)",
     )  # fmt: skip
     return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    value = _natural(text)
-    if value == 0.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
-    return value
-
-
-def _natural(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 on")
-    return value
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
 from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from surrogates.options import positive
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -110,21 +111,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.add_argument(
             f"--omega-{name.lower()}-hz",
             dest=f"omega_{name}_hz",
-            type=_frequency,
+            type=positive,
             metavar="X",
             help=f"with the other one: a single synthesis at this omega_{name}",
         )
     return run(command, arguments, argv)
-
-
-def _frequency(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frequency above 0")
-    return value
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
 from ccd_casadi.support.process_pool import PATIENCE
+from surrogates.options import whole
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -57,19 +58,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
 
 
-def _count(text: str) -> int:
-    if not (text.isdecimal() and len(text) < 5 and int(text) >= 2):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number of points from 2 to 9999")
-    return int(text)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
         "ccd_casadi.insight", "Weight against bandwidth, and what the optimum answers to."
     )
     arguments.add_argument(
-        "--points", metavar="N", type=_count, default=20, help="of the front (default: 20)"
+        "--points", metavar="N", type=whole(2, 9999), default=20, help="of the front (default: 20)"
     )
     add_scheduler(arguments)
     return run(command, arguments, argv)

@@ -10,6 +10,7 @@ from ccd_casadi.robust.setpoint import Limits
 from ccd_casadi.robust.study import Demands, robustness, study_dict
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
+from surrogates.options import number, positive, whole
 
 _DEFAULT = Demands()
 _MOVE = (
@@ -60,49 +61,30 @@ def command(options: argparse.Namespace) -> ExitCode:
     return ExitCode.DONE
 
 
+PERCENT = number(0.0, 50.0, strict=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
         "ccd_casadi.robustness", "Margins, plants off the model, noise and a move of a design."
     )
     add = arguments.add_argument
-    add("--shift", type=_percent, default=5.0, metavar="PERCENT", help="of resonances; default 5")
-    add("--damping", type=_positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
+    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
+    add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
         help="factors of the damping; default 0.5 2")  # fmt: skip
-    add("--tolerance", type=_percent, default=1.0, metavar="PERCENT",
+    add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
         help="of every hardware parameter; default 1")  # fmt: skip
-    add("--samples", type=_count, default=200, metavar="N", help="of random hardware; default 200")
-    add("--noise", type=_positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
-    add("--disturbance", type=_positive, default=1.0, metavar="X",
+    add("--samples", type=whole(1), default=200, metavar="N",
+        help="of random hardware; default 200")  # fmt: skip
+    add("--noise", type=positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
+    add("--disturbance", type=positive, default=1.0, metavar="X",
         help="force at every actuator, N/√Hz; default 1")  # fmt: skip
-    add("--axis", type=_count, default=1, metavar="N", help="output that moves; default 1")
+    add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
     for name, default, unit in _MOVE:
-        add(f"--{name}", type=_positive, default=default, metavar="X",
+        add(f"--{name}", type=positive, default=default, metavar="X",
             help=f"of the move, {unit}; default {default:g}")  # fmt: skip
     return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
-
-
-def _percent(text: str) -> float:
-    value = _positive(text)
-    if value >= 50.0:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is not below 50 %; give a smaller share")
-    return value
-
-
-def _count(text: str) -> int:
-    if not (text.isdecimal() and len(text) < 7 and int(text) >= 1):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number from 1; give one")
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogates.ctrl_c import ctrl_c_noticed, was_ctrl_c
+from surrogates.interrupts import ctrl_c_noticed, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.

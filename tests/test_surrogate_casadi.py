@@ -14,7 +14,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
 from surrogates import GaussianProcess, Hyperparameters, Kernel, condition, design, fit, to_casadi
 from surrogates.casadi_export import NEAR, radial_expression
-from surrogates.kernels import radial
+from surrogates.covariance import radial
+from surrogates.flat_limit import cancellation
 
 KERNELS = pytest.mark.parametrize("kernel", list(Kernel))
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
@@ -66,7 +67,7 @@ def test_equals_scikit_learns_prediction(kernel: Kernel, seed: int) -> None:
     noise=st.sampled_from([1e-12, 1e-9, 1e-5]),
     seed=st.integers(0, 100),
 )
-def test_equals_predict_to_nine_digits_however_smooth(
+def test_equals_predict_to_nine_digits_or_to_rounding(
     kernel: Kernel, gradients: bool, exponents: list[float], signal: float, noise: float, seed: int
 ) -> None:
     # Length scales of 0.5 to 1000 boxes under signal variances up to a million: the weights of
@@ -81,8 +82,11 @@ def test_equals_predict_to_nine_digits_however_smooth(
     gp = condition(p, X, Y, **box, kernel=kernel, dY=dY if gradients else None)
     T = np.vstack([design("lhs", **box, n=30, seed=seed + 1), X[:5]])
     ours = flat(to_casadi(gp, std=False).map(len(T))(T.T))
-    spread = float(np.ptp(gp.predict(X)))
-    np.testing.assert_allclose(ours, gp.predict(T), atol=1e-9 * spread, rtol=0)
+    # Of gradients under a Matérn kernel that is short in one input and flat in another the sum
+    # keeps its rounding, and is at least several times better where it takes the flat form.
+    rounding = gp.output_scale * cancellation(p, gp.weights, len(X))
+    bound = max(1e-9 * float(np.ptp(gp.predict(X))), (4.0 if gp.flat is None else 0.25) * rounding)
+    np.testing.assert_allclose(ours, gp.predict(T), atol=bound, rtol=0)
 
 
 @KERNELS

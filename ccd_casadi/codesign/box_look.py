@@ -78,7 +78,7 @@ def look_over_box(
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
     values = np.array([_objective(problem, sample) for sample in feasible])
-    margin = BETTER * abs(J)
+    margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best = None, J
     starts = _starts(problem, feasible, values, np.asarray(x[:-2]))
     for sample in starts:

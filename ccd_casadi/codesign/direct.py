@@ -34,6 +34,9 @@ class Direct:
     """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem.
 
     `box_points` true inner problems over the box are looked at in the end (`box_look`).
+
+    >>> Direct(starts=2).starts
+    2
     """
 
     starts: int = 4

@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import math
-import os
 import platform
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,7 @@ from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.codesign.surrogate_quality import Quality, quality_dict
+from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import (
     KKT_LEVEL,
     CloserModel,
@@ -33,6 +32,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
+from surrogates import Quality
+from surrogates.files import write_whole
 
 PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
 
@@ -146,7 +147,7 @@ def verdict_of(
     """The five lines on a verified design; `error` is that of its predicted bandwidth."""
     figures, robust = verified.design.figures, verified.robust
     solved = outcome.outer
-    at = quality[0].at_design if quality else None
+    at = quality[0].at_point if quality else None
     return Verdict(
         certified=certified(
             certificate=figures.certified,
@@ -253,9 +254,7 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
 
 
 def clean(value: Any) -> Any:

@@ -1,6 +1,5 @@
 """One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +25,7 @@ from ccd_casadi.codesign.result import (
     write_json,
 )
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
-from ccd_casadi.codesign.surrogate_quality import Quality, surrogate_quality
+from ccd_casadi.codesign.surrogate_quality import surrogate_quality
 from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
@@ -34,7 +33,8 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from surrogates import design, save
+from surrogates import Quality, design, save
+from surrogates.files import write_whole
 
 FORMULATIONS = ("nested", "lifted", "direct")
 Formulation = Nested | Lifted | Direct
@@ -134,10 +134,10 @@ def co_design(
         x = verified.x if look.x is None else look.x
         outcome = _resumed(sampler, formulation, outcome, x, seed)
         again = [verify(sampler, end) for end in _distinct(x, outcome.x)]
-        verified = min([*again, verified] if verified.feasible else again, key=_rank)
+        verified = _best([verified, *again], formulation.tolerance)
     if verified.kkt.stationarity > KKT_LEVEL:
         ends = perturbed(sampler, verified.x, seed)
-        verified = min([verified, *(verify(sampler, end) for end in ends)], key=_rank)
+        verified = _best([verified, *(verify(sampler, end) for end in ends)], formulation.tolerance)
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
 
 
@@ -173,10 +173,16 @@ def _distinct(x: Array, other: Array | None) -> list[Array]:
     return [x] if other is None or np.array_equal(x, other) else [x, other]
 
 
-def _rank(verified: VerifiedDesign) -> tuple[bool, bool, float]:
-    """Feasible first; then stationary; then the better J. Equal ones are told by their residual."""
-    stationary = verified.kkt.stationarity <= KKT_LEVEL
-    return not verified.feasible, not stationary, verified.objective
+def _best(found: list[VerifiedDesign], tolerance: float) -> VerifiedDesign:
+    """The least J of those that are feasible; within the tolerance of it one that is stationary.
+
+    A better design that is not stationary is kept: to call a worse one optimal would be untrue.
+    """
+    feasible = [item for item in found if item.feasible] or found
+    least = min(item.objective for item in feasible)
+    near = [item for item in feasible if item.objective <= least + tolerance * abs(least)]
+    stationary = [item for item in near if item.kkt.stationarity <= KKT_LEVEL]
+    return min(stationary or near, key=lambda item: item.objective)
 
 
 def conclude(
@@ -238,9 +244,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(case)
-    draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, folder / "case.toml")
+    write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

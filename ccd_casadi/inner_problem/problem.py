@@ -90,7 +90,15 @@ class RobustSet:
 
 @dataclass(frozen=True)
 class CoDesignProblem:
-    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout."""
+    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout.
+
+    Made by `problem_of`; `dataclasses.replace` makes variants of it:
+
+    >>> import ccd_casadi as ccd
+    >>> from dataclasses import replace
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> heavier = replace(problem, lower=(60.0, 60.0), start=(65.0, 65.0))
+    """
 
     source: PlantSource
     names: tuple[str, ...]
@@ -218,7 +226,15 @@ def _own_function(source: PlantSource) -> ModelFunction:
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
-    """The scaled plant at θ, with its family where the problem is a robust one."""
+    """The scaled plant M_K G(jω₀ω) at θ, with its family where the problem is a robust one.
+
+    Raises PlantError where the model is no plant at θ.
+
+    >>> import ccd_casadi as ccd
+    >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
+    (209.2, (4, 4))
+    """
     system = mechanics(plant_of(problem), theta)
 
     def scaled(*perturbation: Perturbation) -> ScaledPlant:
@@ -234,7 +250,17 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
 
 
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
-    """The true inner problem at θ, by the problem's method."""
+    """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
+
+        max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper)
+
+    An infeasible θ is a result without `optimum` that says what falls short.
+
+    >>> import ccd_casadi as ccd
+    >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(best.bandwidth / ccd.HZ, 2), best.active
+    (58.23, ('S_max', 'omega_T lower'))
+    """
     solve = sweep_inner if problem.method == "sweep" else search_inner
     return solve(scaled_plant(problem, theta), problem.weights, problem.inner)
 
@@ -242,7 +268,14 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
 def true_design(
     problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float
 ) -> Sensitivities:
-    """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s."""
+    """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)
+    >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
+    (True, [-0.21, -0.138])
+    """
     return evaluate(
         scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
     )

@@ -72,6 +72,11 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     """Trace `model` once with CasADi symbols and check what it returns.
 
     Raises PlantError with a remedy where a key is missing or unknown, or a shape is wrong.
+
+    >>> from ccd_casadi.plants.two_mass import two_mass
+    >>> plant = build_plant(two_mass, ["m1", "m2"], {"zeta": 0.01})
+    >>> mechanics(plant, (60.0, 50.0)).M.diagonal().tolist(), hardware_cost(plant, (60.0, 50.0))
+    ([60.0, 50.0], 110.0)
     """
     theta = ca.SX.sym("theta", len(names))
     try:

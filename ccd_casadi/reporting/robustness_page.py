@@ -1,6 +1,5 @@
 """robustness.html: what the design survives, in figures with the numbers behind them."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +23,13 @@ from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ
+from surrogates.files import write_whole
 
 
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
     """Write robustness.html, atomically."""
     path = folder / "robustness.html"
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(robustness_html(run, found, seed), encoding="utf-8")
-    os.replace(draft, path)
+    write_whole(path, robustness_html(run, found, seed))
     return path
 
 
