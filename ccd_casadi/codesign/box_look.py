@@ -2,13 +2,14 @@
 
 The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
 formulation solved itself counted in. With surrogates over (θ, ω_S, ω_T) a θ is passed over where
-even their optimistic values,
+even their optimistic values (if left-out samples say that they are to be trusted),
 
     ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
 
-do not reach the J at hand; the `CHECKED` most promising of those are solved all the same. Whatever
-is better than its neighbours starts a local solve on the true problem (`kinked.descend`); the best
-end wins. What this excludes is a better optimum whose basin one of the points lies in, and no more.
+do not reach the J at hand. The `CHECKED` most promising of those are solved all the same, and all
+of them where one is better than the surrogates' optimism allowed. Whatever is better than its
+neighbours starts a local solve on the true problem (`kinked.descend`); the best end wins. What this
+excludes is a better optimum whose basin one of the points lies in, and no more.
 """
 
 from collections.abc import Sequence
@@ -24,15 +25,17 @@ from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
-from surrogates import GaussianProcess, design
+from surrogates import GaussianProcess, design, quality_of
 
-LOCAL_STARTS = 5  # local solves at most, from the best of the points that beat their neighbours
+LOCAL_STARTS = 8  # local solves at most, from the best of the points that beat their neighbours
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
 OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
-CHECKED = 3  # of those passed over that are solved nevertheless
+CHECKED = 4  # of those passed over that are solved nevertheless
+COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+COARSE = 1.02  # what the best between the points of the mesh may be above the best on it
 MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
 
@@ -137,16 +140,32 @@ def _spread(
         plant = plant_of(sampler.problem)
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
         more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
-        if more and len(processes) == 3:
+        solve: list[Array] = list(more)
+        if more and len(processes) == 3 and _trustworthy(processes, seed):
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
             order = np.argsort(hopes)
-            keep = [i for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
-            passed_over = len(more) - len(keep)
-            more = [more[i] for i in sorted(keep)]
-        if more:
-            solved = [*solved, *sampler.bandwidths(np.array(more), "looking over the box")]
-            known = [*known, *solved[-len(more) :]]
+            keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
+            first = sampler.bandwidths(np.array([more[i] for i in keep]), "looking over the box")
+            refuted = any(
+                sample.feasible and _objective(sampler.problem, sample) < hopes[i]
+                for i, sample in zip(keep, first, strict=True)
+            )
+            known = [*known, *first]
+            solve = [more[i] for i in range(len(more)) if i not in keep] if refuted else []
+            passed_over = len(more) - len(keep) - len(solve)
+        if solve:
+            known = [*known, *sampler.bandwidths(np.array(solve), "looking over the box")]
     return known, passed_over
+
+
+def _trustworthy(processes: tuple[GaussianProcess, ...], seed: int) -> bool:
+    """Whether the surrogates may rule anything out: smooth samples, predicted within their bands.
+
+    Where ω_b jumps (a peak below it reaches -3 dB) a smooth surrogate is sure of what is not so.
+    """
+    middle = 0.5 * (processes[0].lower + processes[0].upper)
+    found = [quality_of(process, middle, seed=seed) for process in processes]
+    return all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
 
 
 def _optimistic_objective(
@@ -169,7 +188,7 @@ def _optimistic_objective(
             ],
             axis=0,
         )
-        hope = bandwidth[0] + OPTIMISM * bandwidth[1]
+        hope = COARSE * (bandwidth[0] + OPTIMISM * bandwidth[1])
         best = float(hope[allowed].max()) if allowed.any() else -np.inf
         out[i] = problem.w1 * hardware_cost(plant, theta) + problem.w2 * best
     return out
@@ -190,7 +209,7 @@ def _apart(thetas: Array, width: Array) -> list[bool]:
 def _starts(
     problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
 ) -> list[BandwidthSample]:
-    """Samples with a lower J than their 2 n_θ nearest neighbours, away from θ; the best first."""
+    """Samples with a lower J than their n_θ + 1 nearest neighbours, away from θ; the best first."""
     if not samples:
         return []
     lower, upper = box(problem)
@@ -199,7 +218,7 @@ def _starts(
     chosen = []
     for i in np.argsort(values):
         away = np.abs(unit - unit[i]).max(axis=1)
-        near = np.argsort(away)[1 : 2 * lower.size + 1]
+        near = np.argsort(away)[1 : lower.size + 2]
         if (values[near] >= values[i]).all() and np.abs(unit[i] - here).max() > SAME:
             chosen.append(samples[i])
     return chosen[:LOCAL_STARTS]

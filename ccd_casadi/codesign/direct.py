@@ -83,28 +83,26 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     start = quantities.at(x)
     if acceptable(problem, x, start) and _stationary(problem, x, start):
         return x, start, None
+    x, start = _past_kinks(problem, quantities, x, start)
+    if acceptable(problem, x, start) and _residual(problem, x, start) <= SMOOTH:
+        return x, start, None
     solution: OuterSolution | None = None
     try:
         solution = solve_program(program, x, warm=True)
     except OuterFailure:
-        pass
-    best, best_x = start, x
-    candidates = [] if solution is None else [solution.best]
-    for candidate in candidates:
-        found = quantities.at(candidate.x)
-        if not acceptable(problem, candidate.x, found):
-            continue
-        if not acceptable(problem, x, start) or _no_worse(problem, candidate, x, start):
-            best, best_x = found, candidate.x
-    if not acceptable(problem, best_x, best) or _residual(problem, best_x, best) > SMOOTH:
-        best_x, best = _past_kinks(problem, quantities, best_x, best)
-    return best_x, best, solution
+        return x, start, None
+    found = quantities.at(solution.best.x)
+    if acceptable(problem, solution.best.x, found) and (
+        not acceptable(problem, x, start) or _no_worse(problem, solution.best, x, start)
+    ):
+        return solution.best.x, found, solution
+    return x, start, solution
 
 
 def _past_kinks(
     problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
 ) -> tuple[Array, Sensitivities]:
-    """Where IPOPT stalls, peaks of S are equal: go on with each as a constraint of its own."""
+    """Every peak of S a constraint of its own: some ten designs where IPOPT takes a hundred."""
     end = descend(problem, quantities, x, settled=1e-13)
     found = quantities.at(end)
     if not acceptable(problem, end, found):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.codesign.kkt import lagrangian_parts, other_peaks
+from ccd_casadi.codesign.kkt import OTHER_PEAK, lagrangian_parts, other_peaks
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -25,6 +25,7 @@ BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
 INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
 FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
+SHELF = 10.0  # ln per (share of the box)²: how far a step stays from where ω_b jumps
 SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
 
@@ -37,6 +38,11 @@ class _Point:
     g: Array
     jacobian: Array
     tags: tuple[tuple[str, float, int], ...]
+
+    @property
+    def by_shelf(self) -> bool:
+        """Whether ω_b may jump near by."""
+        return any(kind == "shelf" for kind, _, _ in self.tags)
 
 
 def descend(
@@ -69,6 +75,9 @@ def descend(
     rho = scale
     for _ in range(steps):
         d, mu, model = _step(here, H, radius, rho)
+        while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
+            radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
+            d, mu, model = _step(here, H, radius, rho)
         rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
         if radius < LEAST or model <= settled * abs(here.J):
             break
@@ -97,7 +106,14 @@ def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) 
     if peaks:
         g = np.append(g, [peak.value + INSIDE for peak in peaks])
         jacobian = np.vstack([jacobian, *(peak.row for peak in peaks)])
-        tags += [("peak", float(np.log(peak.omega)), peak.member) for peak in peaks]
+        tags += [
+            (
+                "peak" if peak.name.startswith(OTHER_PEAK) else "shelf",
+                np.log(peak.omega),
+                peak.member,
+            )
+            for peak in peaks
+        ]
     cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
     J = problem.w1 * cost + problem.w2 * design.figures.bandwidth
     return _Point(z, design, J, gradient, g, jacobian, tuple(tags))
@@ -113,18 +129,22 @@ def _step(here: _Point, H: Array, radius: float, rho: float) -> tuple[Array, Arr
     n, m = here.z.size, here.g.size
     solver = _solver(n, m)
     unit = max(float(np.abs(here.gradient).max()), 1e-300)
+    # Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong.
+    shelf = np.array([kind == "shelf" for kind, _, _ in here.tags])
+    g = here.g + np.where(shelf, SHELF * radius**2, 0.0)
+    # In steps of one radius, so that the solver's tolerances mean the same at every radius.
     hessian = np.zeros((n + m, n + m))
-    hessian[:n, :n] = H / unit + 1e-9 * np.trace(H) / (n * unit) * np.eye(n)
+    hessian[:n, :n] = radius * (H / unit + 1e-9 * np.trace(H) / (n * unit) * np.eye(n))
     hessian[n:, n:] = 1e-6 * np.eye(m)
     linear = np.append(here.gradient / unit, np.full(m, 10.0 * (1.0 + rho / unit)))
     A = np.hstack([here.jacobian, -np.eye(m)])
-    low = np.append(np.maximum(-radius, -here.z), np.zeros(m))
-    high = np.append(np.minimum(radius, 1.0 - here.z), np.full(m, np.inf))
+    low = np.append(np.maximum(-1.0, -here.z / radius), np.zeros(m))
+    high = np.append(np.minimum(1.0, (1.0 - here.z) / radius), np.full(m, np.inf))
     try:
-        answer = solver(h=hessian, g=linear, a=A, lba=-np.inf, uba=-here.g, lbx=low, ubx=high)
+        answer = solver(h=hessian, g=linear, a=A, lba=-np.inf, uba=-g / radius, lbx=low, ubx=high)
     except RuntimeError:  # the quadratic program was not solved
         return np.zeros(n), np.zeros(m), 0.0
-    d = np.clip(np.array(answer["x"]).ravel()[:n], low[:n], high[:n])
+    d = radius * np.clip(np.array(answer["x"]).ravel()[:n], low[:n], high[:n])
     mu = unit * np.maximum(np.array(answer["lam_a"]).ravel(), 0.0)
     weight = max(rho, 2.0 * float(mu.max(initial=0.0)))
     before = weight * float(np.maximum(here.g, 0.0).sum())
