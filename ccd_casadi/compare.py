@@ -13,6 +13,8 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def table(comparison: "Comparison") -> str:
     """The methods in a few columns for the terminal."""
+    from ccd_casadi.reporting.verdict import short
+
     lines = [f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'s':>8}  status"]
     for method in comparison.methods:
         f = method.figures
@@ -22,6 +24,7 @@ def table(comparison: "Comparison") -> str:
         lines.append(
             f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
             f"{f['hardware_cost']:10.4g}{f['syntheses']:11d}{f['seconds']:8.1f}  {f['status']}"
+            + (f" ({short(f)})" if short(f) else "")
         )
     return "\n".join(lines)
 

@@ -42,6 +42,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             samples=done.case.sampling.lifted_points,
             tolerance=done.case.outer.tolerance,
             seed=options.seed,
+            own=x,
         )
     responses = post_optimal(done.problem, x)
     seconds = perf_counter() - began

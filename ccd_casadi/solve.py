@@ -23,6 +23,8 @@ _CODES = {
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
+    from ccd_casadi.reporting.verdict import terminal_lines
+
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
@@ -30,6 +32,7 @@ def summary(solution: "Solution") -> str:
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
+        *terminal_lines(result),
         f"theta         {theta}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "

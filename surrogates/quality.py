@@ -24,8 +24,16 @@ FOLDS = 10
 LEAST_FOR_ROUGHNESS = 20
 ROUGHNESS_ORDER = 200
 NUGGET = 1e-9
-# Q² above which the samples are followed whatever their roughness.
+# Q² above which the samples are followed whatever their roughness; above which a kink is a slight
+# one; and below which the surrogate follows them poorly, smooth or not.
 EXCELLENT = 1.0 - 1e-6
+GOOD = 0.995
+POOR = 0.9
+# A sample this close to the point of interest (share of the box) is that point. Left out, it may be
+# off by so many of its deviations, or by so much of the samples' range, before the others miss it.
+SAME = 1e-6
+SIGMAS = 3.0
+SHARE = 1e-3
 
 
 class Roughness(StrEnum):
@@ -43,7 +51,8 @@ class Quality:
     true, predicted (n,): each sample, and its prediction without it; standardised (n,): the
     difference over the deviation of the band; coverage: share inside nominal 95 % bands.
     loo, kfold: errors left out one by one and in ten folds. extrapolates: what is amiss at the
-    point of interest, nothing where samples support it.
+    point of interest, nothing where samples support it. at_point: where that point is itself a
+    sample, the error there without it in `unit` and in predicted deviations; None elsewhere.
 
     roughness: a kink across a surface has Sobolev regularity just below 3/2, a jump just below
     1/2, and sample paths of a Matérn process regularity ν. Each ν is fitted by maximum
@@ -68,11 +77,44 @@ class Quality:
     coverage: float
     roughness: Roughness
     extrapolates: tuple[str, ...]
+    at_point: tuple[float, float] | None = None
+
+    @property
+    def poor(self) -> bool:
+        """Whether left-out samples are predicted too badly to speak of support."""
+        return not self.kfold.q2 >= POOR
+
+    @property
+    def samples_look(self) -> str:
+        """Smooth, kinked or torn, as far as the surrogate follows the samples at all."""
+        if self.poor:
+            return "poorly followed"
+        if self.roughness is Roughness.KINKED and self.kfold.q2 >= GOOD:
+            return "nearly smooth"
+        return self.roughness.value
+
+    @property
+    def unsupported(self) -> str:
+        """Why the samples do not support the point of interest; nothing where they do."""
+        if self.extrapolates:
+            return "; ".join(self.extrapolates)
+        if self.poor:
+            return f"followed to Q² {self.kfold.q2:.3g} only"
+        if self.at_point is not None:
+            error, sigmas = self.at_point
+            span = 100.0 if self.unit == "%" else float(np.ptp(self.true))
+            if sigmas > SIGMAS and abs(error) > SHARE * span:
+                return (
+                    f"the design is a sample that the others miss by {abs(error):.3g} {self.unit}, "
+                    f"{sigmas:.1f} deviations"
+                )
+        return ""
 
     @property
     def smooth_enough(self) -> bool:
         """Whether one smooth surrogate suits the samples."""
-        return self.roughness is Roughness.SMOOTH or self.kfold.q2 >= EXCELLENT
+        smooth = self.roughness is Roughness.SMOOTH and not self.poor
+        return smooth or self.kfold.q2 >= EXCELLENT
 
 
 def quality_of(
@@ -107,6 +149,11 @@ def quality_of(
         kind = roughness(smoothness_likelihoods(process.X, process.targets[:n], seed))
     standardised = residuals / (process.band * deviations)
     predicted = samples.Y - residuals
+    unit_x = (np.asarray(x, float) - process.lower) / (process.upper - process.lower)
+    away = np.abs(process.X - unit_x).max(axis=1)
+    at, at_point = int(np.argmin(away)), None
+    if away[at] <= SAME:
+        at_point = (float(factor * residuals[at]), float(abs(standardised[at])))
     return Quality(
         name=name,
         unit=unit,
@@ -118,6 +165,7 @@ def quality_of(
         coverage=float(np.mean(np.abs(standardised) <= TWO_SIDED_95)),
         roughness=kind,
         extrapolates=extrapolation(process, samples.X, x).reasons,
+        at_point=at_point,
     )
 
 

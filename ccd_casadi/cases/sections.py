@@ -132,7 +132,8 @@ class OuterSection:
     """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
 
     `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
-    that predicts left-out samples best.
+    that predicts left-out samples best. `box_points`: true inner problems spread over the box of θ
+    that a solve ends with a look at, those that it has solved already among them; 0: none.
     """
 
     starts: int = _key(count(1), 16)
@@ -140,6 +141,7 @@ class OuterSection:
     tolerance: float = _key(FRACTION, 1e-3)
     max_refinements: int = _key(count(0), 12)
     surrogate: str = _key(choice("matern52", "rbf", "auto"), "matern52")
+    box_points: int = _key(count(0), 32)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import (
     LocalOptimum,
     OuterFailure,
@@ -32,12 +33,15 @@ STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 class Direct:
     """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem.
 
+    `box_points` true inner problems over the box are looked at in the end (`box_look`).
+
     >>> Direct(starts=2).starts
     2
     """
 
     starts: int = 4
     tolerance: float = 1e-3
+    box_points: int = 32
 
 
 def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
@@ -79,20 +83,44 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     start = quantities.at(x)
     if acceptable(problem, x, start) and _stationary(problem, x, start):
         return x, start, None
+    x, start = _past_kinks(problem, quantities, x, start)
+    if acceptable(problem, x, start) and _residual(problem, x, start) <= SMOOTH:
+        return x, start, None
     solution: OuterSolution | None = None
     try:
         solution = solve_program(program, x, warm=True)
     except OuterFailure:
-        pass
-    best, best_x = start, x
-    candidates = [] if solution is None else [solution.best]
-    for candidate in candidates:
-        found = quantities.at(candidate.x)
-        if not acceptable(problem, candidate.x, found):
-            continue
-        if not acceptable(problem, x, start) or _no_worse(problem, candidate, x, start):
-            best, best_x = found, candidate.x
-    return best_x, best, solution
+        return x, start, None
+    found = quantities.at(solution.best.x)
+    if acceptable(problem, solution.best.x, found) and (
+        not acceptable(problem, x, start) or _no_worse(problem, solution.best, x, start)
+    ):
+        return solution.best.x, found, solution
+    return x, start, solution
+
+
+def _past_kinks(
+    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
+) -> tuple[Array, Sensitivities]:
+    """Every peak of S a constraint of its own: some ten designs where IPOPT takes a hundred."""
+    end = descend(problem, quantities, x, settled=1e-13)
+    found = quantities.at(end)
+    if not acceptable(problem, end, found):
+        return x, design
+    if not acceptable(problem, x, design):
+        return end, found
+    before, after = (objective(problem, *item) for item in ((x, design), (end, found)))
+    if after < before - 1e-9 * abs(before):
+        return end, found
+    level = after <= before + 1e-9 * abs(before)
+    better = _residual(problem, end, found) < _residual(problem, x, design)
+    return (end, found) if level and better else (x, design)
+
+
+def objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
+    """J of a true design at x."""
+    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
+    return problem.w1 * cost + problem.w2 * design.figures.bandwidth
 
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
@@ -103,13 +131,16 @@ def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> boo
 
 def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Whether the true optimality conditions hold already, to what IPOPT would reach."""
+    return _residual(problem, x, design) <= STATIONARY
+
+
+def _residual(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
     kkt = kkt_certificate(problem, x, design)
-    return max(kkt.stationarity, kkt.complementarity) <= STATIONARY
+    return max(kkt.stationarity, kkt.complementarity)
 
 
 def _no_worse(
     problem: CoDesignProblem, candidate: LocalOptimum, x: Array, start: Sensitivities
 ) -> bool:
-    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
-    before = problem.w1 * cost + problem.w2 * start.figures.bandwidth
+    before = objective(problem, x, start)
     return candidate.objective <= before + 1e-9 * abs(before)

@@ -51,14 +51,21 @@ class Lifted:
     tolerance: float = 1e-3
     max_refinements: int = 12
     kernel: str = "matern52"
+    box_points: int = 32
 
 
 def solve_lifted(
-    sampler: Sampler, options: Lifted, *, seed: int, given: Surrogates | None = None
+    sampler: Sampler,
+    options: Lifted,
+    *,
+    seed: int,
+    given: Surrogates | None = None,
+    incumbent: QuantitySample | None = None,
 ) -> FormulationResult:
     """Sample x = (θ, ln ω_S, ln ω_T), then rounds of fit, IPOPT and one true synthesis.
 
-    With `given` surrogates the rounds start from those and what they were fitted to.
+    With `given` surrogates the rounds start from those and what they were fitted to, with an
+    `incumbent` from that design.
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
@@ -74,8 +81,7 @@ def solve_lifted(
     iterates: list[Iterate] = []
     processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
     solution: OuterSolution | None = None
-    agreed, fitted = False, 0 if given is None else len(samples)
-    incumbent: QuantitySample | None = None
+    agreed, fitted = False, len(samples) if processes else 0
     for round_number in range(options.max_refinements + 1):
         if len(samples) >= REFIT * fitted:
             processes = fit_quantities(problem, samples, seed, kind=options.kernel)

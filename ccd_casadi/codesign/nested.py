@@ -34,7 +34,7 @@ class Nested:
     `plan`: "grid" (`points` an axis), "sobol" or "lhs" (`points` in all) over θ. `starts` of IPOPT
     a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
     rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
-    best.
+    best. `box_points` true inner problems over the box are looked at in the end (`box_look`).
 
     >>> Nested(plan="sobol", points=24).starts
     16
@@ -46,6 +46,7 @@ class Nested:
     tolerance: float = 1e-3
     max_refinements: int = 12
     kernel: str = "matern52"
+    box_points: int = 32
 
 
 def solve_nested(

@@ -136,6 +136,8 @@ def solve_program(
         options["ipopt.hessian_approximation"] = "limited-memory"
         # The true quantities carry rounding: there is no use in chasing the last digits.
         options["ipopt.acceptable_iter"] = 4
+        # Where it has not converged by then it goes to and fro over a kink; `kinked` does not.
+        options["ipopt.max_iter"] = 100
     if warm:
         options |= {
             "ipopt.warm_start_init_point": "yes",

@@ -4,7 +4,8 @@
 
 An equation, not a bound: where lighter is also faster, the curve shows by how much. IPOPT walks
 it on the lifted surrogates, each point started from its neighbour's; the true inner problem
-answers at every θ, and its designs teach the surrogates until both agree.
+answers at every θ, and its designs teach the surrogates until both agree. The two ends are found
+anew in every round, and the curve goes through a design that is known already, or above it.
 """
 
 from collections.abc import Sequence
@@ -70,18 +71,24 @@ def pareto_front(
     tolerance: float = 1e-3,
     max_rounds: int = 8,
     seed: int = 0,
+    own: Array | None = None,
 ) -> Front:
     """The front by `points` costs, evenly spaced from the lightest to the fastest design.
 
     Where the lightest is the fastest there is no trade-off, and the costs go on to the largest.
 
-    `samples` designs are sampled first (0: six per variable). Raises UserError where the
-    hardware cost is constant, or where too few designs are certified to learn from.
+    `samples` designs are sampled first (0: six per variable). `own`, a design (θ, ln ω_S, ln ω_T)
+    known to be good, is a point of the front unless a faster one is found at its cost. What is
+    slower than a lighter point is solved again from there; an end that stays so is dropped. Raises
+    UserError where the hardware cost is constant, or where too few designs are certified to learn
+    from.
     """
     problem = sampler.problem
     lower, upper = lifted_bounds(problem)
     count = samples or 6 * len(lower)
     found = sampler.quantities(design("sobol", lower, upper, count, seed))
+    if own is not None:
+        found = [*found, *sampler.quantities(np.clip(own, lower, upper))]
     known = [sample for sample in found if sample.certified]
     if len(known) <= len(lower):
         words = f"only {len(known)} of {count} designs in the box were certified"
@@ -89,17 +96,28 @@ def pareto_front(
     processes, fitted = fit_quantities(problem, known, seed), len(known)
     program = _program(problem, processes)
     starts = design("sobol", lower, upper, STARTS, seed + 1)
-    ends = _ends(program, problem, starts)
+    if own is not None:
+        starts = np.vstack([np.clip(own, lower, upper), starts])
+    ends, trades = _ends(program, problem, starts)
     f_low, f_high = (hardware_cost(plant_of(problem), x[:-2]) for x in ends)
+    if own is not None:  # the true optimum may lie beyond what the first surrogates expect
+        f_own = hardware_cost(plant_of(problem), own[:-2])
+        f_low, f_high = min(f_low, f_own), max(f_high, f_own)
     if not f_high - f_low > FLAT * max(abs(f_low), abs(f_high)):
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
     costs = np.linspace(f_low, f_high, points)
     todo = list(range(points))
     x = np.linspace(ends[0], ends[1], points)
+    through = None
+    if own is not None:
+        through = int(np.argmin(np.abs(costs - f_own)))
+        costs[through], x[through] = f_own, starts[0]
     result: dict[int, FrontPoint] = {}
     rounds = 0
     while todo and rounds < max_rounds:
         rounds += 1
+        if rounds > 1:
+            _move_ends(program, problem, starts, [k for k in todo if k != through], costs, x)
         x = _walk(program, problem, costs, todo, starts, x)
         learn = []
         inner = sampler.bandwidths(x[todo, :-2], f"verifying round {rounds}")
@@ -117,7 +135,66 @@ def pareto_front(
             else:
                 processes = update_quantities(problem, known, processes)
             program = _program(problem, processes)
-    return Front(_efficient([result[k] for k in range(points)]), rounds, sampler.syntheses)
+    if through is not None:
+        assert own is not None
+        sample = sampler.bandwidths(own[:-2], "the run's own design")[0]
+        there = result[through]
+        if sample.feasible and not there.bandwidth >= sample.bandwidth:
+            promised = float(processes[0].predict(own[None, :])[0])
+            result[through] = _point(problem, sample, promised, tolerance)
+    for k in range(1, points):
+        lighter = [result[i] for i in range(k) if result[i].bandwidth > result[k].bandwidth]
+        if lighter:
+            faster = max(lighter, key=lambda point: point.bandwidth)
+            _solve_again(sampler, program, processes, costs[k], faster, k, result, tolerance)
+    kept = sorted(result.values(), key=lambda point: point.hardware_cost)
+    while trades and len(kept) > 1 and not kept[-1].bandwidth >= kept[-2].bandwidth:
+        kept.pop()  # the fastest design is not there
+    return Front(_efficient(kept), rounds, sampler.syntheses)
+
+
+def _move_ends(
+    program: NonlinearProgram,
+    problem: CoDesignProblem,
+    starts: Array,
+    todo: Sequence[int],
+    costs: Array,
+    x: Array,
+) -> None:
+    """Put the ends that are not verified where the surrogates see them, taught by the truth."""
+    last = len(costs) - 1
+    if not {0, last} & set(todo):
+        return
+    try:
+        ends, _ = _ends(program, problem, starts)
+    except UserError:
+        return
+    for k, end in ((0, ends[0]), (last, ends[1])):
+        if k in todo:
+            x[k], costs[k] = end, hardware_cost(plant_of(problem), end[:-2])
+
+
+def _solve_again(
+    sampler: Sampler,
+    program: NonlinearProgram,
+    processes: tuple[GaussianProcess, ...],
+    cost: float,
+    faster: FrontPoint,
+    k: int,
+    result: dict[int, FrontPoint],
+    tolerance: float,
+) -> None:
+    """Point k from a lighter and faster one: kept where the truth is faster than before."""
+    problem = sampler.problem
+    start = np.array([*faster.theta, np.log(faster.omega_S), np.log(faster.omega_T)])
+    try:
+        x = solve_program(_at_cost(program, problem, cost), start).best.x
+    except OuterFailure:
+        return
+    sample = sampler.bandwidths(x[:-2], "from a lighter point")[0]
+    if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
+        promised = float(processes[0].predict(x[None, :])[0])
+        result[k] = _point(problem, sample, promised, tolerance)
 
 
 def _program(problem: CoDesignProblem, processes: tuple[GaussianProcess, ...]) -> NonlinearProgram:
@@ -132,20 +209,17 @@ def _walk(
     starts: Array,
     x: Array,
 ) -> Array:
-    """The program's optimum at each cost of `todo`, from the neighbours' optima and `starts`.
-
-    At the two ends θ stands: there is no freedom left but ω_S and ω_T.
-    """
+    """The program's optimum at each cost of `todo`, from both neighbours' optima and `starts`."""
     x = x.copy()
+    last = len(costs) - 1
     for k in todo:
-        end = k in (0, len(costs) - 1)
-        there = _at_theta(program, x[k][:-2]) if end else _at_cost(program, problem, costs[k])
-        tries = np.vstack([x[k], x[max(k - 1, 0)], starts])
+        there = _at_cost(program, problem, costs[k])
+        tries = np.vstack([x[k], x[max(k - 1, 0)], x[min(k + 1, last)], starts])
         try:
-            best = solve_program(there, tries[:, -2:] if end else tries).best.x
+            best = solve_program(there, tries).best.x
         except OuterFailure:
             continue  # the truth is asked where it stands, and teaches the surrogates
-        x[k, -len(best) :] = best
+        x[k] = best
     return x
 
 
@@ -155,18 +229,12 @@ def _at_cost(program: NonlinearProgram, problem: CoDesignProblem, cost: float) -
     return replace(program, g=ca.vertcat(program.g, f / cost - 1.0), g_lower=lower)
 
 
-def _at_theta(program: NonlinearProgram, theta: Array) -> NonlinearProgram:
-    omega = ca.MX.sym("omega", 2)
-    x = ca.vertcat(ca.DM(theta), omega)
-    f, g = ca.substitute([program.f, program.g], [program.x], [x])
-    lower, upper, variables = program.lower[-2:], program.upper[-2:], program.variables[-2:]
-    return replace(program, x=omega, f=f, g=g, lower=lower, upper=upper, variables=variables)
-
-
-def _ends(program: NonlinearProgram, problem: CoDesignProblem, starts: Array) -> list[Array]:
+def _ends(
+    program: NonlinearProgram, problem: CoDesignProblem, starts: Array
+) -> tuple[list[Array], bool]:
     """The lightest and the fastest predicted feasible design; where these are one, the heaviest.
 
-    Raises UserError where IPOPT finds none.
+    Second, whether they are two. Raises UserError where IPOPT finds none.
     """
     f = plant_of(problem).hardware(program.x[: len(problem.names)])[0]
     bandwidth = (program.f - problem.w1 * f) / problem.w2
@@ -179,7 +247,7 @@ def _ends(program: NonlinearProgram, problem: CoDesignProblem, starts: Array) ->
         raise UserError(f"no trade-off: {words} ({error})") from None
     costs = [hardware_cost(plant_of(problem), x[:-2]) for x in (light, fast, heavy)]
     trades = costs[1] - costs[0] > DOMINATED * (costs[2] - costs[0])
-    return [light, fast if trades else heavy]
+    return [light, fast if trades else heavy], trades
 
 
 def _point(

@@ -21,10 +21,13 @@ import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.kkt import (
+    ACTIVE,
+    OTHER_PEAK,
     KktCertificate,
     kkt_certificate,
     lagrangian_hessian,
     lagrangian_parts,
+    other_peaks,
 )
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -89,11 +92,16 @@ def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
     size = float(np.abs(kkt.objective_gradient).max())
     strong = [name for name in kkt.active if kkt.multipliers[name] > WEAK * size]
     rows = dict(zip(names, jacobian, strict=True)) | _bound_rows(problem)
+    kinked = any(name not in rows for name in strong)
+    if kinked:  # where local peaks are equal, each is a constraint
+        rows |= {peak.name: peak.row for peak in other_peaks(problem, x, design, ACTIVE)}
     A = np.array([rows[name] for name in strong]).reshape(-1, n)
     Z = null_space(A) if len(A) else np.eye(n)
     determined = Z.shape[1] == n - len(A)
     H = np.zeros((n, n))
-    if Z.shape[1]:
+    if Z.shape[1] and kinked:
+        determined = False  # the second derivatives of each peak are not known
+    elif Z.shape[1]:
         columns = lagrangian_hessian(problem, x, np.eye(n), kkt.multipliers, quantities.at)
         H = np.full((n, n), np.nan) if columns is None else 0.5 * (columns + columns.T)
         reduced = Z.T @ H @ Z
@@ -106,10 +114,10 @@ def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
     for parameter in _parameters(problem, x, design.values[0], slope_f, slope_b):
         dz = np.full(n, np.nan)
         if determined:
-            level = [parameter.levels.get(name, 0.0) for name in strong]
+            level = [_level(parameter, name) for name in strong]
             dz = np.linalg.solve(system, -np.concatenate([parameter.gradient, level]))[:n]
         dx = dz * (upper - lower)
-        change = sum(kkt.multipliers.get(name, 0.0) * d for name, d in parameter.levels.items())
+        change = sum(mu * _level(parameter, name) for name, mu in kkt.multipliers.items())
         responses.append(
             Response(
                 parameter=parameter.name,
@@ -123,6 +131,12 @@ def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
         )
     weak = tuple(name for name in kkt.active if name not in strong)
     return PostOptimal(tuple(responses), kkt, weak, determined)
+
+
+def _level(parameter: _Parameter, constraint: str) -> float:
+    """∂g/∂p of a constraint; a peak besides the largest moves with S_max as that one does."""
+    name = "S_max" if constraint.startswith(OTHER_PEAK) else constraint
+    return parameter.levels.get(name, 0.0)
 
 
 def _parameters(

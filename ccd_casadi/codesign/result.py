@@ -10,14 +10,29 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.outer_problem import OuterSolution
+from ccd_casadi.codesign.surrogate_quality import quality_dict
+from ccd_casadi.codesign.verdict import (
+    KKT_LEVEL,
+    CloserModel,
+    Verdict,
+    certified,
+    deployable,
+    optimal,
+    predicted,
+    reason,
+    survives,
+    verdict_dict,
+)
 from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
+from surrogates import Quality
 from surrogates.files import write_whole
 
 PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
@@ -51,37 +66,47 @@ def result_dict(
     syntheses: int,
     seconds: float,
     seed: int,
+    quality: tuple[Quality, ...] = (),
+    look: BoxLook | None = None,
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     figures = verified.design.figures
-    predicted = predicted_bandwidth(outcome, verified)
-    error = abs(predicted / figures.bandwidth - 1.0)
+    promised = predicted_bandwidth(outcome, verified)
+    error = abs(promised / figures.bandwidth - 1.0)
     checks = {
         "certificate": figures.certified,
         "constraints": verified.feasible,
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.inner_gap <= tolerance),
+        "optimality": bool(verified.kkt.stationarity <= KKT_LEVEL),
     }
     if verified.robust is not None:
         checks["robust"] = verified.robust.passed
+    if verified.references:
+        checks["closer_models"] = all(
+            check.figures.certificate.stable for check in verified.references
+        )
+    verdict = verdict_of(outcome, verified, problem, tolerance, error, quality, look)
     failed = [name for name, passed in checks.items() if not passed]
-    reason = "" if not failed else "failed: " + ", ".join(failed)
+    why = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
     result = {
         **figures_dict(figures),
         "status": "not_verified" if failed else "verified",
-        "reason": "; ".join(part for part in (reason, outcome.message) if part),
+        "reason": "; ".join(part for part in (why, outcome.message) if part),
+        "verdict": verdict_dict(verdict),
         "formulation": formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": dict(zip(problem.names, problem.units, strict=True)),
         "objective": verified.objective,
         "hardware_cost": verified.hardware_cost,
-        "surrogate_bandwidth_hz": predicted / HZ,
+        "surrogate_bandwidth_hz": promised / HZ,
         "verification_error": error,
         "checks": checks,
         "active": list(verified.active),
         "inner_gap": verified.inner_gap,
         "kkt": _kkt(verified.kkt),
         "globality": _globality(outcome.outer),
+        "box_look": _box_look(look),
         "without_suspension": {
             "stable": verified.unsuspended.certificate.stable,
             "bandwidth_hz": verified.unsuspended.bandwidth / HZ,
@@ -106,7 +131,77 @@ def result_dict(
         "seed": seed,
         "versions": versions(),
     }
+    result["surrogate_quality"] = quality_dict(quality)
     return clean(result)
+
+
+def verdict_of(
+    outcome: FormulationResult,
+    verified: VerifiedDesign,
+    problem: CoDesignProblem,
+    tolerance: float,
+    error: float,
+    quality: tuple[Quality, ...] = (),
+    look: BoxLook | None = None,
+) -> Verdict:
+    """The five lines on a verified design; `error` is that of its predicted bandwidth."""
+    figures, robust = verified.design.figures, verified.robust
+    solved = outcome.outer
+    at = quality[0].at_point if quality else None
+    return Verdict(
+        certified=certified(
+            certificate=figures.certified,
+            constraints=verified.feasible,
+            norm=figures.certificate.norm,
+            norm_bound=figures.certificate.norm_bound,
+            peak=figures.sensitivity_peak,
+        ),
+        optimal=optimal(
+            residual=verified.kkt.stationarity,
+            second_order=verified.kkt.second_order,
+            inner_gap=verified.inner_gap,
+            tolerance=tolerance,
+            starts=0 if solved is None else solved.starts,
+            optima=0 if solved is None else len(solved.optima),
+            look=look,
+        ),
+        predicted=predicted(
+            error=error,
+            tolerance=tolerance,
+            left_out=None if at is None else abs(at[0]) / (figures.bandwidth / HZ),
+            left_out_hz=None if at is None else abs(at[0]),
+            sigmas=None if at is None else at[1],
+            extrapolates=quality[0].extrapolates if quality else (),
+            surrogate=bool(outcome.surrogates),
+        ),
+        survives=survives(
+            verified.survival,
+            S_max=problem.inner.S_max,
+            robust=None if robust is None else robust.passed,
+            robust_words=_robust_words(robust),
+            closer=tuple(
+                CloserModel(
+                    check.name,
+                    check.figures.certificate.stable,
+                    check.figures.sensitivity_peak,
+                )
+                for check in verified.references
+            ),
+        ),
+        deployable=deployable(verified.survival),
+    )
+
+
+def _robust_words(check: RobustCheck | None) -> str:
+    if check is None:
+        return ""
+    at = f"at {100 * check.at.shift:+.2g} %, damping x {check.at.damping:.3g}"
+    if not check.worst.certificate.stable:
+        return f"unstable within its own robust set, {at}"
+    peak = f"peak of S {check.worst.sensitivity_peak:.4g} {at}"
+    if check.passed:
+        return f"its own robust set is kept ({check.plants} plants, worst {peak})"
+    return f"its own robust set is not kept: {peak}"
 
 
 def infeasible_dict(
@@ -195,6 +290,14 @@ def _robust(check: RobustCheck | None) -> dict[str, Any]:
             "plants": check.plants,
         }
     }
+
+
+def _box_look(look: BoxLook | None) -> dict[str, Any]:
+    """What was looked at besides the formulation's own way; nothing where there was no look."""
+    if look is None:
+        return {}
+    found = {key: value for key, value in vars(look).items() if key != "x"}
+    return found | {"moved": look.moved}
 
 
 def _globality(solution: OuterSolution | None) -> dict[str, Any]:

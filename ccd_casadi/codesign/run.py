@@ -1,6 +1,6 @@
 """One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -12,24 +12,27 @@ from threadpoolctl import threadpool_limits
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
+from ccd_casadi.codesign.box_look import BoxLook, look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import (
-    clean,
     controller_dict,
     infeasible_dict,
+    predicted_bandwidth,
     result_dict,
     write_json,
 )
-from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
+from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
+from ccd_casadi.codesign.surrogate_quality import surrogate_quality
+from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import Quality, design, save
 from surrogates.files import write_whole
@@ -50,12 +53,18 @@ class Solution:
 def formulation_of(case: Case, name: str) -> Formulation:
     """The formulation of that name with the options of a case file."""
     outer, sampling = case.outer, case.sampling
-    rounds = (outer.starts, outer.tolerance, outer.max_refinements, outer.surrogate)
+    rounds = (
+        outer.starts,
+        outer.tolerance,
+        outer.max_refinements,
+        outer.surrogate,
+        outer.box_points,
+    )
     if name == "nested":
         return Nested(sampling.design, sampling.points, *rounds)
     if name == "lifted":
         return Lifted(sampling.lifted_points, *rounds)
-    return Direct(starts=outer.direct_starts, tolerance=outer.tolerance)
+    return Direct(outer.direct_starts, outer.tolerance, outer.box_points)
 
 
 def solve(
@@ -112,7 +121,68 @@ def co_design(
             outcome = solve_direct(sampler, formulation, seed=seed)
         if outcome.x is None:
             outcome = rescue(sampler, outcome, seed)
-    return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
+    if outcome.x is None:
+        return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
+    verified = verify(sampler, outcome.x)
+    J = verified.objective if verified.feasible else np.inf
+    look = look_over_box(sampler, verified.x, J, formulation.box_points, seed, outcome.surrogates)
+    rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
+    if look.x is not None or (
+        len(outcome.iterates) <= rounds
+        and _prediction_error(outcome, verified) > formulation.tolerance
+    ):
+        x = verified.x if look.x is None else look.x
+        outcome = _resumed(sampler, formulation, outcome, x, seed)
+        again = [verify(sampler, end) for end in _distinct(x, outcome.x)]
+        verified = _best([verified, *again], formulation.tolerance)
+    if verified.kkt.stationarity > KKT_LEVEL:
+        ends = perturbed(sampler, verified.x, seed)
+        verified = _best([verified, *(verify(sampler, end) for end in ends)], formulation.tolerance)
+    return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
+
+
+def _resumed(
+    sampler: Sampler, formulation: Formulation, outcome: FormulationResult, x: Array, seed: int
+) -> FormulationResult:
+    """Go on from a better design (or the same one, wrongly predicted): the surrogates learn it."""
+    if isinstance(formulation, Direct):
+        return replace(outcome, x=x, design=sampler.design(x), agreed=True)
+    if isinstance(formulation, Nested):
+        thetas = np.unique(np.array([*sampler.solved, tuple(x[:-2])]), axis=0)
+        found = solve_nested(sampler, formulation, seed=seed, given=Surrogates((), thetas, ()))
+    else:
+        old = fitted_quantities(outcome.surrogates)
+        new = [sample for sample in sampler.quantities(x) if sample.certified]
+        samples = tuple({sample.x: sample for sample in (*old, *new)}.values())
+        thetas = np.array([sample.x[:-2] for sample in samples])
+        processes = outcome.surrogates if old else ()
+        given = Surrogates(processes, thetas, samples)
+        found = solve_lifted(
+            sampler, formulation, seed=seed, given=given, incumbent=new[0] if new else None
+        )
+    if found.x is None:
+        return replace(outcome, x=x)
+    return replace(found, iterates=(*outcome.iterates, *found.iterates))
+
+
+def _prediction_error(outcome: FormulationResult, verified: VerifiedDesign) -> float:
+    return abs(predicted_bandwidth(outcome, verified) / verified.design.figures.bandwidth - 1.0)
+
+
+def _distinct(x: Array, other: Array | None) -> list[Array]:
+    return [x] if other is None or np.array_equal(x, other) else [x, other]
+
+
+def _best(found: list[VerifiedDesign], tolerance: float) -> VerifiedDesign:
+    """The least J of those that are feasible; within the tolerance of it one that is stationary.
+
+    A better design that is not stationary is kept: to call a worse one optimal would be untrue.
+    """
+    feasible = [item for item in found if item.feasible] or found
+    least = min(item.objective for item in feasible)
+    near = [item for item in feasible if item.objective <= least + tolerance * abs(least)]
+    stationary = [item for item in near if item.kkt.stationarity <= KKT_LEVEL]
+    return min(stationary or near, key=lambda item: item.objective)
 
 
 def conclude(
@@ -122,8 +192,10 @@ def conclude(
     tolerance: float,
     seed: int,
     began: float,
+    verified: VerifiedDesign | None = None,
+    look: BoxLook | None = None,
 ) -> Solution:
-    """Verify and polish what a formulation found, if anything."""
+    """Verify and polish what a formulation found, if anything, where that is not done yet."""
     if outcome.x is None:
         result = infeasible_dict(
             formulation,
@@ -133,7 +205,7 @@ def conclude(
             seed=seed,
         )
         return Solution(result, outcome, None)
-    verified = verify(sampler, outcome.x)
+    verified = verify(sampler, outcome.x) if verified is None else verified
     quality = surrogate_quality(outcome.surrogates, verified.x, seed)
     result = result_dict(
         sampler.problem,
@@ -144,8 +216,9 @@ def conclude(
         syntheses=sampler.syntheses,
         seconds=perf_counter() - began,
         seed=seed,
+        quality=quality,
+        look=look,
     )
-    result["surrogate_quality"] = clean(quality_dict(quality))
     return Solution(result, outcome, verified, quality)
 
 

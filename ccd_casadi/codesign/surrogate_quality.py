@@ -40,7 +40,14 @@ def recommendation(qualities: Sequence[Quality]) -> str:
     if not qualities:
         return ""
     said = []
-    rough = [q.name.replace("_", " ") for q in qualities if not q.smooth_enough]
+    poor = [q for q in qualities if q.poor]
+    if poor:
+        which = ", ".join(f"{q.name.replace('_', ' ')} (Q² {q.kfold.q2:.2g})" for q in poor)
+        said.append(
+            f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
+            "surrogate says anything away from the design."
+        )
+    rough = [q.name.replace("_", " ") for q in qualities if not (q.smooth_enough or q.poor)]
     if rough:
         what = ", ".join(rough)
         said.append(
@@ -60,6 +67,9 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             f"At the design the surrogate of {', '.join(beyond)} extrapolates: trust the "
             "verification, and retrain before moving bounds or weights."
         )
+    for q in qualities:
+        if q.unsupported and not q.extrapolates and not q.poor:
+            said.append(f"{q.name.replace('_', ' ').capitalize()}: {q.unsupported}.")
     return " ".join(said) or "The surrogates follow their samples, and support the design."
 
 
@@ -77,6 +87,9 @@ def quality_dict(qualities: Sequence[Quality]) -> dict[str, Any]:
                 "coverage_95": q.coverage,
                 "roughness": q.roughness.value,
                 "extrapolates": list(q.extrapolates),
+                "left_out_at_design": None
+                if q.at_point is None
+                else {"error": q.at_point[0], "deviations": q.at_point[1]},
             }
             for q in qualities
         },

@@ -8,6 +8,7 @@ from ccd_casadi.codesign.closer_models import ReferenceCheck, check_references
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.codesign.survival import Survival, survival
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -46,6 +47,7 @@ class VerifiedDesign:
     unsuspended: DesignFigures
     references: tuple[ReferenceCheck, ...] = ()
     robust: "RobustCheck | None" = None
+    survival: Survival | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,9 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         unsuspended=unsuspended,
         references=check_references(problem, theta, final),
         robust=_check_robust(problem, theta, final),
+        survival=survival(problem, theta, final.controller, final.figures.bandwidth)
+        if final.figures.certified
+        else None,
     )
 
 

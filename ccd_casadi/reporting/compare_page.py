@@ -6,6 +6,7 @@ from typing import Any
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.comparison import Comparison, Method
 from ccd_casadi.codesign.steepest_descent import Descent
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, synthesised_loop, table_gains
@@ -37,6 +38,7 @@ from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop
 from surrogates.files import write_whole
@@ -87,7 +89,16 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         "",
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         found["sentences"][0],
+        warned=any(
+            worst(method.figures) is not State.PASSED
+            for method in comparison.methods
+            if method.solution
+        ),
     )
+    for method in reversed(comparison.methods):
+        lines = verdict_html(method.figures)
+        if lines:
+            sections.insert(0, Section(f"Verdict: {LABELS[method.name]}", lines))
     path = folder / "report.html"
     text = with_turntables(page(f"Comparison: {comparison.case.path.name}", sections, head))
     write_whole(path, text)

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.signal import cont2discrete
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.sections import Root, sections_of
@@ -26,6 +27,7 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
@@ -51,7 +53,10 @@ def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
     if found.sampled.stable:
         sections.append(Section("The code", _code(found)))
     status = "verified" if found.passed else "not verified"
-    head = header(title, found.passed, status, reason, meta, _conclusion(run, found))
+    head = header(
+        title, found.passed, status, reason, meta, _conclusion(run, found),
+        warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
+    )  # fmt: skip
     path.write_text(page(title, sections, head), encoding="utf-8")
 
 

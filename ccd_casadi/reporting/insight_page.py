@@ -6,6 +6,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.insight import natural_hz
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.insight import (
     caption_front,
@@ -25,6 +26,7 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
@@ -61,6 +63,8 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
         f"around the design of {run.folder.name}/result.json",
         f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
         f"of {number(cost)}. {rule_sentence(loop, natural_hz(run))}",
+        warned=worst(run.result) is not State.PASSED,
+        verdict=verdict_html(run.result),
     )
     drawn = figure_front(problem, front, (cost, bandwidth_hz, "this run's design"))
     words = "\n".join(paragraph(text) for text in response_sentences(responses))

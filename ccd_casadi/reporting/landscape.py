@@ -103,15 +103,24 @@ def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
             f"The verified design (★) has {number(best_hz)} Hz."
         )
     field = land.bandwidth_hz
-    known = field[np.isfinite(field)]
+    inside = np.isfinite(field) & ~land.outside
+    known = field[inside] if inside.any() else field[np.isfinite(field)]
     if not known.size:
         return "The surrogates have no feasible design anywhere on the grid."
     where = "computed from the lifted surrogates by maximising ω_b over (ω_S, ω_T) at each θ"
+    limited = " inside the last trust region" if land.outside.any() else ""
     words = (
         f"ω_b*(θ), {where if lifted else 'the surrogate'}: {number(float(known.min()), 4)} to "
-        f"{number(float(known.max()), 4)} Hz; the verified design (★) has {number(best_hz)} Hz."
+        f"{number(float(known.max()), 4)} Hz{limited}; the verified design (★) has "
+        f"{number(best_hz)} Hz."
     )
-    words += _steepest(land)
+    if land.outside.any():
+        words += (
+            f" Pale: outside the last trust region ({100.0 * land.outside.mean():.0f} % of the "
+            "grid), where the last surrogate was not asked to be right; believe the dots there."
+        )
+    else:
+        words += _steepest(land)
     share = np.isnan(field).mean()
     if share > 0.0:
         words += f" Grey: no feasible design ({100.0 * share:.0f} % of the grid)."

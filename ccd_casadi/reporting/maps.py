@@ -48,6 +48,16 @@ class Landscape:
     forbidden: Array | None = None
     region: tuple[float, float, float, float] | None = None
 
+    @property
+    def outside(self) -> np.ndarray:
+        """The grid's points outside the trust region: no surrogate speaks of them."""
+        if self.region is None or not self.bandwidth_hz.size:
+            return np.zeros(self.bandwidth_hz.shape, dtype=bool)
+        a, b, c, d = self.region
+        first = (self.first >= a) & (self.first <= b)
+        second = (self.second >= c) & (self.second <= d)
+        return ~(first[:, None] & second[None, :])
+
 
 @dataclass(frozen=True)
 class ThetaPath:
@@ -93,6 +103,10 @@ def figure_landscape(
         axes.set_facecolor("#eeeeee")
         shown = land.bandwidth_hz if land.bandwidth_hz.size else land.truths[:, 2]
         filled, norm = _contours(axes, land.first, land.second, land.bandwidth_hz, shown)
+        if land.outside.any():
+            pale = np.where(land.outside, 1.0, np.nan)
+            axes.pcolormesh(land.first, land.second, pale.T, cmap="gray", vmin=0.0, vmax=1.0,
+                            alpha=0.72, shading="nearest", rasterized=True)  # fmt: skip
         if land.forbidden is not None and land.forbidden.any():
             _shade(axes, land.first, land.second, land.forbidden.astype(float) - 0.5)
         if len(land.designs):

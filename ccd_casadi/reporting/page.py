@@ -24,6 +24,10 @@ p { margin: 8px 0; }
   font-weight: 600; border: 1px solid; }
 .good { color: #00543d; background: #e3f4ee; border-color: #7cc5ad; }
 .bad { color: #8a3300; background: #fdeee2; border-color: #e0a178; }
+.warn { color: #6b5200; background: #fdf6d8; border-color: #d9c15c; }
+.open { color: #444; background: #f3f3f3; border-color: #bbb; }
+.verdict { margin-top: 14px; } .verdict .badge { font-size: 12.5px; white-space: nowrap; }
+.wide.verdict th:first-child { width: 11%; } .wide.verdict td:nth-child(2) { width: 12%; }
 .lead { font-size: 17px; line-height: 1.5; margin: 12px 0 0; }
 figure { margin: 14px 0 22px; }
 svg { display: block; height: auto; }
@@ -153,13 +157,28 @@ def preformatted(text: str) -> str:
     return f"<pre>{escape(text)}</pre>"
 
 
-def header(title: str, good: bool, status: str, reason: str, meta: str, lead: str) -> str:
-    """Title, status badge with its reason, a line of circumstances, and the conclusion."""
+def header(
+    title: str,
+    good: bool,
+    status: str,
+    reason: str,
+    meta: str,
+    lead: str,
+    *,
+    warned: bool = False,
+    verdict: str = "",
+) -> str:
+    """Title, status badge with its reason, a line of circumstances, and the conclusion.
+
+    The badge is not green where the verdict has a warning; `verdict` is HTML of its lines.
+    """
     kind, sign = ("good", "✓") if good else ("bad", "✕")
+    if good and warned:
+        kind, sign = "warn", "!"
     badge = f'<span class="badge {kind}">{sign} {escape(status)}</span>'
     return (
         f"<h1>{escape(title)}</h1>\n<p>{badge} {escape(reason)}</p>\n"
-        f'<p class="meta">{escape(meta)}</p>\n<p class="lead">{escape(lead)}</p>'
+        f'<p class="meta">{escape(meta)}</p>\n<p class="lead">{escape(lead)}</p>\n{verdict}'
     )
 
 

@@ -18,11 +18,14 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ
 from surrogates.files import write_whole
+
+LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
@@ -43,6 +46,7 @@ def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
         "that were tried; nothing is said of others",
         f"{theta_words(run.result)} · seed {seed}",
         lead,
+        verdict=verdict_html(run.result),
     )
     sections = [
         Section("In short", "\n".join(paragraph(words) for words in others)),
@@ -73,6 +77,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         f"{sum(j.stable and j.peak > S_max for j in hard.judged)} others above S_max; worst found: "
         f"{_outcome(hard.worst)}.",
     ]
+    words += _bandwidth_lost(run, found)
     if hard.failed:
         words.append(f"{hard.failed} random sets of hardware made no plant and are not counted.")
     disk = found.margins.outputs
@@ -92,6 +97,23 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
     words += [_moved(found, i) for i in range(len(found.moves))]
     return words
+
+
+def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
+    """What the stable plants with other hardware have left of ω_b, where they lose any to speak of.
+
+    A loop that stays stable and within S_max can be half as fast.
+    """
+    hz = np.array([item.bandwidth / HZ for item in found.tolerances.judged if item.stable])
+    hz = hz[np.isfinite(hz)]
+    design = run.figures.bandwidth / HZ
+    if not hz.size or hz.min() > (1.0 - LOSS) * design:
+        return []
+    quarter, least = float(np.quantile(hz, 0.25)), float(hz.min())
+    return [
+        f"Bandwidth on that hardware: a quarter of the stable plants has {number(quarter, 4)} Hz "
+        f"or less, the slowest {number(least, 4)} Hz, where the design has {number(design, 4)} Hz."
+    ]
 
 
 def _moved(found: Study, i: int) -> str:

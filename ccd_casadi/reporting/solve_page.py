@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
@@ -52,6 +53,7 @@ from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_fi
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
+from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 
@@ -86,6 +88,8 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
         _reason(solution),
         f"{case.path.name} · {result['formulation']} formulation · {now}",
         conclusion(result),
+        warned=worst(result) is State.WARNED,
+        verdict=verdict_html(result),
     )
     sections = []
     if solution.verified is not None:
@@ -103,9 +107,8 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
 
 
 def _reason(solution: "Solution") -> str:
-    checks = solution.result.get("checks", {})
     if solution.result["status"] == "verified":
-        return f"all checks passed: {', '.join(checks).replace('_', ' ')}"
+        return head_words(solution.result)
     return solution.result["reason"]
 
 

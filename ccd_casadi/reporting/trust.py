@@ -82,8 +82,8 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
         tuple(
             (
                 WORDS[q.name], len(q.true), *(f"{number(e, 3)} {q.unit}" for e in _errors(q)),
-                number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.roughness.value,
-                "; ".join(q.extrapolates) or "supported",
+                number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look,
+                q.unsupported or "supported",
             )
             for q in qualities
         ),

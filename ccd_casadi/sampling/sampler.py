@@ -90,6 +90,7 @@ class Sampler:
         self._spent: dict[str, int] = {}
         self.trace: list[TraceEntry] = []
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
+        self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # inner problems asked for
 
     @property
     def syntheses(self) -> int:
@@ -118,6 +119,7 @@ class Sampler:
             except (KeyError, TypeError, ValueError) as error:
                 raise self.store.damaged() from error
             found.append(sample)
+            self.solved[theta] = sample
             if not sample.feasible and (
                 self.nearest is None or sample.violation < self.nearest.violation
             ):

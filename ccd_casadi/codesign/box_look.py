@@ -1,0 +1,233 @@
+"""A look at the whole box: is anything better than what a formulation found?
+
+The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
+formulation solved itself counted in. With surrogates over (θ, ω_S, ω_T) a θ is passed over where
+even their optimistic values (if left-out samples say that they are to be trusted),
+
+    ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
+
+do not reach the J at hand. The `CHECKED` most promising of those are solved all the same, and all
+of them where one is better than the surrogates' optimism allowed. Whatever is better than its
+neighbours starts a local solve on the true problem (`kinked.descend`); the best end wins. What this
+excludes is a better optimum whose basin one of the points lies in, and no more.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import acceptable, objective
+from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, design, quality_of
+
+LOCAL_STARTS = 8  # local solves at most, from the best of the points that beat their neighbours
+BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
+SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
+PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
+TRIES = 4
+OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
+CHECKED = 4  # of those passed over that are solved nevertheless
+COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+COARSE = 1.02  # what the best between the points of the mesh may be above the best on it
+MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
+
+
+@dataclass(frozen=True)
+class BoxLook:
+    """What was looked at: `points` θ, `solved` by true inner problems, `feasible` of these with a
+    design; the others were passed over, their optimistic surrogates being worse.
+
+    `better`: how many of them beat the J that the formulation came `before` with; `starts` local
+    solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
+    """
+
+    points: int
+    solved: int
+    feasible: int
+    better: int
+    starts: int
+    seed: int
+    before: float
+    after: float
+    x: Array | None
+
+    @property
+    def moved(self) -> bool:
+        """Whether something better was found."""
+        return self.x is not None
+
+
+def look_over_box(
+    sampler: Sampler,
+    x: Array,
+    J: float,
+    points: int,
+    seed: int,
+    processes: tuple[GaussianProcess, ...] = (),
+) -> BoxLook:
+    """Look at `points` θ over the box for a J lower than that of x = (θ, ln ω_S, ln ω_T).
+
+    `processes`: surrogates of ω_b, ln‖S‖∞ and ln|S(jω_low)| over x, where there are any.
+    """
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
+    feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
+    values = np.array([_objective(problem, sample) for sample in feasible])
+    margin = BETTER * abs(J) if np.isfinite(J) else 0.0
+    best_x, best = None, J
+    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))
+    for sample in starts:
+        begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+        end = descend(problem, quantities, begin)
+        for place in (end, begin):
+            found = quantities.at(place)
+            if acceptable(problem, place, found):
+                value = objective(problem, place, found)
+                if value < best - margin:
+                    best_x, best = place, value
+                break
+    return BoxLook(
+        points=len(samples) + passed_over,
+        solved=len(samples),
+        feasible=len(feasible),
+        better=int((values < J - margin).sum()),
+        starts=len(starts),
+        seed=seed,
+        before=J,
+        after=best,
+        x=best_x,
+    )
+
+
+def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
+    """Ends of local solves from a few starts around x: the last try where x is not stationary."""
+    problem = sampler.problem
+    quantities = TrueQuantities(problem, sampler.record)
+    lower, upper = box(problem)
+    ends = []
+    for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
+        theta = np.clip(x[:-2] + step * (upper - lower), lower, upper)
+        sample = sampler.bandwidths(theta, "perturbed starts")[0]
+        if sample.feasible:
+            begin = np.array([*theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+            end = descend(problem, quantities, begin, settled=1e-13)
+            if acceptable(problem, end, quantities.at(end)):
+                ends.append(end)
+    return ends
+
+
+def _spread(
+    sampler: Sampler, J: float, points: int, seed: int, processes: tuple[GaussianProcess, ...]
+) -> tuple[list[BandwidthSample], int]:
+    """The inner problems that the run has solved, and as many more as make up `points`.
+
+    Second, how many of these were passed over for their surrogates.
+    """
+    lower, upper = box(sampler.problem)
+    solved = list(sampler.solved.values())
+    apart = _apart(np.array([s.theta for s in solved]).reshape(-1, lower.size), upper - lower)
+    known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
+    passed_over = 0
+    if len(known) < points:
+        plant = plant_of(sampler.problem)
+        spread = design("sobol", lower, upper, points, seed)[len(known) :]
+        more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
+        solve: list[Array] = list(more)
+        if more and len(processes) == 3 and _trustworthy(processes, seed):
+            hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
+            order = np.argsort(hopes)
+            keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
+            first = sampler.bandwidths(np.array([more[i] for i in keep]), "looking over the box")
+            refuted = any(
+                sample.feasible and _objective(sampler.problem, sample) < hopes[i]
+                for i, sample in zip(keep, first, strict=True)
+            )
+            known = [*known, *first]
+            solve = [more[i] for i in range(len(more)) if i not in keep] if refuted else []
+            passed_over = len(more) - len(keep) - len(solve)
+        if solve:
+            known = [*known, *sampler.bandwidths(np.array(solve), "looking over the box")]
+    return known, passed_over
+
+
+def _trustworthy(processes: tuple[GaussianProcess, ...], seed: int) -> bool:
+    """Whether the surrogates may rule anything out: smooth samples, predicted within their bands.
+
+    Where ω_b jumps (a peak below it reaches -3 dB) a smooth surrogate is sure of what is not so.
+    """
+    middle = 0.5 * (processes[0].lower + processes[0].upper)
+    found = [quality_of(process, middle, seed=seed) for process in processes]
+    return all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
+
+
+def _optimistic_objective(
+    problem: CoDesignProblem, processes: tuple[GaussianProcess, ...], thetas: Array
+) -> Array:
+    """The least J (n,) that the surrogates do not rule out at each θ (n, n_θ); see the module."""
+    lower, upper = lifted_bounds(problem)
+    axes = [np.linspace(lower[k], upper[k], MESH) for k in (-2, -1)]
+    mesh = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    levels = np.log([problem.inner.S_max, problem.inner.S_low])
+    plant = plant_of(problem)
+    out = np.empty(len(thetas))
+    for i, theta in enumerate(thetas):
+        X = np.hstack([np.tile(theta, (len(mesh), 1)), mesh])
+        bandwidth, *bounded = (process.predict(X, return_std=True) for process in processes)
+        allowed = np.all(
+            [
+                mean - OPTIMISM * std <= level
+                for (mean, std), level in zip(bounded, levels, strict=True)
+            ],
+            axis=0,
+        )
+        hope = COARSE * (bandwidth[0] + OPTIMISM * bandwidth[1])
+        best = float(hope[allowed].max()) if allowed.any() else -np.inf
+        out[i] = problem.w1 * hardware_cost(plant, theta) + problem.w2 * best
+    return out
+
+
+def _apart(thetas: Array, width: Array) -> list[bool]:
+    """Which of them are no near repetition of an earlier one: a cluster is one look."""
+    kept: list[int] = []
+    out = []
+    for i, theta in enumerate(thetas):
+        far = all(np.abs((theta - thetas[k]) / width).max() > 0.02 for k in kept)
+        out.append(far)
+        if far:
+            kept.append(i)
+    return out
+
+
+def _starts(
+    problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
+) -> list[BandwidthSample]:
+    """Samples with a lower J than their n_θ + 1 nearest neighbours, away from θ; the best first."""
+    if not samples:
+        return []
+    lower, upper = box(problem)
+    unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
+    here = (theta - lower) / (upper - lower)
+    chosen = []
+    for i in np.argsort(values):
+        away = np.abs(unit - unit[i]).max(axis=1)
+        near = np.argsort(away)[1 : lower.size + 2]
+        if (values[near] >= values[i]).all() and np.abs(unit[i] - here).max() > SAME:
+            chosen.append(samples[i])
+    return chosen[:LOCAL_STARTS]
+
+
+def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
+    return bool((constraint_values(plant_of(problem), sample.theta) <= 1e-9).all())
+
+
+def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
+    cost = hardware_cost(plant_of(problem), sample.theta)
+    return problem.w1 * cost + problem.w2 * sample.bandwidth

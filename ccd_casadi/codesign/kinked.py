@@ -1,0 +1,192 @@
+"""The true problem by sequential quadratic programming, every local peak of S a constraint.
+
+    min ∇Jᵀd + ½ dᵀH d   s.t.  g + ∇g d <= 0 (elastic),  |d| <= Δ,  0 <= z + d <= 1
+
+in unit-box variables z. An optimum is often where two peaks of S are equal, or where a peak below
+ω_b just stays under -3 dB: ‖S‖∞ has a kink and ω_b a jump there, on which a method that knows
+one gradient alone stalls. A step is taken where the merit J + ρ Σ max(0, g) falls, and where the
+design is certified; H is the damped BFGS matrix of the Lagrangian (Nocedal and Wright, 18.3).
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.codesign.kkt import OTHER_PEAK, lagrangian_parts, other_peaks
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+
+BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
+INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
+FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
+SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
+SHELF = 10.0  # ln per (share of the box)²: how far a step stays from where ω_b jumps
+SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
+
+
+@dataclass(frozen=True)
+class _Point:
+    z: Array
+    design: Sensitivities
+    J: float
+    gradient: Array
+    g: Array
+    jacobian: Array
+    tags: tuple[tuple[str, float, int], ...]
+
+    @property
+    def by_shelf(self) -> bool:
+        """Whether ω_b may jump near by."""
+        return any(kind == "shelf" for kind, _, _ in self.tags)
+
+
+def descend(
+    problem: CoDesignProblem,
+    quantities: TrueQuantities,
+    x: Array,
+    *,
+    steps: int = 30,
+    radius: float = FIRST,
+    settled: float = SETTLED,
+) -> Array:
+    """From a certified design to the nearest optimum of the true problem; the best x found.
+
+    At most `steps` designs are asked for. Returns the start where it is not certified.
+    """
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    size = x.size
+
+    def at(z: Array) -> _Point | None:
+        where = lower + width * np.clip(z, 0.0, 1.0)
+        design = quantities.at(where)
+        return _point(problem, where, np.clip(z, 0.0, 1.0), design)
+
+    here = at((x - lower) / width)
+    if here is None:
+        return x
+    scale = max(float(np.abs(here.gradient).max()), 1e-300)
+    H = scale * np.eye(size)
+    rho = scale
+    for _ in range(steps):
+        d, mu, model = _step(here, H, radius, rho)
+        while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
+            radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
+            d, mu, model = _step(here, H, radius, rho)
+        rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
+        if radius < LEAST or model <= settled * abs(here.J):
+            break
+        there = at(here.z + d)
+        gained = -np.inf if there is None else _merit(here, rho) - _merit(there, rho)
+        if there is not None:
+            H = _updated(H, here, there, mu)
+        if there is None or gained < 0.1 * model:
+            radius = min(radius, float(np.abs(d).max())) * 0.35
+        elif gained > 0.7 * model and np.abs(d).max() > 0.9 * radius:
+            radius = min(2.0 * radius, LARGEST)
+        if there is not None and gained > 1e-4 * model:
+            here = there
+    return lower + width * here.z
+
+
+def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) -> _Point | None:
+    if not design.figures.certified:
+        return None
+    gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
+    g = g.copy()
+    g[:2] += INSIDE
+    peaks = other_peaks(problem, x, design, BAND)
+    tags = [(name, 0.0, 0) for name in names]
+    tags[0] = ("peak", float(np.log(design.figures.sensitivity_peak_frequency)), -1)
+    if peaks:
+        g = np.append(g, [peak.value + INSIDE for peak in peaks])
+        jacobian = np.vstack([jacobian, *(peak.row for peak in peaks)])
+        tags += [
+            (
+                "peak" if peak.name.startswith(OTHER_PEAK) else "shelf",
+                np.log(peak.omega),
+                peak.member,
+            )
+            for peak in peaks
+        ]
+    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
+    J = problem.w1 * cost + problem.w2 * design.figures.bandwidth
+    return _Point(z, design, J, gradient, g, jacobian, tuple(tags))
+
+
+def _merit(point: _Point, rho: float) -> float:
+    """J + ρ Σ max(0, g); a -3 dB shelf that is passed shows in J itself, as a jump."""
+    return point.J + rho * float(np.maximum(point.g, 0.0).sum())
+
+
+def _step(here: _Point, H: Array, radius: float, rho: float) -> tuple[Array, Array, float]:
+    """d, the multipliers of g, and by how much the model of the merit falls."""
+    n, m = here.z.size, here.g.size
+    solver = _solver(n, m)
+    unit = max(float(np.abs(here.gradient).max()), 1e-300)
+    # Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong.
+    shelf = np.array([kind == "shelf" for kind, _, _ in here.tags])
+    g = here.g + np.where(shelf, SHELF * radius**2, 0.0)
+    # In steps of one radius, so that the solver's tolerances mean the same at every radius.
+    hessian = np.zeros((n + m, n + m))
+    hessian[:n, :n] = radius * (H / unit + 1e-9 * np.trace(H) / (n * unit) * np.eye(n))
+    hessian[n:, n:] = 1e-6 * np.eye(m)
+    linear = np.append(here.gradient / unit, np.full(m, 10.0 * (1.0 + rho / unit)))
+    A = np.hstack([here.jacobian, -np.eye(m)])
+    low = np.append(np.maximum(-1.0, -here.z / radius), np.zeros(m))
+    high = np.append(np.minimum(1.0, (1.0 - here.z) / radius), np.full(m, np.inf))
+    try:
+        answer = solver(h=hessian, g=linear, a=A, lba=-np.inf, uba=-g / radius, lbx=low, ubx=high)
+    except RuntimeError:  # the quadratic program was not solved
+        return np.zeros(n), np.zeros(m), 0.0
+    d = radius * np.clip(np.array(answer["x"]).ravel()[:n], low[:n], high[:n])
+    mu = unit * np.maximum(np.array(answer["lam_a"]).ravel(), 0.0)
+    weight = max(rho, 2.0 * float(mu.max(initial=0.0)))
+    before = weight * float(np.maximum(here.g, 0.0).sum())
+    after = weight * float(np.maximum(here.g + here.jacobian @ d, 0.0).sum())
+    model = before - after - float(here.gradient @ d + 0.5 * d @ H @ d)
+    return d, mu, model
+
+
+def _solver(n: int, m: int) -> ca.Function:
+    dense = {
+        "h": ca.Sparsity.dense(n + m, n + m),
+        "a": ca.Sparsity.dense(m, n + m),
+    }
+    return ca.conic("step", "daqp", dense, {"error_on_fail": True})
+
+
+def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
+    """Powell's damped BFGS update with the change of the Lagrangian's gradient."""
+    s = there.z - here.z
+    after = there.gradient.copy()
+    for value, tag in zip(mu, here.tags, strict=True):
+        row = _same(tag, there)
+        if value > 0.0 and row is None:
+            return H  # the peak is gone: there is no difference to learn from
+        if value > 0.0:
+            after += value * there.jacobian[row]
+    y = after - here.gradient - here.jacobian.T @ mu
+    Hs = H @ s
+    curvature = float(s @ Hs)
+    if curvature <= 1e-16 * float(np.trace(H)):
+        return H
+    if s @ y < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - float(s @ y))
+        y = share * y + (1.0 - share) * Hs
+    return H - np.outer(Hs, Hs) / curvature + np.outer(y, y) / float(s @ y)
+
+
+def _same(tag: tuple[str, float, int], there: _Point) -> int | None:
+    """The row of the same constraint there; of a peak, the nearest in frequency."""
+    kind, place, _ = tag
+    rows = [i for i, other in enumerate(there.tags) if other[0] == kind]
+    if not rows:
+        return None
+    nearest = min(rows, key=lambda i: abs(there.tags[i][1] - place))
+    return nearest if abs(there.tags[nearest][1] - place) <= SAME_PEAK else None

@@ -1,0 +1,286 @@
+"""One verdict on a finished design in five lines, the same for the terminal, files and pages.
+
+certified: the true closed loop meets its certificate and the constraints. optimal: the true
+optimality conditions hold and nothing better is known. predicted: what the surrogate said is true.
+survives: the loop stands a plant a little off its model. deployable: it can run on a computer.
+
+Every line is passed, warned, failed or unknown, in words and with the figures that it rests on.
+A design is verified when no line failed; a warning is for the reader to weigh.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any
+
+from ccd_casadi.codesign.box_look import BoxLook
+from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
+
+KKT_LEVEL = 1e-4  # scaled residual of the true optimality conditions; the polish reaches 1e-6
+SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
+LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
+LEAST_FACTORS = (0.5, 2.0)  # of their damping, which is known no better
+CLOSER_PEAK = 0.10  # relative: peak of S above S_max on a closer model that is worth a warning
+DIFFERENTIATOR = 0.02  # |K(0)| over |K(jω_b)| below which nothing holds the stage at rest
+SIGMAS = 3.0  # left-out error at the design, in predicted deviations
+DELAY_PERIODS = 1.5  # one period of delay and half a period of hold
+
+
+class State(StrEnum):
+    """What a line of the verdict says."""
+
+    PASSED = "passed"
+    WARNED = "warned"
+    FAILED = "failed"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line: its state, its words and the figures behind them."""
+
+    state: State
+    words: str
+    figures: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The five lines, in the order in which they matter."""
+
+    certified: Line
+    optimal: Line
+    predicted: Line
+    survives: Line
+    deployable: Line
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of the lines that failed."""
+        return tuple(name for name, line in self.lines() if line.state is State.FAILED)
+
+    def lines(self) -> tuple[tuple[str, Line], ...]:
+        """Name and line, in order."""
+        return tuple((item.name, getattr(self, item.name)) for item in fields(self))
+
+
+@dataclass(frozen=True)
+class CloserModel:
+    """The controller on a closer model of the plant: stable, and its peak of S."""
+
+    name: str
+    stable: bool
+    peak: float
+
+
+def certified(
+    *, certificate: bool, constraints: bool, norm: float, norm_bound: float, peak: float
+) -> Line:
+    """The certificate of the true closed loop, and S_max, S_low, λ <= 0 as given."""
+    figures = {"norm": norm, "norm_bound": norm_bound, "sensitivity_peak": peak}
+    if not certificate:
+        return Line(State.FAILED, "the closed loop is not certified", figures)
+    if not constraints:
+        words = "certified, but S_max, S_low or a constraint on theta is not met"
+        return Line(State.FAILED, words, figures)
+    words = f"closed loop stable, norm {norm:.6g} <= {norm_bound:.6g}, constraints met"
+    return Line(State.PASSED, words, figures)
+
+
+def optimal(
+    *,
+    residual: float,
+    second_order: float | None,
+    inner_gap: float,
+    tolerance: float,
+    starts: int,
+    optima: int,
+    look: BoxLook | None,
+) -> Line:
+    """KKT residual, the global inner problem at θ, and what was looked at in the box."""
+    figures: dict[str, Any] = {
+        "kkt_residual": residual,
+        "kkt_level": KKT_LEVEL,
+        "inner_gap": inner_gap,
+        "starts": starts,
+        "distinct_optima": optima,
+    }
+    known = f"best of {_count(starts, 'start')}" if starts else ""
+    if optima > 1:
+        known += f", {optima} distinct optima"
+    if look is None or not look.points:
+        known = ", ".join(part for part in (known, "gap not known: no look at the box") if part)
+    else:
+        figures |= {
+            "box_points": look.points,
+            "box_solved": look.solved,
+            "box_feasible": look.feasible,
+            "box_better": look.better,
+            "box_starts": look.starts,
+            "box_seed": look.seed,
+            "objective_before": look.before,
+        }
+        how = f"{look.points} spread theta"
+        if look.solved < look.points:
+            how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
+        said = f"none better at {how}"
+        if look.moved:
+            said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
+        known = ", ".join(part for part in (known, said, "gap not known") if part)
+    if not residual <= KKT_LEVEL:
+        words = f"not optimal: KKT residual {residual:.1e} above {KKT_LEVEL:.0e}; {known}"
+        return Line(State.FAILED, words, figures)
+    if not inner_gap <= tolerance:
+        words = (
+            f"not optimal: other weights at the same theta give {100 * inner_gap:.2g} % more "
+            f"bandwidth; {known}"
+        )
+        return Line(State.FAILED, words, figures)
+    words = f"KKT residual {residual:.1e}; {known}"
+    if second_order is not None and second_order < SADDLE:
+        figures["least_curvature"] = second_order
+        words = f"a stationary point that curves downwards ({second_order:.2g}): {words}"
+        return Line(State.WARNED, words, figures)
+    return Line(State.PASSED, words, figures)
+
+
+def predicted(
+    *,
+    error: float,
+    tolerance: float,
+    left_out: float | None = None,
+    left_out_hz: float | None = None,
+    sigmas: float | None = None,
+    extrapolates: Sequence[str] = (),
+    surrogate: bool = True,
+) -> Line:
+    """Surrogate against truth at the design.
+
+    Where the design is itself one of the samples the surrogate reproduces it and `error` shows
+    nothing: `left_out` (relative) is the error there without it, `sigmas` in deviations.
+    """
+    figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
+    if not surrogate:
+        return Line(State.PASSED, "nothing was predicted: IPOPT worked on the truth", figures)
+    if left_out is not None:
+        figures |= {"left_out": left_out, "left_out_hz": left_out_hz, "left_out_sigmas": sigmas}
+    if not error <= tolerance:
+        words = f"prediction and truth differ by {100 * error:.2g} %, more than {tolerance:.0e}"
+        return Line(State.FAILED, words, figures)
+    if left_out is None:
+        words = f"bandwidth predicted to {error:.1e}"
+        if extrapolates:
+            words += f"; the surrogate extrapolates there: {extrapolates[0]}"
+            return Line(State.WARNED, words, figures)
+        return Line(State.PASSED, words, figures)
+    words = (
+        f"the optimum is a training sample; left out, its bandwidth is missed by "
+        f"{left_out_hz:.2g} Hz ({100 * left_out:.2g} %"
+        + (f", {sigmas:.1f} sigma)" if sigmas is not None else ")")
+    )
+    if left_out <= tolerance or (sigmas is not None and sigmas <= SIGMAS and left_out <= 0.01):
+        return Line(State.PASSED, words, figures)
+    return Line(State.WARNED, f"{words}: the samples around do not support the design", figures)
+
+
+def survives(
+    found: Survival | None,
+    *,
+    S_max: float,
+    robust: bool | None = None,
+    robust_words: str = "",
+    closer: Sequence[CloserModel] = (),
+) -> Line:
+    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none)."""
+    if found is None:
+        return Line(State.UNKNOWN, "the loop could not be perturbed", {})
+    state, said = State.PASSED, []
+    low, high = found.stable_shift
+    said.append(f"stable for resonances {_range(low, high)}")
+    if low > -LEAST_SHIFT or high < LEAST_SHIFT:
+        state = State.WARNED
+        said[-1] += f", less than +-{100 * LEAST_SHIFT:g} %"
+    said.append(f"within S_max {_range(*found.S_max_shift)}")
+    damping = found.stable_damping
+    if damping[0] > LEAST_FACTORS[0] or damping[1] < LEAST_FACTORS[1]:
+        state = State.WARNED
+        said.append(f"unstable where damping is not between {damping[0]:.3g} and {damping[1]:.3g}")
+    if found.unstable_poles_hz:
+        state = State.WARNED
+        at = ", ".join(f"{hz:.4g}" for hz in found.unstable_poles_hz[:3])
+        said.append(f"K itself is unstable (poles at {at} Hz)")
+    for model in closer:
+        if model.stable and model.peak > (1.0 + CLOSER_PEAK) * S_max:
+            state = State.WARNED
+            said.append(f"peak of S {model.peak:.3g} on {model.name}")
+    for model in closer:
+        if not model.stable:
+            state = State.FAILED
+            said.insert(0, f"unstable on {model.name}")
+    if robust is not None:
+        said.insert(0, robust_words)
+        if not robust:
+            state = State.FAILED
+    if found.static_share < DIFFERENTIATOR:
+        said.append(
+            f"almost a differentiator: |K(0)| is {100 * found.static_share:.2g} % of its value at "
+            f"the bandwidth, 1 N at rest moves the stage {found.static_compliance:.2g} m"
+        )
+    figures = {
+        "stable_shift": list(found.stable_shift),
+        "S_max_shift": list(found.S_max_shift),
+        "shift_followed_to": REACH,
+        "least_shift": LEAST_SHIFT,
+        "stable_damping": list(found.stable_damping),
+        "damping_followed_to": list(FACTORS),
+        "gain_margin": list(found.gain),
+        "phase_margin_deg": found.phase_deg,
+        "modulus_margin": found.modulus,
+        "unstable_controller_poles_hz": list(found.unstable_poles_hz),
+        "static_stiffness": found.static_stiffness,
+        "static_compliance": found.static_compliance,
+        "static_share": found.static_share,
+        "robust_set": robust,
+        "closer_models": {m.name: {"stable": m.stable, "peak": m.peak} for m in closer},
+    }
+    return Line(state, "; ".join(said), figures)
+
+
+def deployable(found: Survival | None) -> Line:
+    """Before `deploy`: what delay the margins leave, and the rate below which it is used up."""
+    if found is None or not math.isfinite(found.delay):
+        return Line(State.UNKNOWN, "run deploy", {})
+    rate = DELAY_PERIODS / found.delay
+    words = (
+        f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
+        f"and one period of delay alone use it up below {rate:.3g} Hz"
+    )
+    figures = {
+        "delay_margin": found.delay,
+        "phase_margin_deg": found.phase_deg,
+        "unstable_below_rate_hz": rate,
+    }
+    return Line(State.UNKNOWN, words, figures)
+
+
+def verdict_dict(verdict: Verdict) -> dict[str, Any]:
+    """`verdict` of result.json."""
+    return {
+        name: {"state": line.state.value, "words": line.words, **line.figures}
+        for name, line in verdict.lines()
+    }
+
+
+def reason(verdict: Verdict) -> str:
+    """Why a design is not verified, in the words of the lines that failed."""
+    return "; ".join(f"{name}: {getattr(verdict, name).words}" for name in verdict.failed)
+
+
+def _range(low: float, high: float) -> str:
+    beyond = [">" if abs(end) >= 0.999 * REACH else "" for end in (low, high)]
+    return f"{beyond[0]}{100 * low:+.2g} to {beyond[1]}{100 * high:+.2g} %"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")

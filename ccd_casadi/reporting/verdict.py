@@ -1,0 +1,80 @@
+"""The verdict of a run as every command and page shows it: five lines, each with sign and words."""
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.reporting.page import escape
+
+LINES = ("certified", "optimal", "predicted", "survives", "deployable")
+SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}
+BADGES = {State.PASSED: "good", State.WARNED: "warn", State.FAILED: "bad", State.UNKNOWN: "open"}
+WIDTH = 100  # of a terminal line
+
+
+class Shown(NamedTuple):
+    """One line of a stored verdict."""
+
+    name: str
+    state: State
+    words: str
+
+
+def lines_of(result: Mapping[str, Any]) -> tuple[Shown, ...]:
+    """The lines of result.json; none of a run that has no design, or is older than verdicts."""
+    verdict = result.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return ()
+    found = []
+    for name in LINES:
+        line = verdict.get(name)
+        if isinstance(line, Mapping) and line.get("state") in set(State):
+            found.append(Shown(name, State(line["state"]), str(line.get("words", ""))))
+    return tuple(found)
+
+
+def worst(result: Mapping[str, Any]) -> State:
+    """Failed before warned before passed; what is unknown counts as neither."""
+    states = {line.state for line in lines_of(result)}
+    return next((s for s in (State.FAILED, State.WARNED) if s in states), State.PASSED)
+
+
+def terminal_lines(result: Mapping[str, Any]) -> list[str]:
+    """`survives      warned   stable for ...`, wrapped under their words."""
+    found = []
+    for line in lines_of(result):
+        head = f"{line.name:14s}{line.state.value:9s}"
+        found += textwrap.wrap(
+            line.words, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)
+        )
+    return found
+
+
+def short(result: Mapping[str, Any]) -> str:
+    """What did not pass, in a few words: `survives warned`."""
+    return ", ".join(
+        f"{line.name} {line.state.value}"
+        for line in lines_of(result)
+        if line.state in (State.FAILED, State.WARNED)
+    )
+
+
+def head_words(result: Mapping[str, Any]) -> str:
+    """What stands beside the badge of a verified run: never more than its lines say."""
+    warned = [line.name for line in lines_of(result) if line.state is State.WARNED]
+    if not warned:
+        checks = ", ".join(result.get("checks", {})).replace("_", " ")
+        return f"all checks passed: {checks}"
+    return f"with warnings: {', '.join(warned)}"
+
+
+def verdict_html(result: Mapping[str, Any]) -> str:
+    """The five lines as a table; nothing where there is no verdict."""
+    rows = "\n".join(
+        f'<tr><th scope="row">{escape(line.name)}</th><td><span class="badge {BADGES[line.state]}">'
+        f"{SIGNS[line.state]} {escape(line.state.value)}</span></td><td>{escape(line.words)}</td>"
+        "</tr>"
+        for line in lines_of(result)
+    )
+    return f'<table class="wide verdict"><tbody>{rows}</tbody></table>' if rows else ""
