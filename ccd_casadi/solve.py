@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of, write_run
+from ccd_casadi.codesign.run import (
+    FORMULATIONS,
+    Solution,
+    co_design,
+    formulation_of,
+    resolved,
+    write_run,
+)
 from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.registry import SHIPPED
@@ -86,7 +93,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         write_run(folder, case, solution)
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    write_report(folder, case, problem, solution)
+    write_report(folder, resolved(case, solution), solution.problem or problem, solution)
     code = _CODES[solution.result["status"]]
     if not options.quiet:
         print(summary(solution))

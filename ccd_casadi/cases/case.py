@@ -372,7 +372,8 @@ def _robust(section: RobustSection) -> RobustSet | None:
     shift = section.resonance_shift
     if shift == 0.0 and not section.damping:
         return None
-    design = {"low": -shift, "nominal": 0.0, "high": shift}[section.design_at]
+    ends = {"auto": None if shift else 0.0, "low": -shift, "nominal": 0.0, "high": shift}
+    design = ends[section.design_at]
     return RobustSet(shift, section.shifts if shift else 1, section.damping, design)
 
 

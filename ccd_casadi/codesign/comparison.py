@@ -62,12 +62,23 @@ def compare(
     methods = [
         _formulation(case, problem, folder, workers, name, seed, quiet) for name in FORMULATIONS
     ]
+    problem = _chosen(problem, methods)
     descents = _descents(case, problem, workers, seed, quiet)
     for gradient in Gradient:
         methods.append(_best_descent(problem, descents, gradient))
     for name, starts in (("sequential", 0), ("sequential_global", 8)):
         methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
+
+
+def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
+    """The problem with the design plant of the best formulation, where the case leaves it open."""
+    solved = [m for m in methods if m.solution is not None and m.solution.problem is not None]
+    if problem.robust is None or problem.robust.design_shift is not None or not solved:
+        return problem
+    best = min(solved, key=lambda m: m.figures.get("objective", np.inf))
+    assert best.solution is not None
+    return best.solution.problem or problem
 
 
 def _formulation(

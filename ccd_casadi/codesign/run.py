@@ -1,7 +1,7 @@
 """One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -39,12 +40,16 @@ Formulation = Nested | Lifted | Direct
 
 @dataclass(frozen=True)
 class Solution:
-    """Everything a run found: the JSON result, and the objects behind it (None: infeasible)."""
+    """Everything a run found: the JSON result, and the objects behind it (None: infeasible).
+
+    `problem` is the one solved: of a robust case that leaves its design plant open, the best one's.
+    """
 
     result: dict[str, Any]
     outcome: FormulationResult
     verified: VerifiedDesign | None
     quality: tuple[Quality, ...] = ()
+    problem: CoDesignProblem | None = None
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -97,22 +102,30 @@ def solve(
 def co_design(
     sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
 ) -> Solution:
-    """Run one formulation on a sampler, verify and polish its design on the truth."""
+    """Run one formulation on a sampler, verify and polish its design on the truth.
+
+    A robust problem that leaves its design plant open is solved for each, and the best one kept.
+    """
     began = perf_counter()
     name = type(formulation).__name__.lower()
+
+    def verified(each: Sampler, outcome: FormulationResult) -> Solution:
+        return conclude(each, name, outcome, formulation.tolerance, seed, began)
+
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
-        outcome = FormulationResult(None, None, (), (), None, False, forbidden)
-    else:
+        return verified(sampler, FormulationResult(None, None, (), (), None, False, forbidden))
+
+    def solved(each: Sampler) -> Solution:
         if isinstance(formulation, Nested):
-            outcome = solve_nested(sampler, formulation, seed=seed, given=given)
+            outcome = solve_nested(each, formulation, seed=seed, given=given)
         elif isinstance(formulation, Lifted):
-            outcome = solve_lifted(sampler, formulation, seed=seed, given=given)
+            outcome = solve_lifted(each, formulation, seed=seed, given=given)
         else:
-            outcome = solve_direct(sampler, formulation, seed=seed)
-        if outcome.x is None:
-            outcome = rescue(sampler, outcome, seed)
-    return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
+            outcome = solve_direct(each, formulation, seed=seed)
+        return verified(each, rescue(each, outcome, seed) if outcome.x is None else outcome)
+
+    return best_over_design_plants(sampler, solved, verified)
 
 
 def conclude(
@@ -166,11 +179,22 @@ def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> Formulati
     )
 
 
+def resolved(case: Case, solution: Solution) -> Case:
+    """The case with the design plant that was found best, where it left that open."""
+    if solution.problem is None or solution.problem.robust is None:
+        return case
+    robust = replace(case.robust, design_at=solution.problem.robust.design_at)
+    return replace(case, robust=robust)
+
+
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
-    """Write what a run folder holds besides samples and report; clear an earlier run's."""
+    """Write what a run folder holds besides samples and report; clear an earlier run's.
+
+    The case in it names the design plant that was found best, so that what works on the run does.
+    """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
-    text = case_to_toml(case)
+    text = case_to_toml(resolved(case, solution))
     draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
     draft.write_text(text, encoding="utf-8")
     os.replace(draft, folder / "case.toml")
