@@ -10,6 +10,7 @@ from ccd_casadi.robust.setpoint import Limits
 from ccd_casadi.robust.study import Demands, robustness, study_dict
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.optional_packages import require
 
 _DEFAULT = Demands()
 _MOVE = (
@@ -25,6 +26,7 @@ _MOVE = (
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     began = perf_counter()
+    require("slycot", "slicot")  # margins and the structured bound need it: before anything else
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
     if options.axis > outputs:

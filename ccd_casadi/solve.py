@@ -3,10 +3,12 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 
 from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
+from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
 from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.unit_findings import peak_words, unit_findings
 from ccd_casadi.codesign.run import (
     FORMULATIONS,
     Solution,
@@ -17,7 +19,11 @@ from ccd_casadi.codesign.run import (
 )
 from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.facts import facts_of
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.registry import SHIPPED
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -62,13 +68,27 @@ def summary(solution: Solution) -> str:
 def show_findings(case: Case, problem: CoDesignProblem) -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     if case.plant.model in SHIPPED:
+        for words in peak_words(problem.inner.S_max):
+            print(f"warning: {words}", file=sys.stderr)
         return
     found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
     for item in found:
         if item.severity is not Severity.NOTE:
-            print(f"{item.severity.value}: plant: {item.words}", file=sys.stderr)
+            subject = "" if item.topic is Topic.UNITS else "plant: "
+            print(f"{item.severity.value}: {subject}{item.words}", file=sys.stderr)
     for words in plant_of(problem).notes(problem.start):
         print(f"note: {words}", file=sys.stderr)
+
+
+def with_units(solution: Solution, problem: CoDesignProblem) -> Solution:
+    """The solution, a failed one's reason with what looks like a wrong unit."""
+    if solution.result["status"] == "verified":
+        return solution
+    modal = modal_plant(mechanics(plant_of(problem), problem.start), problem.suspension)
+    scaled = scale_plant(modal, problem.weights.M_K)
+    found = unit_findings(problem, facts_of(problem.start, modal, scaled), scaled)
+    words = [solution.result["reason"], *(item.words for item in found)]
+    return replace(solution, result=solution.result | {"reason": "; ".join(filter(None, words))})
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -89,7 +109,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     ):
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
         formulation = formulation_of(case, options.formulation)
-        solution = co_design(sampler, formulation, options.seed, given)
+        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
         write_run(folder, case, solution)
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 

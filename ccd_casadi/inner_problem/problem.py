@@ -18,7 +18,7 @@ import numpy as np
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.differenced import own_plant
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import ModelFunction, Plant, build_plant, mechanics
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
@@ -237,6 +237,7 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
 
     def scaled(*perturbation: Perturbation) -> ScaledPlant:
         modal = modal_plant(system, problem.suspension, *perturbation)
+        require_damping(modal)
         return scale_plant(modal, problem.weights.M_K)
 
     nominal, robust = scaled(), problem.robust
