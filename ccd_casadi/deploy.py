@@ -98,6 +98,8 @@ def _summary(run: FinishedRun, found: Deployment) -> str:
         peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
         words = f"{1 + len(found.members)} plants, {count} simulated: {peak}"
         lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
+    if found.statics is not None:
+        lines.append(("at rest", found.statics.words))
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 

@@ -99,6 +99,8 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
             "periods": measured.periods,
             "leftover": measured.leftover,
         },
+        "static_stiffness": None if found.statics is None else found.statics.stiffness,
+        "static_compliance": None if found.statics is None else found.statics.compliance,
         "robust": None
         if not found.members
         else {

@@ -42,6 +42,7 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.statics import Statics, sampled_statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 # A reduced controller keeps S_max to 0.5 % (it binds at most optima, where any change passes it a
@@ -121,6 +122,7 @@ class Deployment:
     members: tuple[MemberLoop, ...] = ()
     measured_members: tuple[tuple[Perturbation, MeasuredSensitivity], ...] = ()
     unverified: str = ""
+    statics: Statics | None = None
 
     @property
     def order(self) -> int:
@@ -251,7 +253,7 @@ def deploy(
     return Deployment(
         orders, limits, reduced, reduced_figures, trials, target, rate, delay,
         best.conversion, held, realisation, sampled, measured, tuple(checked), simulated,
-        _unverified(run),
+        _unverified(run), _statics(run, realisation.system),
     )  # fmt: skip
 
 
@@ -259,6 +261,11 @@ def _unverified(run: FinishedRun) -> str:
     """Why the run is not verified; empty where it is, or where no run is behind the design."""
     status = run.result.get("status", "verified")
     return "" if status == "verified" else str(run.result.get("reason") or status)
+
+
+def _statics(run: FinishedRun, K: DiscreteStateSpace) -> Statics:
+    at = K.response(np.array([run.figures.bandwidth]))[0]
+    return sampled_statics(run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), at)
 
 
 class _Loops:

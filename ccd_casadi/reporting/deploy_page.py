@@ -62,12 +62,13 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     before = " + ".join(str(item.rows[0].order) for item in found.orders)
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
+    rest = "" if found.statics is None else f" {found.statics.words}"
     return (
         f"{orders} states instead of {before} (synthesised: {len(run.controller.A)}), at "
         f"{number(found.rate_hz)} Hz with a delay of "
         f"{number(1e6 * found.delay, 4)} µs: bandwidth {number(K.bandwidth / HZ)} Hz "
         f"({_percent(K.bandwidth, full.bandwidth)}), peak of S {number(K.sensitivity_peak)} "
-        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max)."
+        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max).{rest}"
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.robust.structured import diagonal_mu
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
@@ -80,6 +81,19 @@ def margins(
         to_control(named_controller(controller)),
     )
     return Margins(tuple(loops), _together(g * k, hz), _together(k * g, hz))
+
+
+def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
+    """The same from responses alone, of a sampled loop up to half its rate."""
+    loops, together = [], []
+    for name, L in (("output", G @ K), ("input", K @ G)):
+        S = np.linalg.inv(np.eye(L.shape[1]) + L)
+        for i in range(L.shape[1]):
+            loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
+        alpha = 1.0 / np.array([diagonal_mu(s - 0.5 * np.eye(len(s))) for s in S])
+        worst = int(alpha.argmin())
+        together.append(DiskMargin(float(alpha[worst]), float(hz[worst])))
+    return Margins(tuple(loops), together[0], together[1])
 
 
 def _loop(name: str, hz: Array, L: NDArray) -> LoopMargins:

@@ -75,7 +75,7 @@ def structured_bound(
     for _ in range(1 + ROUNDS):
         K = responses(plant, controller, 2.0 * np.pi * new)[1]
         M = [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
-        mu = np.array([_mu(m) for m in M])
+        mu = np.array([diagonal_mu(m) for m in M])
         known = np.vstack([known, np.column_stack([new, mu])])
         for i in np.argsort(-mu):
             if not _stands(M[i], allowed):
@@ -96,7 +96,7 @@ def _errors(modal: ModalPlant, kept: NDArray[np.intp], omega: float, K: NDArray)
     return -root[:, None] * np.linalg.inv(Z)[np.ix_(kept, kept)] * root
 
 
-def _mu(M: NDArray) -> float:
+def diagonal_mu(M: NDArray) -> float:
     """Upper bound for complex scalars on the diagonal."""
     ones = np.ones(len(M), dtype=int)
     return float(require("slycot", "slicot").ab13md(M, ones, COMPLEX * ones)[0])
@@ -107,7 +107,7 @@ def _stands(M: NDArray, r: float) -> bool:
     side = np.where(np.diag(M).imag < 0.0, -1.0, 1.0)
     for kappa in KAPPA:
         turned = np.linalg.solve(np.eye(len(M)) - 1j * kappa * r * M * side, M)
-        if _mu(turned * (r * np.sqrt(1.0 + kappa**2))) < 1.0:
+        if diagonal_mu(turned * (r * np.sqrt(1.0 + kappa**2))) < 1.0:
             return True
     return False
 
