@@ -35,6 +35,7 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
+UNSEEN = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))
 SECTIONS = {
     "lead": (("zero_hz", "pole_hz"), ()),
     "notch": (("zero_hz", "zero_damping", "pole_hz", "pole_damping"), ()),
@@ -178,14 +179,15 @@ def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
                 raise UserError(f"{path}: {place}: give {', '.join((*needed, *optional))}")
             values = {key: number(f"{place}: {key}", value) for key, value in row.items()}
             found = _series(found, _section(values))
-    return found
+    # a gain alone gets a state that nothing sees: what certifies a loop expects one
+    return found if len(found.A) else _series(found, UNSEEN)
 
 
 def _section(v: Mapping[str, float]) -> StateSpace:
     """(b₂s² + b₁s + 1)/(a₂s² + a₁s + 1) of a row, in observer form."""
-    b, a = _polynomial(v, "zero"), _polynomial(v, "pole")
-    order = 2 if a[0] else 1
-    a, b = (np.array(part[2 - order :]) / (a[2 - order]) for part in (a, b))
+    zeros, poles = np.array(_polynomial(v, "zero")), np.array(_polynomial(v, "pole"))
+    order = 2 if poles[0] else 1
+    b, a = (part[2 - order :] / poles[2 - order] for part in (zeros, poles))
     D = b[0]
     rest = b[1:] - a[1:] * D
     A = np.zeros((order, order))

@@ -240,7 +240,8 @@ def deploy(
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
     progress("simulation")
-    measured, simulated = None, ()
+    measured: MeasuredSensitivity | None = None
+    simulated: tuple[tuple[Perturbation, MeasuredSensitivity], ...] = ()
     if sampled.stable and all(item.figures.stable for item in checked):
         shown = {item.at for item in family}
         if checked:

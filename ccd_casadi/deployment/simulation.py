@@ -106,8 +106,8 @@ def measure_set(
 
 
 def _beside(systems: Sequence[DiscreteStateSpace]) -> DiscreteStateSpace:
-    parts = [block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD"]
-    return DiscreteStateSpace(*parts, systems[0].period)
+    A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
+    return DiscreteStateSpace(A, B, C, D, systems[0].period)
 
 
 def _crossing(omega: Array, gain: Array) -> float:

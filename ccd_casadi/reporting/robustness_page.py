@@ -95,7 +95,7 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     if run.period:
         words.append(
             f"A controller in discrete time, a step every {1e6 * run.period:.5g} µs, hold and "
-            "delay exact. Noise, the structured singular value and moves are of continuous ones only."
+            "delay exact; noise, the structured singular value and moves are of continuous ones."
         )
     return words
 
