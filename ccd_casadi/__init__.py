@@ -25,7 +25,7 @@ _PUBLIC = {
     "Lifted": "codesign.lifted",
     "Nested": "codesign.nested",
     "Plant": "plants.plant",
-    "Solution": "codesign.run",
+    "Solution": "codesign.solution",
     "StateSpace": "plants.scaling",
     "TrueQuantities": "inner_problem.true_function",
     "UserError": "support.errors",

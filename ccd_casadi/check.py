@@ -39,6 +39,11 @@ def text(found: dict[str, Any]) -> str:
         f"{share:.2g} of the first resonance"
         for item, share in zip(found["M_K_for_bandwidth"], SHARES, strict=False)
     ]
+    lines += [
+        f"constraint    {item['name']}: {item['value']:.4g} at the start, "
+        + ("met (0 or less)" if item["met"] else "NOT met (it is where it is 0 or less)")
+        for item in found["constraints"]
+    ]
     lines += [f"{item['severity']:13s} {item['words']}" for item in found["findings"]]
     if not found["findings"]:
         lines.append("findings      none")

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import UserError, one_line
+from ccd_casadi.support.optional_packages import require
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from surrogates.options import number, positive
@@ -27,7 +28,15 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
     from ccd_casadi.deployment.pipeline import deploy
 
+    require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
+    status = finished.result.get("status")
+    if status != "verified" and not options.unverified:
+        reason = finished.result.get("reason") or "no reason is given"
+        words = f"the run is {status}: {reason}"
+        remedy = "solve it better, or give --unverified to look at it all the same"
+        print(one_line(f"{options.run}: {words}; {remedy}"), file=sys.stderr)
+        return ExitCode.NOT_VERIFIED
     folder = run_folder(options.run, options.out or options.run / "deploy")
     if folder.resolve() == options.run.resolve():
         words = "would overwrite the run's own controller and report"
@@ -46,7 +55,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     for name in (*DESIGN_FILES, *C_FILES):  # an earlier controller must not pass for this one
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed)
-    if found.sampled.stable:
+    if found.stable:
         write_c(
             folder, found.realisation, title=options.run.resolve().name, delay=found.delay,
             verified=found.passed,
@@ -59,18 +68,21 @@ def command(options: argparse.Namespace) -> ExitCode:
     write_report(folder / "report.html", finished, found)
     if found.passed:
         return ExitCode.DONE
-    print(f"not verified: {_shortfall(found)}", file=sys.stderr)
+    print(one_line(f"not verified: {_shortfall(finished, found)}"), file=sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
+    from ccd_casadi.deployment.robust_set import place_words
+    from ccd_casadi.deployment.words import status_words
+
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
     )  # fmt: skip
     orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
     lines = [
-        ("status", "verified" if found.passed else "not verified"),
+        ("status", status_words(run, found)),
         ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
         ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
         ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),
@@ -78,7 +90,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
                     f"{found.conversion.label}; needed {needed}"),
     ]  # fmt: skip
     if measured is None:
-        lines.append(("", f"unstable: spectral radius {sampled.spectral_radius:.6g}"))
+        lines.append(("", found.shortfalls[0]))
     else:
         for name, figures in (("", sampled), ("simulated", measured)):
             lines.append((
@@ -89,14 +101,28 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
                 f"({100 * (figures.sensitivity_peak / run.problem.inner.S_max - 1):+.2f} % of "
                 "S_max)",
             ))  # fmt: skip
+    if found.members:
+        worst, count = found.worst, 1 + len(found.measured_members)
+        peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
+        words = f"{1 + len(found.members)} plants, {count} simulated: {peak}"
+        lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
+    if found.statics is not None:
+        lines.append(("at rest", found.statics.words))
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 
-def _shortfall(found: "Deployment") -> str:
-    rate = f"{found.rate_hz:.6g} Hz"
-    if found.needed_hz is None:
-        return f"{rate} is not enough, and with this delay no rate is; shorten the delay"
-    return f"{rate} is not enough for {found.conversion.label}: {found.needed_hz:.6g} Hz is needed"
+def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
+    """What is not kept, and at which rate it would be."""
+    if not found.shortfalls:
+        return f"the run itself is not: {found.unverified}"
+    rate = f"{found.rate_hz:.6g} Hz with {found.conversion.label}"
+    ways = "" if len(found.trials) == 1 else f", the best of {len(found.trials)} ways,"
+    words = f"{rate}{ways} is not enough: {found.shortfalls[0]}"
+    possible = [t for t in found.trials if t.needed_hz is not None]
+    if not possible:
+        return f"{words}; with this delay no rate is; shorten the delay"
+    least = min(possible, key=lambda t: t.needed_hz or 0.0)
+    return f"{words}; {least.needed_hz:.6g} Hz is needed ({least.conversion.label})"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -124,6 +150,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--lead", choices=list(LEADS), default="auto",
         help="a lead that makes up for hold and delay (default: where it lowers the rate)",
+    )  # fmt: skip
+    arguments.add_argument(
+        "--unverified", action="store_true",
+        help="go on with a run that is not verified; its controller is never called so",
     )  # fmt: skip
     arguments.add_argument(
         "--saturation", metavar="NEWTON", type=positive,

@@ -20,7 +20,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
     from ccd_casadi.codesign.result import write_json
-    from ccd_casadi.inner_problem.problem import plant_of, true_inner
+    from ccd_casadi.inner_problem.problem import best_choice, plant_of
     from ccd_casadi.plants.plant import hardware_cost
 
     case = load_case(options.case)
@@ -38,15 +38,18 @@ def command(options: argparse.Namespace) -> ExitCode:
     rows: tuple[DesignFigures, ...] = ()
     if single[0] is not None:
         point = (HZ * single[0], HZ * single[1])
+        problem = _best_at(problem, theta, point)
         syntheses, shortfall = 1, ""
     else:
-        found = true_inner(problem, theta)
+        problem, found = best_choice(problem, theta)
         syntheses, shortfall, rows = found.syntheses, found.shortfall, found.rows
         if found.optimum is None:
             answer = head | {"status": "infeasible", "reason": shortfall, "syntheses": syntheses}
             _print(answer, rows, options, began)
             return ExitCode.INFEASIBLE
         point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
+    if problem.robust is not None:
+        head["design_at"] = problem.robust.design_at
     code, answer, controller = _design(problem, theta, point)
     answer = head | answer | {"syntheses": syntheses}
     answer["objective"] = problem.w1 * cost + problem.w2 * HZ * (answer["bandwidth_hz"] or 0.0)
@@ -55,6 +58,20 @@ def command(options: argparse.Namespace) -> ExitCode:
         write_json(folder / "controller.json", controller)
     _print(answer, rows, options, began)
     return code
+
+
+def _best_at(
+    problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
+) -> "CoDesignProblem":
+    """The problem with the design plant whose controller has the least peak of S there."""
+    import numpy as np
+
+    from ccd_casadi.inner_problem.problem import design_choices, true_design
+
+    def peak(choice: "CoDesignProblem") -> float:
+        return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
+
+    return min(design_choices(problem), key=peak)
 
 
 def _design(

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 from time import perf_counter
 
 from ccd_casadi.robust.demands import Demands, Limits
@@ -27,6 +28,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import versions, write_json
+    from ccd_casadi.deployment.given_controller import with_controller
     from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
 
     began = perf_counter()
@@ -37,7 +39,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     if not options.damping[0] <= 1.0 <= options.damping[1]:
         low, high = options.damping
         raise UserError(f"--damping: is {low:g} {high:g}; give a factor up to 1 and one from 1")
-    folder = run_folder(options.run, options.out or options.run)
+    place = options.out or options.run
+    if options.controller is not None:
+        finished = with_controller(finished, options.controller)
+        if options.out is None:  # the run's own page stays
+            place = options.run / f"robustness_{options.controller.stem}"
+    folder = run_folder(options.run, place)
     demands = Demands(
         shift=options.shift / 100.0,
         damping=tuple(options.damping),
@@ -85,6 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "ccd_casadi.robustness", "Margins, plants off the model, noise and a move of a design."
     )
     add = arguments.add_argument
+    words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
+    add("--controller", type=Path, metavar="FILE", help=words)
     add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
     add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
         help="factors of the damping; default 0.5 2")  # fmt: skip

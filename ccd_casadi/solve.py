@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ccd_casadi.codesign import FORMULATIONS
@@ -11,7 +12,7 @@ from ccd_casadi.support.process_pool import PATIENCE
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
-    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.codesign.solution import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 _CODES = {
@@ -54,24 +55,46 @@ def summary(solution: "Solution") -> str:
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
-    from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
+    from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
+    from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import SHIPPED
 
     if case.plant.model in SHIPPED:
+        for words in peak_words(problem.inner.S_max):
+            print(f"warning: {words}", file=sys.stderr)
         return
     found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
     for item in found:
         if item.severity is not Severity.NOTE:
-            print(f"{item.severity.value}: plant: {item.words}", file=sys.stderr)
+            subject = "" if item.topic is Topic.UNITS else "plant: "
+            print(f"{item.severity.value}: {subject}{item.words}", file=sys.stderr)
     for words in plant_of(problem).notes(problem.start):
         print(f"note: {words}", file=sys.stderr)
+
+
+def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
+    """The solution, a failed one's reason with what looks like a wrong unit."""
+    from ccd_casadi.cases.unit_findings import unit_findings
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.plants.facts import facts_of
+    from ccd_casadi.plants.modal import modal_plant
+    from ccd_casadi.plants.plant import mechanics
+    from ccd_casadi.plants.scaling import scale_plant
+
+    if solution.result["status"] == "verified":
+        return solution
+    modal = modal_plant(mechanics(plant_of(problem), problem.start), problem.suspension)
+    scaled = scale_plant(modal, problem.weights.M_K)
+    found = unit_findings(problem, facts_of(problem.start, modal, scaled), scaled)
+    words = [solution.result["reason"], *(item.words for item in found)]
+    return replace(solution, result=solution.result | {"reason": "; ".join(filter(None, words))})
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case, problem_of
-    from ccd_casadi.codesign.run import co_design, formulation_of, write_run
+    from ccd_casadi.codesign.run import co_design, formulation_of, resolved, write_run
     from ccd_casadi.codesign.stored import named_surrogate
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.sampling.cluster import pool
@@ -94,7 +117,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     ):
         sampler = Sampler(problem, samples, workers, quiet=options.quiet)
         formulation = formulation_of(case, options.formulation)
-        solution = co_design(sampler, formulation, options.seed, given)
+        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
         write_run(folder, case, solution)
     code = _CODES[solution.result["status"]]
     if not options.quiet:
@@ -102,7 +125,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"run folder    {folder}")
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    write_report(folder, case, problem, solution)
+    write_report(folder, resolved(case, solution), solution.problem or problem, solution)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code

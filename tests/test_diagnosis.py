@@ -3,11 +3,15 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from ccd_casadi.cases.case import CaseError, load_case, problem_of
-from ccd_casadi.cases.diagnosis import Topic, diagnose
+from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose
 from ccd_casadi.check import main as check
+from ccd_casadi.plants.facts import Zero
+from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
 from ccd_casadi.solve import main as solve
 
 ROOT = Path(__file__).parent.parent
@@ -125,9 +129,12 @@ def test_a_zero_in_the_right_half_plane_is_a_warning(tmp_path: Path) -> None:
     problem = problem_of(load_case(case_file(tmp_path, lever)))
     words = [f.words for f in diagnose(problem)[1] if f.topic is Topic.ZERO]
     assert "right half-plane" in words[0]
-    # 10 X2/F - 9 X1/F = 0 at s² = k/(9 m2), damping neglected
-    hz = (2e8 / 9 / 67.56) ** 0.5 / 6.283185307
-    assert f"{hz:.4g}"[:3] in words[0]
+    # 10 X2/F - 9 X1/F = 0 at s² = k/(9 m2), damping neglected: lowest at the heaviest m2, once
+    hz = (2e8 / 9 / 70.0) ** 0.5 / 6.283185307
+    told = float(words[0].split("half-plane at ")[1].split()[0])
+    assert told == pytest.approx(hz, rel=5e-3)
+    assert "m2=70" in words[0]
+    assert sum("right half-plane" in text for text in words) == 1
 
 
 def test_solve_tells_what_is_serious_unless_it_is_quiet(
@@ -141,3 +148,107 @@ def test_solve_tells_what_is_serious_unless_it_is_quiet(
     assert "warning: plant: the mode at" in capsys.readouterr().err
     assert solve([*words, "--quiet"]) == 3
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_an_undamped_mode_is_told_by_its_frequency(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    undamped = GOOD.replace("'damping_ratio': 0.01", "'damping': DAMPING")
+    path = case_file(tmp_path, undamped.replace("DAMPING", "ca.DM.zeros(2, 2)"))
+    assert check([str(path)]) == 2
+    hz = (2e8 * 2 / 67.56) ** 0.5 / 6.283185307
+    assert f"the mode at {hz:.5g} Hz is not damped" in capsys.readouterr().err
+    # one that reaches the flexible mode will do, however little
+    (tmp_path / "some").mkdir()
+    some = undamped.replace("DAMPING", "1e-3 * chain")
+    assert check([str(case_file(tmp_path / "some", some))]) == 0
+
+
+FLIPPING = (
+    "    import numpy as np\n    M, K = np.diag([m1, m2]), 2e8 * np.array([[1.0, -1], [-1, 1]])\n"
+    "    root = np.diag(np.diag(M) ** -0.5)\n"
+    "    w, V = np.linalg.eigh(root @ K @ root)\n    V = root @ V * np.array([1.0, SIGN])\n"
+)
+MODAL = (
+    "{'mass': np.eye(2), 'stiffness': np.diag(np.maximum(w, 0)), 'damping_ratio': 0.01,"
+    " 'input': V.T[:, :1], 'output': V[:1], 'hardware_cost': m1 + m2}"
+)
+
+
+def test_eigenvectors_whose_sign_flips_are_an_error_by_name(tmp_path: Path) -> None:
+    """Values are those of one plant everywhere; its derivatives are of none."""
+    good = case_file(tmp_path, MODAL, before=FLIPPING.replace("SIGN", "1.0"))
+    problem_of(load_case(good))
+    (tmp_path / "flip").mkdir()
+    sign = "np.sign(np.sin(1e6 * m1 + 0.3))"
+    path = case_file(tmp_path / "flip", MODAL, before=FLIPPING.replace("SIGN", sign))
+    with pytest.raises(CaseError) as caught:
+        problem_of(load_case(path))
+    words = str(caught.value)
+    assert "the derivative of input to m1" in words or "the derivative of output to m1" in words
+    assert "eigenvectors whose sign" in words
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("M_K = 2e7", "M_K = 20.0"), "times too small"),
+        (("M_K = 2e7", "M_K = 2e13"), "times too large"),
+        (("S_max = 1.75", "S_max = 6.0"), "was 6 dB meant? Then write 1.995"),
+    ],
+)
+def test_what_looks_like_another_unit_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], words: str
+) -> None:
+    path = case_file(tmp_path, GOOD)
+    assert check([str(path)]) == 0
+    assert "unit" not in capsys.readouterr().out
+    text = path.read_text()
+    assert change[0] in text
+    path.write_text(text.replace(*change))
+    assert check([str(path)]) == 0
+    assert words in capsys.readouterr().out
+
+
+def test_a_stiffness_in_newton_per_micrometre_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = case_file(tmp_path, GOOD.replace("2e8 * chain", "200.0 * chain"))
+    assert check([str(path)]) == 0
+    assert "is the stiffness in another unit?" in capsys.readouterr().out
+
+
+def test_constraints_are_shown_with_what_their_sign_means(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = "|{'constraints': {'light': m1 - 60, 'heavy': 50 - m1}}"
+    assert check([str(case_file(tmp_path, GOOD + more))]) == 0
+    out = capsys.readouterr().out
+    assert "light: 7.56 at the start, NOT met" in out
+    assert "heavy: -17.56 at the start, met (0 or less)" in out
+
+
+def test_a_zero_of_the_suspension_is_no_limit(tmp_path: Path) -> None:
+    """Force on one mass, sensor on the other: no zero but the suspension's."""
+    far = GOOD + "|{'output': ca.DM([[0, 1]])}"
+    slow = case_file(tmp_path, far.replace("2e8", "60.0"))
+    slow.write_text(slow.read_text().replace("M_K = 2e7", "M_K = 30.0"))
+    found = [f for f in diagnose(problem_of(load_case(slow)))[1] if f.topic is Topic.ZERO]
+    right = [f for f in found if "right half-plane" in f.words]
+    assert right
+    assert all("is the suspension's" in f.words for f in right)
+    assert all(f.severity is Severity.NOTE for f in right)
+
+
+@pytest.mark.parametrize("damping", [-1.0, -0.4, -0.02])
+def test_the_proven_limit_is_poissons_integral(damping: float) -> None:
+    """Half a period of weight on either side, by quadrature."""
+    zero = Zero(7.0, damping, 1.0)
+    limit, M = bandwidth_limit_hz(zero, 1.8), 1.8
+    x, y = 7.0 * -damping, 7.0 * (1.0 - damping**2) ** 0.5
+
+    def weight(w: float) -> float:
+        return x / (x**2 + (w - y) ** 2) + x / (x**2 + (w + y) ** 2)
+
+    near = quad(weight, 0.0, limit, limit=500, points=[min(y, limit)])[0]
+    assert (np.pi - near) * np.log(M) == pytest.approx(0.5 * np.log(2.0) * near, rel=1e-5)

@@ -12,7 +12,8 @@ import pytest
 
 from ccd_casadi.cases.case import Case, load_case, problem_of
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.run import Solution, co_design, formulation_of
+from ccd_casadi.codesign.run import co_design, formulation_of
+from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines

@@ -39,6 +39,9 @@ from ccd_casadi.support.errors import PlantError, UserError, described, one_line
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.weights import Weights
 
+DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
+EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
+
 
 class CaseError(UserError):
     """One line: file, key, what is wrong, what to do."""
@@ -88,7 +91,13 @@ def load_case(path: str | Path) -> Case:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # some editors write a byte-order mark
     except FileNotFoundError:
-        raise fail("there is no such file; name a case file (TOML)") from None
+        words = "there is no such file; name a case file (TOML)"
+        if str(path) == DEFAULT_CASE:
+            words = (
+                f"there is no such file: it is the default in a clone of the project, and none was "
+                f"named; name a case file of your own: {EXAMPLE}"
+            )
+        raise fail(words) from None
     except UnicodeDecodeError as error:
         line = error.object.count(b"\n", 0, error.start) + 1
         raise fail(f"line {line} is not UTF-8 text; save the file as UTF-8") from None
@@ -387,7 +396,8 @@ def _robust(section: RobustSection) -> RobustSet | None:
     shift = section.resonance_shift
     if shift == 0.0 and not section.damping:
         return None
-    design = {"low": -shift, "nominal": 0.0, "high": shift}[section.design_at]
+    ends = {"auto": None if shift else 0.0, "low": -shift, "nominal": 0.0, "high": shift}
+    design = ends[section.design_at]
     return RobustSet(shift, section.shifts if shift else 1, section.damping, design)
 
 

@@ -73,7 +73,7 @@ def points(value: Any) -> str | None:
 def steps(value: Any) -> str | None:
     if isinstance(value, list | tuple) and value and all(FRACTION(v) is None for v in value):
         return None
-    return f"is {shown(value)}; give a list of numbers between 0 and 1"
+    return f"is {shown(value)}; give a list of numbers between 0 and 1, both exclusive"
 
 
 def factors(value: Any) -> str | None:
@@ -114,5 +114,5 @@ def shown(value: Any) -> str:
 
 ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
-FRACTION = number(0.0, 1.0, "give a number between 0 and 1")
+FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, math.inf, "give a number above 1")

@@ -5,54 +5,28 @@ design can be made with; warnings what a designer must know; notes what explains
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from functools import lru_cache
 from itertools import product
 
 import numpy as np
 
+from ccd_casadi.cases.findings import Finding as Finding
+from ccd_casadi.cases.findings import Severity as Severity
+from ccd_casadi.cases.findings import Topic as Topic
+from ccd_casadi.cases.unit_findings import unit_findings
+from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
-from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
+from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Plant, mechanics, theta_words
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
 
 MAX_CORNERS = 16
+CHECKED = 2  # of the points, start and middle: where derivatives by differences are looked at
 HIDDEN = 1e-6  # a mode whose gain is below this share of the largest is not driven, or measured
 COUPLED = 1e-9  # a share of the modes' own damping above which a damper connects modes
-LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
-
-
-class Severity(StrEnum):
-    """How much a finding matters."""
-
-    ERROR = "error"
-    WARNING = "warning"
-    NOTE = "note"
-
-
-class Topic(StrEnum):
-    """What a finding is about."""
-
-    MATRICES = "matrices"
-    RIGID_MODES = "rigid modes"
-    HIDDEN_MODE = "hidden mode"
-    ZERO = "transmission zero"
-    DOMAIN = "domain"
-    EFFORT = "control effort"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One sentence about the plant; `index` of the θ where it was seen, among those looked at."""
-
-    severity: Severity
-    topic: Topic
-    words: str
-    index: int
 
 
 def points_to_check(problem: CoDesignProblem) -> list[tuple[float, ...]]:
@@ -87,16 +61,24 @@ def diagnose(
         try:
             system = mechanics(plant, theta, derivatives=index == 0)
             modal = modal_plant(system, problem.suspension)
+            require_damping(modal)
             scaled = scale_plant(modal, problem.weights.M_K)
+            free = scale_plant(modal_plant(system, Suspension(0.0, 0.0)), problem.weights.M_K)
         except PlantError as error:
             words = str(error) if "at theta" in str(error) else f"{error} {place}"
             findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
             continue
-        found = facts_of(theta, modal, scaled)
+        found = facts_of(theta, modal, scaled, free)
+        doubt = plant.doubt(theta) if index < CHECKED else ""
+        if doubt:
+            findings.append(Finding(Severity.ERROR, Topic.DERIVATIVES, doubt, index))
         findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
         findings += _hidden(modal, index, place)
-        findings += _about_zeros(found, problem.inner.S_max, index)
+        findings += zero_findings(found, problem.inner.S_max, index, place)
+        if index == 0:
+            findings += unit_findings(problem, found, scaled)
         facts.append(found)
+    findings = most_limiting(findings)
     counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
     if len(counts) > 1 and rigid_modes is None:
         words = (
@@ -210,27 +192,3 @@ def _rigid(
         )
         return [Finding(Severity.WARNING, Topic.RIGID_MODES, words, index)]
     return []
-
-
-def _about_zeros(facts: PlantFacts, S_max: float, index: int) -> list[Finding]:
-    found = []
-    for zero in facts.zeros:
-        z = zero.frequency_hz
-        if zero.damping_ratio < -1e-9:
-            words = (
-                f"a transmission zero in the right half-plane at {z:.4g} Hz: with a peak of S of "
-                f"{S_max:g} no controller has a bandwidth much above {z * (1 - 1 / S_max):.3g} Hz "
-                "(z (1 - 1/S_max)); move sensor and actuator closer together"
-            )
-            severe = z < 2.0 * facts.effort_hz
-            severity = Severity.WARNING if severe else Severity.NOTE
-            found.append(Finding(severity, Topic.ZERO, words, index))
-        elif zero.damping_ratio < LIGHT:
-            words = (
-                f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
-                f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
-                f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
-                "Hz unless M_K pays for it"
-            )
-            found.append(Finding(Severity.NOTE, Topic.ZERO, words, index))
-    return found

@@ -11,6 +11,7 @@ from ccd_casadi.cases.diagnosis import Finding, first_seen
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts
+from ccd_casadi.plants.plant import constraint_values
 
 # ω_b over the frequency at which M_K σ_min(G) = 1: 0.86 to 1.06 on case study 1, less where
 # resonances stand in the way.
@@ -40,6 +41,12 @@ def plant_report(
         "bandwidth_window_hz": [share * start.effort_hz for share in WINDOW],
         "M_K": problem.weights.M_K,
         "M_K_for_bandwidth": _suitable(problem, start),
+        "constraints": [
+            {"name": name, "value": float(value), "met": bool(value <= 0.0)}
+            for name, value in zip(
+                plant.constraint_names, constraint_values(plant, problem.start), strict=True
+            )
+        ],
         "findings": [
             {"severity": f.severity.value, "topic": f.topic.value, "words": f.words}
             for f in first_seen(findings)

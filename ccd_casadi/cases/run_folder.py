@@ -6,7 +6,7 @@ checked, and the controller is certified again on the plant that the case file d
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,9 @@ class FinishedRun:
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
-    `result` is result.json as it was written.
+    `result` is result.json as it was written. With a controller in discrete time in place of the
+    run's own (`period` above 0, s) `sampled_judge` gives stability, ω_b, ‖S‖∞ and rate of growth of
+    the sampled loop on a plant, `sampled_responses` G and K at frequencies in rad/s.
     """
 
     folder: Path
@@ -44,6 +46,9 @@ class FinishedRun:
     controller: StateSpace
     figures: DesignFigures
     result: Mapping[str, Any]
+    sampled_judge: Callable[[ScaledPlant], tuple[bool, float, float, float]] | None = None
+    sampled_responses: Callable[[Array], tuple[np.ndarray, np.ndarray]] | None = None
+    period: float = 0.0
 
 
 def read_run(folder: Path) -> FinishedRun:

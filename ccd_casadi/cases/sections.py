@@ -104,7 +104,7 @@ class RobustSection:
 
     `resonance_shift` s: flexible frequencies at `shifts` places from -s to +s (relative), each with
     damping times 1 and every factor of `damping`. `design_at`: which end of that range, or its
-    middle, the controller is synthesised for.
+    middle, the controller is synthesised for; "auto" tries all three and keeps the best.
     """
 
     resonance_shift: float = _key(
@@ -112,7 +112,7 @@ class RobustSection:
     )
     shifts: int = _key(count(2), 5)
     damping: tuple[float, ...] = _key(factors, ())
-    design_at: str = _key(choice("low", "nominal", "high"), "low")
+    design_at: str = _key(choice("auto", "low", "nominal", "high"), "auto")
 
 
 @dataclass(frozen=True)

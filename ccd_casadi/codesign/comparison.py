@@ -12,8 +12,9 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.conclusions import conclusions
 from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.codesign.result import clean, figures_dict, versions
-from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of
+from ccd_casadi.codesign.run import FORMULATIONS, co_design, formulation_of
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
+from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -62,12 +63,23 @@ def compare(
     methods = [
         _formulation(case, problem, folder, workers, name, seed, quiet) for name in FORMULATIONS
     ]
+    problem = _chosen(problem, methods)
     descents = _descents(case, problem, workers, seed, quiet)
     for gradient in Gradient:
         methods.append(_best_descent(problem, descents, gradient))
     for name, starts in (("sequential", 0), ("sequential_global", 8)):
         methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
+
+
+def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
+    """The problem with the design plant of the best formulation, where the case leaves it open."""
+    solved = [m for m in methods if m.solution is not None and m.solution.problem is not None]
+    if problem.robust is None or problem.robust.design_shift is not None or not solved:
+        return problem
+    best = min(solved, key=lambda m: m.figures.get("objective", np.inf))
+    assert best.solution is not None
+    return best.solution.problem or problem
 
 
 def _formulation(

@@ -232,8 +232,8 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
     if found[worst] <= 1e-9 * size:
         return ""
     return (
-        f"constraint {plant.constraint_names[worst]} cannot be met in the bounds of theta: its "
-        f"least value found is {found[worst]:.4g}, above 0"
+        f"no theta was found that meets the constraint {plant.constraint_names[worst]}: its least "
+        f"value found in the bounds is {found[worst]:.4g}, and it is met where it is 0 or less"
     )
 
 

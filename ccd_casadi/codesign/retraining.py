@@ -21,7 +21,8 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.run import Solution, conclude, rescue, write_run
+from ccd_casadi.codesign.run import conclude, rescue, write_run
+from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values

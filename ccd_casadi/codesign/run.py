@@ -1,10 +1,9 @@
 """One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -13,6 +12,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.box_look import BoxLook, look_over_box, perturbed
+from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -25,6 +25,7 @@ from ccd_casadi.codesign.result import (
     result_dict,
     write_json,
 )
+from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.surrogate_quality import surrogate_quality
 from ccd_casadi.codesign.verdict import KKT_LEVEL
@@ -34,20 +35,10 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from surrogates import Quality, design, save
+from surrogates import design, save
 from surrogates.files import write_whole
 
 Formulation = Nested | Lifted | Direct
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Everything a run found: the JSON result, and the objects behind it (None: infeasible)."""
-
-    result: dict[str, Any]
-    outcome: FormulationResult
-    verified: VerifiedDesign | None
-    quality: tuple[Quality, ...] = ()
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -106,23 +97,42 @@ def solve(
 def co_design(
     sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
 ) -> Solution:
-    """Run one formulation on a sampler, verify and polish its design on the truth."""
+    """Run one formulation on a sampler, verify and polish its design on the truth.
+
+    A robust problem that leaves its design plant open is solved for each, and the best one kept.
+    """
     began = perf_counter()
     name = type(formulation).__name__.lower()
+
+    def concluded(each: Sampler, outcome: FormulationResult) -> Solution:
+        return conclude(each, name, outcome, formulation.tolerance, seed, began)
+
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
-        outcome = FormulationResult(None, None, (), (), None, False, forbidden)
-    else:
+        return concluded(sampler, FormulationResult(None, None, (), (), None, False, forbidden))
+
+    def solved(each: Sampler) -> Solution:
         if isinstance(formulation, Nested):
-            outcome = solve_nested(sampler, formulation, seed=seed, given=given)
+            outcome = solve_nested(each, formulation, seed=seed, given=given)
         elif isinstance(formulation, Lifted):
-            outcome = solve_lifted(sampler, formulation, seed=seed, given=given)
+            outcome = solve_lifted(each, formulation, seed=seed, given=given)
         else:
-            outcome = solve_direct(sampler, formulation, seed=seed)
+            outcome = solve_direct(each, formulation, seed=seed)
         if outcome.x is None:
-            outcome = rescue(sampler, outcome, seed)
-    if outcome.x is None:
-        return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
+            outcome = rescue(each, outcome, seed)
+        if outcome.x is None:
+            return concluded(each, outcome)
+        return _with_look(each, formulation, outcome, seed, began)
+
+    return best_over_design_plants(sampler, solved, concluded)
+
+
+def _with_look(
+    sampler: Sampler, formulation: Formulation, outcome: FormulationResult, seed: int, began: float
+) -> Solution:
+    """Verify, look over the box for something better, and go on from there if there is."""
+    assert outcome.x is not None
+    name = type(formulation).__name__.lower()
     verified = verify(sampler, outcome.x)
     J = verified.objective if verified.feasible else np.inf
     look = look_over_box(sampler, verified.x, J, formulation.box_points, seed, outcome.surrogates)
@@ -239,11 +249,22 @@ def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> Formulati
     )
 
 
+def resolved(case: Case, solution: Solution) -> Case:
+    """The case with the design plant that was found best, where it left that open."""
+    if solution.problem is None or solution.problem.robust is None:
+        return case
+    robust = replace(case.robust, design_at=solution.problem.robust.design_at)
+    return replace(case, robust=robust)
+
+
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
-    """Write what a run folder holds besides samples and report; clear an earlier run's."""
+    """Write what a run folder holds besides samples and report; clear an earlier run's.
+
+    The case in it names the design plant that was found best, so that what works on the run does.
+    """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
-    text = case_to_toml(case)
+    text = case_to_toml(resolved(case, solution))
     write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})

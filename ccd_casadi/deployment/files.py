@@ -7,6 +7,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import versions, write_json
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduced
+from ccd_casadi.deployment.robust_set import MemberLoop
 from ccd_casadi.deployment.sections import Root, Section, sections_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
@@ -17,9 +18,9 @@ DESIGN_FILES = ("controller.json", "design.mat")
 
 
 def write_files(folder: Path, run: FinishedRun, found: Deployment, seed: int) -> None:
-    """deploy.json always; controller and .mat file only of a loop that is stable."""
+    """deploy.json always; controller and .mat file only of a loop that is stable everywhere."""
     write_json(folder / "deploy.json", deployment_dict(run, found, seed))
-    if not found.sampled.stable:
+    if not found.stable:
         return
     write_json(folder / "controller.json", controller_dict(found))
     K, held = found.realisation.system, found.plant
@@ -60,6 +61,12 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
     sampled, measured = found.sampled, found.measured
     return {
         "status": "verified" if found.passed else "not_verified",
+        "reason": "; ".join(
+            [
+                *([f"the run is not verified: {found.unverified}"] if found.unverified else []),
+                *found.shortfalls[:1],
+            ]
+        ),
         "rate_hz": found.rate_hz,
         "needed_rate_hz": found.needed_hz,
         "delay": found.delay,
@@ -92,11 +99,34 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
             "periods": measured.periods,
             "leftover": measured.leftover,
         },
+        "static_stiffness": None if found.statics is None else found.statics.stiffness,
+        "static_compliance": None if found.statics is None else found.statics.compliance,
+        "robust": None
+        if not found.members
+        else {
+            "plants": 1 + len(found.members),
+            "simulated": 1 + len(found.measured_members),
+            "stable": found.stable,
+            "worst": _member(found.worst),
+            "members": [_member(item) for item in found.members],
+        },
         "methods": {trial.conversion.label: trial.needed_hz for trial in found.trials},
         "channels": [_channel(item, run.figures.bandwidth) for item in found.orders],
         "theta": dict(zip(run.problem.names, run.theta, strict=True)),
         "versions": versions(),
         "seed": seed,
+    }
+
+
+def _member(item: MemberLoop) -> dict[str, Any]:
+    f = item.figures
+    return {
+        "shift": item.at.shift,
+        "damping": item.at.damping,
+        "stable": f.stable,
+        "spectral_radius": f.spectral_radius,
+        "sensitivity_peak": f.sensitivity_peak,
+        "sensitivity_peak_hz": f.sensitivity_peak_frequency / HZ,
     }
 
 

@@ -100,15 +100,16 @@ def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Red
     return found
 
 
-def smallest(rows: list[Reduced], limits: Limits) -> Reduced:
+def smallest(
+    rows: list[Reduced], limits: Limits, holds: Callable[[Reduced], bool] = lambda row: True
+) -> Reduced:
     """The row of least order within the limits; of several, the one with the lowest peak.
 
-    The minimal realisation where none does.
+    `holds`: what else is asked of it, on other plants. The minimal realisation where none does.
     """
     met = [row for row in rows if row.meets(limits)]
-    if not met:
-        return rows[0]
-    return min(met, key=lambda row: (row.order, row.figures.sensitivity_peak))
+    met.sort(key=lambda row: (row.order, row.figures.sensitivity_peak))
+    return next((row for row in met if holds(row)), rows[0])
 
 
 def _truncation(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None:

@@ -4,9 +4,11 @@ Plant and controller are advanced one after the other, as they are on the machin
 closed loop's matrices is used, so the measurement confirms them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ccd_casadi.deployment.sampled import DiscreteStateSpace
 from ccd_casadi.kernels.sensitivity import HALF_POWER
@@ -62,26 +64,50 @@ def measure_sensitivity(
 
     All lines up to half the sampling rate, `LINES` of them up to ω_b, repeated until steady.
     """
-    p, T = len(plant.C), plant.period
+    return measure_set([plant], controller, bandwidth, seed)[0]
+
+
+def measure_set(
+    plants: Sequence[DiscreteStateSpace],
+    controller: DiscreteStateSpace,
+    bandwidth: float,
+    seed: int,
+) -> tuple[MeasuredSensitivity, ...]:
+    """The same on several plants, each with a copy of the controller, run side by side."""
+    count, p, T = len(plants), len(plants[0].C), plants[0].period
+    plant = _beside(plants)
+    controller = _beside([controller] * count)
     samples = round(2.0 * np.pi * LINES / (bandwidth * T))
     lines = np.arange(1, (samples + 1) // 2)
     spectrum = np.zeros(samples // 2 + 1, complex)
     spectrum[lines] = np.exp(2j * np.pi * np.random.default_rng(seed).random(len(lines)))
     signal = np.fft.irfft(spectrum, samples)
-    references = signal[:, None, None] * np.eye(p)
+    references = signal[:, None, None] * np.tile(np.eye(p), (count, 1))
     state, before, periods, leftover = None, None, 0, np.inf
     while periods < PERIODS and leftover > SETTLED:
         errors, state = simulate(plant, controller, references, state)
         if before is not None:
             leftover = float(np.abs(errors - before).max() / np.abs(errors).max())
         before, periods = errors, periods + 1
-    S = np.fft.rfft(errors, axis=0)[lines] / spectrum[lines, None, None]
-    gain = np.asarray(np.linalg.norm(S, 2, axis=(1, 2)), dtype=float)
     omega = np.asarray(2.0 * np.pi * lines / (samples * T), dtype=float)
-    top = int(gain.argmax())
-    return MeasuredSensitivity(
-        omega, gain, float(gain[top]), float(omega[top]), _crossing(omega, gain), periods, leftover
-    )
+    found = []
+    for i in range(count):
+        own = errors[:, i * p : (i + 1) * p]
+        S = np.fft.rfft(own, axis=0)[lines] / spectrum[lines, None, None]
+        gain = np.asarray(np.linalg.norm(S, 2, axis=(1, 2)), dtype=float)
+        top = int(gain.argmax())
+        found.append(
+            MeasuredSensitivity(
+                omega, gain, float(gain[top]), float(omega[top]), _crossing(omega, gain),
+                periods, leftover,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def _beside(systems: Sequence[DiscreteStateSpace]) -> DiscreteStateSpace:
+    A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
+    return DiscreteStateSpace(A, B, C, D, systems[0].period)
 
 
 def _crossing(omega: Array, gain: Array) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.differenced import own_plant
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import ModelFunction, Plant, build_plant, mechanics
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
@@ -73,19 +73,33 @@ class RobustSet:
 
     Frequencies of the flexible modes times 1 + s, `shifts` values of s evenly over ±`shift`, and
     with every one of them damping times each factor of `damping`. The controller is designed on the
-    plant shifted by `design_shift`.
+    plant shifted by `design_shift`; None leaves that open: both ends and the middle are tried, see
+    `design_choices`.
     """
 
     shift: float
     shifts: int
     damping: tuple[float, ...]
-    design_shift: float
+    design_shift: float | None
 
     def perturbations(self, shifts: int | None = None) -> tuple[Perturbation, ...]:
         """The set; `shifts` of them for a denser one."""
         values = np.linspace(-self.shift, self.shift, self.shifts if shifts is None else shifts)
         factors = sorted({1.0, *self.damping})
         return tuple(Perturbation(float(s), z) for s in values for z in factors)
+
+    @property
+    def design_at(self) -> str:
+        """The plant that the controller is made on: "auto", "low", "nominal" or "high"."""
+        if self.design_shift is None:
+            return "auto"
+        return ("low", "nominal", "high")[1 + int(np.sign(self.design_shift))]
+
+    def scaled(self, share: float) -> "RobustSet":
+        """The set that reaches a share of this one's way, from the model alone (0) to it (1)."""
+        design = None if self.design_shift is None else share * self.design_shift
+        damping = tuple(factor**share for factor in self.damping)
+        return RobustSet(share * self.shift, self.shifts, damping, design)
 
 
 @dataclass(frozen=True)
@@ -239,14 +253,27 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
 
     def scaled(*perturbation: Perturbation) -> ScaledPlant:
         modal = modal_plant(system, problem.suspension, *perturbation)
+        require_damping(modal)
         return scale_plant(modal, problem.weights.M_K)
 
     nominal, robust = scaled(), problem.robust
     if robust is None:
         return nominal
-    design = nominal if robust.design_shift == 0.0 else scaled(Perturbation(robust.design_shift))
+    design = scaled(Perturbation(robust.design_shift)) if robust.design_shift else nominal
     others = (p for p in robust.perturbations() if p != Perturbation())
     return replace(nominal, family=PlantFamily(design, tuple(scaled(p) for p in others)))
+
+
+def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
+    """The problem for each plant that its controllers may be made on; itself where that is one.
+
+    min over θ and design plants is the least of the minima over θ, so nothing is lost.
+    """
+    robust = problem.robust
+    if robust is None or robust.design_shift is not None:
+        return (problem,)
+    shifts = (-robust.shift, 0.0, robust.shift) if robust.shift else (0.0,)
+    return tuple(replace(problem, robust=replace(robust, design_shift=s)) for s in shifts)
 
 
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
@@ -261,8 +288,23 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     >>> round(best.bandwidth / ccd.HZ, 2), best.active
     (58.23, ('S_max', 'omega_T lower'))
     """
+    return best_choice(problem, theta)[1]
+
+
+def best_choice(
+    problem: CoDesignProblem, theta: Sequence[float]
+) -> tuple[CoDesignProblem, InnerResult]:
+    """The choice of `design_choices` with the largest ω_b* at θ (least violation), and its result.
+
+    `syntheses` counts those of all choices.
+    """
     solve = sweep_inner if problem.method == "sweep" else search_inner
-    return solve(scaled_plant(problem, theta), problem.weights, problem.inner)
+    found = [
+        (choice, solve(scaled_plant(choice, theta), choice.weights, choice.inner))
+        for choice in design_choices(problem)
+    ]
+    best = min(found, key=lambda item: (item[1].violation, -np.nan_to_num(item[1].bandwidth)))
+    return best[0], replace(best[1], syntheses=sum(item[1].syntheses for item in found))
 
 
 def true_design(
@@ -270,12 +312,16 @@ def true_design(
 ) -> Sensitivities:
     """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s.
 
+    Raises ValueError where the problem leaves open what plant the controller is made on.
+
     >>> import ccd_casadi as ccd
     >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
     >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)
     >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
     (True, [-0.21, -0.138])
     """
+    if len(design_choices(problem)) > 1:
+        raise ValueError("a synthesis needs one design plant: take one of design_choices(problem)")
     return evaluate(
         scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
     )

@@ -29,6 +29,9 @@ from ccd_casadi.support.errors import PlantError
 
 STEP = 1e-3  # share of the box: h⁴ is 1e-12, rounding is magnified a thousandfold
 REMEMBERED = 256  # values of the function kept: matrices and hardware cost ask for the same θ
+WRONG = 0.1  # relative disagreement of two difference formulas from which a derivative is wrong
+LEAP = 1e-2  # of a matrix: what its values differ by over one step where they leap
+NOISE = 1e-4  # of a matrix over the box: a derivative below it is none
 AGREEMENT = 1e-9  # relative; a function gives the same numbers for numbers and for symbols
 
 
@@ -159,6 +162,7 @@ class DifferencedModel:
             exact_hessian=False,
             values=self.values,
             notes=notes,
+            doubt=self.doubt,
         )
 
     def __call__(self, theta: Sequence[float] | Array) -> Mechanics:
@@ -173,6 +177,7 @@ class DifferencedModel:
             return _matrices(item.system)
 
         slopes = self._slopes(theta, parts, 4)
+        self._refuse_jumps(theta)
         return Mechanics(
             *_matrices(here.system), ratio, tuple(slopes)  # type: ignore[arg-type]
         )  # fmt: skip
@@ -201,6 +206,50 @@ class DifferencedModel:
             largest = max(np.abs(fine * share).max(initial=0.0), 1e-6 * size)
             worst = max(worst, float(gap / largest) if gap > 0.0 else 0.0)
         return worst
+
+    def doubt(self, theta: Sequence[float] | Array) -> str:
+        """Which derivative is wrong at θ, and the usual cause; empty where both formulas agree."""
+        return self._disagreement(theta, WRONG, 0.0)
+
+    def _refuse_jumps(self, theta: Sequence[float] | Array) -> None:
+        """Raise PlantError where a value leaps between neighbouring points, not only bends."""
+        words = self._disagreement(theta, WRONG, LEAP)
+        if words:
+            raise PlantError(words)
+
+    def _disagreement(self, theta: Sequence[float] | Array, share: float, leap: float) -> str:
+        """The worst derivative whose two formulas differ by `share` of it, and over a step by
+        `leap` of the matrix; nothing is called again, the coarse formula uses the fine one's
+        points."""
+
+        def parts(item: _Values) -> tuple[Array, ...]:
+            return (*_matrices(item.system), item.scalars)
+
+        names = ("mass", "damping", "stiffness", "input", "output")
+        sizes = [np.abs(part).max(initial=0.0) for part in parts(self._at(theta))]
+        width = self.upper - self.lower
+        pairs = zip(self._slopes(theta, parts, 4), self._slopes(theta, parts, 2), strict=True)
+        worst, words = 0.0, ""
+        for k, ((fine, coarse), size) in enumerate(zip(pairs, sizes, strict=True)):
+            for i, name in enumerate(self.names):
+                gap = np.abs(fine[i] - coarse[i]) * width[i]
+                largest = np.abs(fine * width.reshape(-1, *[1] * (fine.ndim - 1))).max(initial=0.0)
+                floor = max(largest, NOISE * size)
+                if not gap.size or floor == 0.0 or not gap.max() > share * floor:
+                    continue
+                if STEP * gap.max() <= leap * size or gap.max() / floor <= worst:
+                    continue
+                worst = float(gap.max() / floor)
+                label = names[k] if k < len(names) else "hardware_cost or a constraint"
+                place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
+                words = (
+                    f"the derivative of {label} to {name} is {100 * worst:.0f} % wrong at theta = "
+                    f"{place}: two difference formulas disagree, so the plant function leaps or "
+                    "bends there; usual causes are eigenvectors whose sign or order changes "
+                    "between points (fix the sign, sort by shape), `if`, `abs`, `round`, or an "
+                    "iteration that stops early"
+                )
+        return words
 
     def _slopes(
         self,

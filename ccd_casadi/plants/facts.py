@@ -10,6 +10,8 @@ from ccd_casadi.plants.scaling import ScaledPlant, transmission_zeros
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
+ALIKE = 0.3  # relative: a zero with and without suspension is the same within this
+
 
 @dataclass(frozen=True)
 class Mode:
@@ -27,11 +29,13 @@ class Zero:
     """A transmission zero: |z| in Hz, its damping ratio (negative: right half-plane), and its dip.
 
     `dip`: the plant's least gain at |z| over its geometric mean at 0.7 and 1.4 times |z|.
+    `artefact`: in the right half-plane, and not so without the rigid bodies' suspension.
     """
 
     frequency_hz: float
     damping_ratio: float
     dip: float
+    artefact: bool = False
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,18 @@ class PlantFacts:
     effort_hz: float
 
 
-def facts_of(theta: tuple[float, ...], modal: ModalPlant, scaled: ScaledPlant) -> PlantFacts:
-    """The facts of a plant at one θ, from its modes and its scaled state space."""
+def facts_of(
+    theta: tuple[float, ...],
+    modal: ModalPlant,
+    scaled: ScaledPlant,
+    free: ScaledPlant | None = None,
+) -> PlantFacts:
+    """The facts of a plant at one θ, from its modes and its scaled state space.
+
+    `free` is the plant without its suspension: what tells that one's zeros from its own.
+    """
     effort = _effort_hz(modal, scaled)
-    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort), effort)
+    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort, free), effort)
 
 
 def _modes(modal: ModalPlant) -> tuple[Mode, ...]:
@@ -83,8 +95,11 @@ def _effort_hz(modal: ModalPlant, plant: ScaledPlant) -> float:
     return float(np.exp(x[0] - y[0] * (x[1] - x[0]) / (y[1] - y[0])) * plant.omega_0 / HZ)
 
 
-def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
+def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tuple[Zero, ...]:
     """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
+    own = None
+    if free is not None:
+        own = transmission_zeros(free.A, free.B, free.C) * (free.omega_0 / plant.omega_0)
     limit = 3.0 * effort_hz * HZ / plant.omega_0
     found = []
     for zero in transmission_zeros(plant.A, plant.B, plant.C):
@@ -96,7 +111,13 @@ def _zeros(plant: ScaledPlant, effort_hz: float) -> tuple[Zero, ...]:
         )
         dip = gain[1] / np.sqrt(gain[0] * gain[2])
         damping = -zero.real / size
-        found.append(Zero(float(size * plant.omega_0 / HZ), float(damping), float(dip)))
+        artefact = bool(
+            own is not None
+            and damping < 0.0
+            and not (np.abs(own[own.real > 0.0] - zero) < ALIKE * size).any()
+        )
+        hz = float(size * plant.omega_0 / HZ)
+        found.append(Zero(hz, float(damping), float(dip), artefact))
     return tuple(sorted(found, key=lambda zero: zero.frequency_hz))
 
 

@@ -18,6 +18,7 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+UNDAMPED = 1e-12  # of the largest modal damping: what is below is rounding of none
 RIGID_RATIO = 1e-5  # a mode below this fraction of the highest frequency counts as rigid
 
 
@@ -116,6 +117,21 @@ def modal_plant(
         dD=perturbation.damping * to_modal(dD) + dg,
         dB=modes.T @ dB,
         dC=dC @ modes,
+    )
+
+
+def require_damping(modal: ModalPlant) -> None:
+    """Raise PlantError where a flexible mode is not damped: its gain would be infinite."""
+    damping, natural, rigid = np.diag(modal.D), modal.natural, modal.rigid
+    least = UNDAMPED * max(float(np.abs(damping[~rigid]).max(initial=0.0)), 1e-300)
+    wrong = np.flatnonzero(~rigid & (damping <= least))
+    if not wrong.size:
+        return
+    i = wrong[0]
+    words = "is not damped" if damping[i] >= -least else "has a negative damping"
+    raise PlantError(
+        f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: no synthesis holds an infinite "
+        "resonance; return a damping matrix that reaches it, or damping_ratio, such as 0.005"
     )
 
 

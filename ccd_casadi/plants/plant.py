@@ -55,8 +55,9 @@ class Plant:
     not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
     reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
     known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
-    to be checked by the true one. Without `exact_hessian` second derivatives of `hardware` cost too
-    much to be asked for.
+    to be checked by the true one.
+    `doubt` says what is wrong with the derivatives at θ, empty where nothing is. Without
+    `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
     """
 
     names: tuple[str, ...]
@@ -71,6 +72,7 @@ class Plant:
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
     nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
+    doubt: Callable[[Sequence[float]], str] = lambda theta: ""
 
 
 def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
@@ -149,7 +151,8 @@ def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
 def checked_ratio(ratio: Any) -> float | None:
     """A model's damping_ratio as a number, or None. Raises PlantError outside (0, 1)."""
     if ratio is not None and not 0.0 < float(ratio) < 1.0:
-        raise PlantError(f"damping_ratio is {ratio}; give a number between 0 and 1")
+        words = "give a number between 0 and 1, both exclusive, such as 0.01"
+        raise PlantError(f"damping_ratio is {ratio}; {words}")
     return None if ratio is None else float(ratio)
 
 

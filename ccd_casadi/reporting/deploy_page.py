@@ -11,6 +11,7 @@ from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
+from ccd_casadi.deployment.words import reason_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
@@ -40,7 +41,7 @@ PERIODS = 6.0  # of ω_b that the step is shown for
 def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
     """One self-contained page."""
     title = f"Controller of {run.folder.resolve().name}, deployed"
-    reason = "" if found.passed else "S_max within 5 % and ω_b within 3 % are not both kept"
+    reason = reason_words(run, found)
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
     sections = [Section("The loop", _loop(run, found)), Section("Figures", _facts(run, found))]
     if found.sampled.stable:
@@ -50,7 +51,7 @@ def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
         Section("Orders", "\n".join(_orders(item, run) for item in found.orders)),
         Section("As sections", "\n".join(_sections(item, run) for item in found.orders)),
     ]
-    if found.sampled.stable:
+    if found.stable:
         sections.append(Section("The code", _code(found)))
     status = "verified" if found.passed else "not verified"
     head = header(
@@ -64,14 +65,15 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     K, full = found.sampled, run.figures
     orders = " + ".join(str(item.chosen.order) for item in found.orders)
     before = " + ".join(str(item.rows[0].order) for item in found.orders)
-    if not K.stable:
-        return f"At {number(found.rate_hz)} Hz the sampled loop is unstable."
+    if not found.stable:
+        return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
+    rest = "" if found.statics is None else f" {found.statics.words}"
     return (
         f"{orders} states instead of {before} (synthesised: {len(run.controller.A)}), at "
         f"{number(found.rate_hz)} Hz with a delay of "
         f"{number(1e6 * found.delay, 4)} µs: bandwidth {number(K.bandwidth / HZ)} Hz "
         f"({_percent(K.bandwidth, full.bandwidth)}), peak of S {number(K.sensitivity_peak)} "
-        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max)."
+        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max).{rest}"
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import retraining
-from ccd_casadi.codesign.run import Solution
+from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 

@@ -55,7 +55,7 @@ def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
         _perturbed(run, found),
         _tolerances(run, found),
         *_structured(found),
-        _move(found),
+        *([_move(found)] if found.moves else []),
     ]
     return page(title, sections, head)
 
@@ -95,7 +95,13 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         )
     if found.overrun is not None:
         words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
+    words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
+    if run.period:
+        words.append(
+            f"A controller in discrete time, a step every {1e6 * run.period:.5g} µs, hold and "
+            "delay exact; noise, the structured singular value and moves are of continuous ones."
+        )
     return words
 
 
@@ -185,26 +191,30 @@ def _gains(run: FinishedRun, found: Study) -> Section:
         for name, row in zip(names, found.gains, strict=True)
     ]
     n, d = found.noise, found.demands
-    rms = [
-        ("position by sensor noise", n.position_by_noise, f"m RMS for {d.sensor:g} m/√Hz"),
-        ("force by sensor noise", n.force_by_noise, f"N RMS for {d.sensor:g} m/√Hz"),
-        (
-            "position by force noise",
-            n.position_by_disturbance,
-            f"m RMS for {d.disturbance:g} N/√Hz",
-        ),
-        ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
-    ]
+    rms = (
+        []
+        if n is None
+        else [
+            ("position by sensor noise", n.position_by_noise, f"m RMS for {d.sensor:g} m/√Hz"),
+            ("force by sensor noise", n.force_by_noise, f"N RMS for {d.sensor:g} m/√Hz"),
+            (
+                "position by force noise",
+                n.position_by_disturbance,
+                f"m RMS for {d.disturbance:g} N/√Hz",
+            ),
+            ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
+        ]
+    )
     facts = [(name, ", ".join(number(float(v), 4) for v in values), unit)
              for name, values, unit in rms]  # fmt: skip
     drawn = figure_html(
         figures.gains(found), "Sensitivity, complementary sensitivity, position by a force at the "
         "actuators (GS), and force by sensor noise (KS).", figures.gains_table(found),
     )  # fmt: skip
-    return Section(
-        "Disturbance and noise",
-        drawn + facts_html(tops) + "<h3>White noise (one-sided density)</h3>" + facts_html(facts),
-    )
+    body = drawn + facts_html(tops) + paragraph(found.statics.words)
+    if facts:
+        body += "<h3>White noise (one-sided density)</h3>" + facts_html(facts)
+    return Section("Disturbance and noise", body)
 
 
 def _perturbed(run: FinishedRun, found: Study) -> Section:

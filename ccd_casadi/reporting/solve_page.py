@@ -58,7 +58,7 @@ from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
-    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.codesign.solution import Solution
     from ccd_casadi.codesign.verify import VerifiedDesign
 
 STATUS = {

@@ -87,6 +87,19 @@ def margins(
     return Margins(tuple(loops), outputs, inputs)
 
 
+def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
+    """The same from responses alone, of a sampled loop up to half its rate."""
+    loops, together = [], []
+    for name, L in (("output", G @ K), ("input", K @ G)):
+        S = np.linalg.inv(np.eye(L.shape[1]) + L)
+        for i in range(L.shape[1]):
+            loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
+        alpha = 1.0 / mu_bound(S - 0.5 * np.eye(S.shape[1]))
+        worst = int(alpha.argmin())
+        together.append(DiskMargin(float(alpha[worst]), float(hz[worst])))
+    return Margins(tuple(loops), together[0], together[1])
+
+
 def _loop(name: str, hz: Array, L: NDArray) -> LoopMargins:
     response = control.FrequencyResponseData(L, HZ * hz, smooth=True)
     gains, phases, _, _, at, _ = control.stability_margins(response, returnall=True)

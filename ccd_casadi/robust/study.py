@@ -10,7 +10,7 @@ from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.robust.demands import Demands as Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
-from ccd_casadi.robust.margins import DiskMargin, Margins, margins
+from ccd_casadi.robust.margins import DiskMargin, Margins, margins, sampled_margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate
 from ccd_casadi.robust.perturbed import (
     Judged,
@@ -28,7 +28,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import loop_data
+from ccd_casadi.synthesis.statics import Statics, sampled_statics, statics
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,15 @@ class Study:
 
     `structured` is None where no flexible mode is in the loop, and where the bound was not computed
     within the `overrun` seconds that it was given.
+    Of a controller in discrete time there are no `noise`, no `structured` bound and no `moves`.
     """
 
     demands: Demands
     hz: Array
     gains: Array
     margins: Margins
-    noise: Noise
+    noise: Noise | None
+    statics: Statics
     shift: Line
     damping: Line
     modes: tuple[Judged, ...]
@@ -75,6 +79,8 @@ def with_structured_bound(run: FinishedRun, found: Study, seconds: float | None 
 
     Given `seconds`, it is computed in a process of its own, which is ended after them.
     """
+    if run.period:  # the bound is of continuous loops
+        return found
     modal = modal_plant(system_of(run), run.problem.suspension)
     if seconds is None:
         bound = structured_bound(run.plant, modal, run.controller, found.hz)
@@ -99,6 +105,8 @@ def tried(
     """Everything but the structured singular value; `workers` share what they can."""
     demands = demands or Demands()
     bandwidth_hz = run.figures.bandwidth / HZ
+    if run.period:
+        return _sampled(run, demands, seed, quiet)
     loop = loop_data(
         run.plant, run.controller, run.weights, gamma=run.figures.gamma,
         bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
@@ -113,6 +121,11 @@ def tried(
         gains=gains(loop.plant, loop.controller),
         margins=margins(run.plant, run.controller, loop.hz, loop.plant, loop.controller),
         noise=noise(closed, d.sensor, d.disturbance),
+        statics=statics(
+            run.plant.plant_si(),
+            run.controller,
+            responses(run.plant, run.controller, np.array([run.figures.bandwidth]))[1][0],
+        ),
         shift=shift_line(run, system, d.shift, quiet=quiet),
         damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
@@ -122,6 +135,35 @@ def tried(
         setpoint=profile,
         free=free,
         moves=moves,
+    )
+
+
+def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool) -> Study:
+    """The part of the study that a controller in discrete time has, hold and delay exact."""
+    assert run.sampled_responses is not None
+    system = system_of(run)
+    nyquist = 0.5 / run.period
+    around = run.plant.grid * run.plant.omega_0 / HZ
+    hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
+    hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
+    G, K = run.sampled_responses(HZ * hz)
+    at = run.sampled_responses(np.array([run.figures.bandwidth]))[1][0]
+    return Study(
+        demands=d,
+        hz=hz,
+        gains=gains(G, K),
+        margins=sampled_margins(hz, G, K),
+        noise=None,
+        statics=sampled_statics(run.plant.plant_si(), run.controller, at),
+        shift=shift_line(run, system, d.shift),
+        damping=damping_line(run, system, *d.damping),
+        modes=single_modes(run, system, d.shift),
+        box=worst_in_box(run, system, d.shift, d.damping),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
+        structured=None,
+        setpoint=setpoint(d.limits),
+        free=False,
+        moves=(),
     )
 
 
@@ -169,7 +211,13 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             name: {"peak": float(row.max()), "peak_hz": float(found.hz[row.argmax()])}
             for name, row in zip(("S", "T", "GS", "KS"), found.gains, strict=True)
         },
-        "noise": {"sensor_density": d.sensor, "force_density": d.disturbance}
+        "static_stiffness": found.statics.stiffness,
+        "static_compliance": found.statics.compliance,
+        "static_share": found.statics.share,
+        "period": run.period or None,
+        "noise": None
+        if found.noise is None
+        else {"sensor_density": d.sensor, "force_density": d.disturbance}
         | {f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
         "resonance_shift": _line(found.shift, "shift"),
         "damping": _line(found.damping, "factor"),

@@ -16,7 +16,7 @@ from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode as ExitCode
 from surrogates.options import Parser, whole
 
-DEFAULT_CASE = "runs/two_mass.toml"
+DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"

@@ -34,7 +34,10 @@ class Outcome(StrEnum):
     NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
-    LOST_IN_ROUNDING = "the controller in SI is not certified again: the loop hangs on lost digits"
+    LOST_IN_ROUNDING = (
+        "the controller in SI is not certified again: the loop hangs on digits that doubles do not "
+        "have; raise gamma_backoff (1.05, 1.2), lower M_K, or narrow omega_S_hz and omega_T_hz"
+    )
     NO_DERIVATIVES = "certified, but its derivatives are lost in rounding"
     NOT_ROBUST = "the closed loop is not stable on every perturbed plant"
 

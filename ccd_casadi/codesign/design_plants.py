@@ -1,0 +1,195 @@
+"""A robust problem once for each plant that its controllers may be made on; the best one is kept.
+
+    min over θ and design plants s of J(θ, s) = min over s of (min over θ of J(θ, s))
+
+Where none of them is verified, the range is reached by continuation: from the optimum of the plant
+alone the set is widened step by step, each design polished on the true problem of a wider one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import acceptable, polish
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
+from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.plants.plant import theta_words
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import DesignFigures
+
+FIRST = 0.25  # share of the range of the first step of a continuation
+POLISHES = 8  # at most in a continuation
+LEAST = 1.0 / 16.0  # share of the range under which a step is given up
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The end of a continuation: x = (θ, ln ω_S, ln ω_T) and the share of the range held there."""
+
+    x: Array
+    share: float
+
+
+def widen(sampler: Sampler, x: Array) -> Reached:
+    """From a design of the plant alone towards the whole set of a problem with one design plant."""
+    problem = sampler.problem
+    assert problem.robust is not None
+    reached, step = Reached(np.asarray(x, float), 0.0), FIRST
+    for _ in range(POLISHES):
+        if reached.share >= 1.0 or step < LEAST:
+            break
+        share = min(1.0, reached.share + step)
+        narrower = replace(problem, robust=problem.robust.scaled(share))
+        found, made, _ = polish(sampler.of(narrower, traced=share == 1.0), reached.x)
+        if acceptable(narrower, found, made):
+            reached, step = Reached(found, share), 2.0 * step
+        else:
+            step *= 0.5
+    return reached
+
+
+def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, float]:
+    """What a formulation would hand on at the end of `widen`, None short of it; the share held."""
+    reached = widen(sampler, x)
+    if reached.share < 1.0:
+        return None, reached.share
+    made = sampler.design(reached.x)
+    words = "reached by continuation from narrower ranges"
+    return FormulationResult(reached.x, made, (), (), None, True, words), 1.0
+
+
+def best_over_design_plants(
+    sampler: Sampler,
+    solve: Callable[[Sampler], Solution],
+    conclude: Callable[[Sampler, FormulationResult], Solution],
+) -> Solution:
+    """The best of a problem's solutions over its design plants, by `solve` and continuation.
+
+    `conclude` verifies what a continuation ended with. A problem with one design plant, or none,
+    is solved as it is.
+    """
+    began = perf_counter()
+    problem = sampler.problem
+    choices = design_choices(problem)
+    samplers = [sampler.of(choice) if len(choices) > 1 else sampler for choice in choices]
+    found = [solve(each) for each in samplers]
+    share = None
+    if problem.robust is not None and not any(map(_verified, found)):
+        share = 0.0
+        alone = solve(sampler.of(replace(problem, robust=None), traced=False))
+        if alone.verified is not None:
+            for i, each in enumerate(samplers):
+                outcome, held = continued(each, alone.verified.x)
+                share = max(share, held)
+                if outcome is not None:
+                    found[i] = min(found[i], conclude(each, outcome), key=_order)
+    violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
+    best = min(range(len(found)), key=lambda i: (*_order(found[i]), violation[i]))
+    result = found[best].result | {
+        "seconds": perf_counter() - began,
+        "syntheses": sampler.syntheses,
+    }
+    if problem.robust is not None:
+        names = [_at(choice) for choice in choices]
+        tried = {name: _tried(item.result) for name, item in zip(names, found, strict=True)}
+        result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
+    result["reason"] = _reason(samplers[best], problem, found[best], share)
+    return replace(found[best], result=result, problem=choices[best])
+
+
+def _verified(item: Solution) -> bool:
+    return bool(item.result["status"] == "verified")
+
+
+def _order(item: Solution) -> tuple[int, int, float]:
+    """Verified first, then what fails the fewest checks, then the least J."""
+    result = item.result
+    failed = sum(not passed for passed in result.get("checks", {}).values())
+    status = ("verified", "not_verified", "infeasible").index(result["status"])
+    return status, failed, result.get("objective", np.inf)
+
+
+def _tried(result: dict[str, Any]) -> dict[str, Any]:
+    keys = ("status", "objective", "reason", "theta", "bandwidth_hz")
+    return {key: result[key] for key in keys if key in result}
+
+
+def _reason(sampler: Sampler, problem: CoDesignProblem, best: Solution, share: float | None) -> str:
+    """Why a search failed: where it looked, how near it came, what may be tried."""
+    words = str(best.result["reason"])
+    if _verified(best):
+        return words
+    if best.verified is not None:
+        missed = missed_words(problem, best.verified.design.figures)
+        parts = [words, missed, remedies(problem, share) if missed else ""]
+        return "; ".join(part for part in parts if part)
+    where = ""
+    if sampler.nearest is not None and np.isfinite(sampler.nearest.violation):
+        where = f"nearest at {theta_words(plant_of(problem), sampler.nearest.theta)}: "
+    thetas = len({entry.theta for entry in sampler.trace})
+    return f"{search_words(problem, thetas)}; {where}{words}; {remedies(problem, share)}"
+
+
+def search_words(problem: CoDesignProblem, thetas: int) -> str:
+    """Which controllers were looked for, and where."""
+    inner, robust = problem.inner, problem.robust
+    box = [
+        f"{name} {low:g} to {high:g}"
+        for name, low, high in (
+            ("omega_S", inner.omega_S[0] / HZ, inner.omega_S[1] / HZ),
+            ("omega_T", inner.omega_T[0] / HZ, inner.omega_T[1] / HZ),
+        )
+    ]
+    made = ""
+    if robust is not None and robust.shift:
+        ends = {"low": "its lower end", "nominal": "its middle", "high": "its upper end"}
+        places = [ends[_at(choice)] for choice in design_choices(problem)]
+        made = (
+            f", made on the plant at {' and '.join(places[-2:])}"
+            if len(places) < 3
+            else f", made on the plant at {', '.join(places[:-1])} and {places[-1]}"
+        ) + f" of +-{100 * robust.shift:g} %"
+    return (
+        f"none found among the mixed-sensitivity H-infinity controllers{made} at {thetas} theta "
+        f"({', '.join(box)} Hz)"
+    )
+
+
+def _at(problem: CoDesignProblem) -> str:
+    assert problem.robust is not None
+    return problem.robust.design_at
+
+
+def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
+    """What may be tried where none was found; `share` of the range that was held, if known."""
+    ways = ["wider bounds of theta, omega_S_hz or omega_T_hz", "a larger S_max or S_low"]
+    robust = problem.robust
+    if robust is not None:
+        narrower = "a narrower range in [robust]"
+        if share:
+            held = f"+-{100 * share * robust.shift:.3g} %" if robust.shift else f"{share:.2g} of it"
+            narrower += f" ({held} was held on the way)"
+        ways.append(narrower)
+    ways.append("another kind of controller (`robustness --controller` judges any)")
+    return f"that none exists is not proven; try {', '.join(ways[:-1])}, or {ways[-1]}"
+
+
+def missed_words(problem: CoDesignProblem, figures: DesignFigures) -> str:
+    """Which of S_max and S_low a design misses, and by how much; empty where it keeps both."""
+    inner = problem.inner
+    found = [
+        f"{label} {missed_by(value, bound)} where {name} = {bound:g} is asked"
+        for name, label, value, bound in (
+            ("S_max", "peak of S", figures.sensitivity_peak, inner.S_max),
+            ("S_low", "|S(j omega_low)|", figures.sensitivity_low, inner.S_low),
+        )
+        if value > bound
+    ]
+    return " and ".join(found)

@@ -1,0 +1,219 @@
+"""A controller from a file, to be judged on a run's plant: ours, a .mat, or a table of filters.
+
+A table (TOML, or JSON of the same form) is what one enters in a drive:
+
+    K(s) = gain Π sections,  every section with the gain 1 at s = 0 (an integrator aside)
+
+    gain = 1.5e6                                                   # N/m
+    integrator_hz = 5.0                                            # (s + ω)/s
+    lead = [{ zero_hz = 30.0, pole_hz = 300.0 }]                   # (1 + s/ω_z)/(1 + s/ω_p)
+    notch = [{ zero_hz = 480.0, zero_damping = 0.02, pole_hz = 480.0, pole_damping = 0.3 }]
+    low_pass = [{ pole_hz = 900.0, pole_damping = 0.7 }]           # second order; first without
+"""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun, read_json
+from ccd_casadi.deployment.sampled import (
+    DiscreteStateSpace,
+    sampled_figures,
+    sampled_plant,
+    sensitivity_loop,
+)
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.interchange import read_mat
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
+
+UNSEEN = StateSpace(-np.eye(1), np.zeros((1, 1)), np.zeros((1, 1)), np.eye(1))
+SECTIONS = {
+    "lead": (("zero_hz", "pole_hz"), ()),
+    "notch": (("zero_hz", "zero_damping", "pole_hz", "pole_damping"), ()),
+    "low_pass": (("pole_hz",), ("pole_damping",)),
+}
+
+
+@dataclass(frozen=True)
+class Given:
+    """A controller in SI, e = r - y to u; in discrete time where `period` (s) is above 0.
+
+    `delay` in s is that from reading y to the new u, of a discrete one.
+    """
+
+    system: StateSpace
+    period: float = 0.0
+    delay: float = 0.0
+
+
+def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
+    """The run with the controller of a file in place of its own, measured on its plant.
+
+    Raises UserError where the file holds none that fits, or the loop is not stable with it.
+    """
+    given = read_controller(path)
+    K = given.system
+    p, m = len(run.plant.C), run.plant.B.shape[1]
+    if (K.C.shape[0], K.B.shape[1]) != (m, p):
+        sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
+        raise UserError(f"{path}: has {sizes}; this plant needs {p} and {m}")
+    if given.period == 0.0:
+        figures = measure(
+            run.plant, K, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
+        )
+        if not figures.certificate.stable:
+            pole = figures.certificate.max_real_pole
+            raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
+        return replace(run, controller=K, figures=figures)
+    discrete = DiscreteStateSpace(K.A, K.B, K.C, K.D, given.period)
+
+    def judge(plant: ScaledPlant) -> tuple[bool, float, float, float]:
+        held = sampled_plant(plant.plant_si(), given.period, given.delay)
+        f = sampled_figures(sensitivity_loop(held, discrete))
+        growth = np.log(max(f.spectral_radius, 1e-300)) / given.period
+        return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
+
+    stable, bandwidth, peak, growth = judge(run.plant)
+    if not stable:
+        words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
+        raise UserError(f"{path}: {words}")
+    figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
+
+    def responses(omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        held = sampled_plant(run.plant.plant_si(), given.period, given.delay)
+        return held.response(omega), discrete.response(omega)
+
+    return replace(
+        run, controller=K, figures=figures, sampled_judge=judge, sampled_responses=responses,
+        period=given.period,
+    )  # fmt: skip
+
+
+def read_controller(path: Path) -> Given:
+    """The controller in a .json, .toml or .mat file. Raises UserError where there is none."""
+    if path.suffix == ".mat":
+        return _from_mat(path)
+    if path.suffix == ".toml":
+        try:
+            table: Mapping[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise UserError(f"{path}: there is no such file; name a controller") from None
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: is not valid TOML: {error}") from None
+    elif path.suffix == ".json":
+        if not path.exists():
+            raise UserError(f"{path}: there is no such file; name a controller")
+        table = read_json(path)
+    else:
+        raise UserError(f"{path}: name a controller as .json, .toml or .mat")
+    if "A" in table:
+        return _from_matrices(path, table)
+    return Given(_from_sections(path, table))
+
+
+def _from_mat(path: Path) -> Given:
+    if not path.exists():
+        raise UserError(f"{path}: there is no such file; name a controller")
+    systems = read_mat(path).systems
+    for name in ("controller_discrete", "controller"):
+        if name in systems:
+            found = systems[name]
+            delay = found.period
+            beside = path.with_name("deploy.json")
+            if found.period and beside.exists():
+                told = read_json(beside).get("delay")
+                delay = float(told) if isinstance(told, int | float) else delay
+            return Given(found.system, found.period, delay)
+    raise UserError(f"{path}: holds no struct controller_discrete or controller")
+
+
+def _from_matrices(path: Path, table: Mapping[str, Any]) -> Given:
+    try:
+        parts = [np.array(table[name], dtype=float) for name in "ABCD"]
+        period, delay = float(table.get("period", 0.0)), float(table.get("delay", 0.0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: A, B, C, D are no matrices: {error}") from None
+    A, B, C, D = parts
+    fits = all(part.ndim == 2 and np.isfinite(part).all() for part in parts) and (
+        A.shape == (len(A), len(A))
+        and B.shape == (len(A), D.shape[1])
+        and C.shape == (len(D), len(A))
+    )
+    if not fits or not (0.0 <= period < np.inf and 0.0 <= delay < np.inf):
+        raise UserError(f"{path}: A, B, C, D (and period, delay) are of no state space")
+    return Given(StateSpace(A, B, C, D), period, delay)
+
+
+def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
+    def number(place: str, value: Any) -> float:
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        if not good or not 0.0 < value < np.inf:
+            raise UserError(f"{path}: {place}: is {json.dumps(value)[:40]}; give a number above 0")
+        return float(value)
+
+    known = ("gain", "integrator_hz", *SECTIONS)
+    for key in table:
+        if key not in known:
+            raise UserError(f"{path}: {key}: unknown key; known are {', '.join(known)}")
+    if "gain" not in table:
+        raise UserError(f"{path}: gain: is missing; give K at s = 0 in N/m (without integrator)")
+    one = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1))
+    found = replace(one, D=np.array([[number("gain", table["gain"])]]))
+    if "integrator_hz" in table:
+        w = HZ * number("integrator_hz", table["integrator_hz"])
+        found = _series(found, StateSpace(np.zeros((1, 1)), np.eye(1), np.array([[w]]), np.eye(1)))
+    for kind, (needed, optional) in SECTIONS.items():
+        rows = table.get(kind, [])
+        for i, row in enumerate(rows if isinstance(rows, list) else [rows], 1):
+            place = f"{kind} {i}"
+            if not isinstance(row, Mapping) or not set(needed) <= set(row) <= {*needed, *optional}:
+                raise UserError(f"{path}: {place}: give {', '.join((*needed, *optional))}")
+            values = {key: number(f"{place}: {key}", value) for key, value in row.items()}
+            found = _series(found, _section(values))
+    # a gain alone gets a state that nothing sees: what certifies a loop expects one
+    return found if len(found.A) else _series(found, UNSEEN)
+
+
+def _section(v: Mapping[str, float]) -> StateSpace:
+    """(b₂s² + b₁s + 1)/(a₂s² + a₁s + 1) of a row, in observer form."""
+    zeros, poles = np.array(_polynomial(v, "zero")), np.array(_polynomial(v, "pole"))
+    order = 2 if poles[0] else 1
+    b, a = (part[2 - order :] / poles[2 - order] for part in (zeros, poles))
+    D = b[0]
+    rest = b[1:] - a[1:] * D
+    A = np.zeros((order, order))
+    A[:, 0] = -a[1:]
+    A[:-1, 1:] = np.eye(order - 1)
+    C = np.zeros((1, order))
+    C[0, 0] = 1.0
+    return StateSpace(A, rest[:, None], C, np.array([[D]]))
+
+
+def _polynomial(v: Mapping[str, float], root: str) -> tuple[float, float, float]:
+    """Coefficients of s², s and 1; the constant 1 where there is no such root."""
+    if f"{root}_hz" not in v:
+        return 0.0, 0.0, 1.0
+    w = HZ * v[f"{root}_hz"]
+    if f"{root}_damping" not in v:
+        return 0.0, 1.0 / w, 1.0
+    return 1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0
+
+
+def _series(first: StateSpace, then: StateSpace) -> StateSpace:
+    """`then` behind `first`."""
+    n, m = len(first.A), len(then.A)
+    return StateSpace(
+        np.block([[first.A, np.zeros((n, m))], [then.B @ first.C, then.A]]),
+        np.vstack([first.B, then.B @ first.D]),
+        np.hstack([then.D @ first.C, then.C]),
+        then.D @ first.D,
+    )

@@ -1,0 +1,87 @@
+"""The plants of a run's [robust] set beside its nominal one, as a deployed loop meets them.
+
+What a robust design promises, stability and ‖S‖∞, is promised on every one of them; ω_b and S_low
+are the nominal plant's.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.verify import DENSE
+from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.sampled import SampledFigures
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+
+
+@dataclass(frozen=True)
+class Member:
+    """A perturbed plant and where it lies in the set."""
+
+    at: Perturbation
+    plant: ScaledPlant
+
+    def seen_by(self, channel: Channel) -> ScaledPlant:
+        """Uᵀ G V of a channel of the nominal plant: a perturbation leaves the mode shapes."""
+        B, C = self.plant.B @ channel.inputs, channel.outputs.T @ self.plant.C
+        return replace(self.plant, B=B.copy(), C=C.copy(), channels=())
+
+
+@dataclass(frozen=True)
+class MemberLoop:
+    """The sampled loop on a member of the set."""
+
+    at: Perturbation
+    figures: SampledFigures
+
+    @property
+    def badness(self) -> float:
+        """‖S‖∞, and beyond any the spectral radius of what is unstable."""
+        f = self.figures
+        return f.sensitivity_peak if f.stable else 1e9 * f.spectral_radius
+
+
+def place_words(at: Perturbation) -> str:
+    """`resonances +3 %, damping x 0.5`.
+
+    >>> place_words(Perturbation(0.03, 0.5)), place_words(Perturbation())
+    ('resonances +3 %, damping x 0.5', 'the nominal plant')
+    """
+    parts = [f"resonances {100.0 * at.shift:+.3g} %"] if at.shift else []
+    parts += [f"damping x {at.damping:.3g}"] if at.damping != 1.0 else []
+    return ", ".join(parts) or "the nominal plant"
+
+
+def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
+    """Every plant of the set but the nominal one; empty without a set.
+
+    `dense`: on as many shifts as a design is verified on.
+    """
+    robust = run.problem.robust
+    if robust is None:
+        return ()
+    system = mechanics(plant_of(run.problem), run.theta, derivatives=False)
+    places = robust.perturbations(DENSE if dense and robust.shift else None)
+    return tuple(
+        Member(at, scale_plant(modal_plant(system, run.problem.suspension, at), run.weights.M_K))
+        for at in places
+        if at != Perturbation()
+    )
+
+
+class WorstFirst:
+    """A test of all of a sequence that begins with the one that failed last."""
+
+    def __init__(self, items: Sequence[Member]) -> None:
+        self._items = list(items)
+
+    def all(self, test: Callable[[Member], bool]) -> bool:
+        """Whether every item passes."""
+        for i, item in enumerate(self._items):
+            if not test(item):
+                self._items.insert(0, self._items.pop(i))
+                return False
+        return True
