@@ -40,7 +40,8 @@ setup-test: .venv/.ready-test
 .venv/.ready: requirements.lock pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv
 	$(PIP) -c requirements.lock numba scipy
-	$(BIN)/python -m ccd_casadi.kernels & kernels=$$!; \
+	$(BIN)/python -c "from ccd_casadi.kernels import compilation; compilation.ensure_compiled()" & \
+	kernels=$$!; \
 	$(PIP) -r requirements.lock && \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e . \
 	|| { kill $$kernels; exit 1; }; \

@@ -114,7 +114,9 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
     workers = []
     try:
         for first in range(count):
-            command = [sys.executable, "-m", f"{PACKAGE}.compilation", *PARTS[first::count]]
+            # not -m, with which the package would import all that its commands need
+            start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
+            command = [*start, *PARTS[first::count]]
             workers.append(subprocess.Popen(command, env=settings, stdout=write))
         os.close(write)
         write = -1
@@ -232,10 +234,11 @@ class _Report(event.Listener):
             os.write(1, f"{_name(kernel)}\n".encode())
 
 
-if __name__ == "__main__":
+def work() -> None:
+    """Compile the parts that the command line names; Ctrl-C ends it without words."""
     event.register("numba:compile", _Report())
-    with contextlib.suppress(KeyboardInterrupt):  # whoever started this hears it as well
+    try:
         for part in sys.argv[1:]:
             compile_part(part)
-        sys.exit(0)
-    sys.exit(130)
+    except KeyboardInterrupt:  # whoever started this process hears it as well
+        os._exit(130)
