@@ -32,6 +32,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.progress import Progress
 from surrogates import design, save
 
 Formulation = Nested | Lifted | Direct
@@ -134,7 +135,11 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(sampler, outcome.x)
-    quality = surrogate_quality(outcome.surrogates, verified.x, seed)
+    with Progress(
+        1, "judging the surrogates", quiet=sampler.quiet or not outcome.surrogates
+    ) as bar:
+        quality = surrogate_quality(outcome.surrogates, verified.x, seed)
+        bar.advance()
     result = result_dict(
         sampler.problem,
         formulation,
