@@ -29,7 +29,9 @@ lint: setup-test
 docs: setup-test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
+# `make bench LONG="--long --compile"` adds the rows that take minutes.
 bench: setup-test
+	$(BIN)/python benchmarks/commands.py $(LONG)
 	$(BIN)/python benchmarks/synthesis.py
 
 setup: .venv/.ready

@@ -175,7 +175,13 @@ def main() -> None:
     seconds, count = inner_optimum(problems[0])
     print(f"one ω_b*(θ) by search_inner: {1e3 * seconds:.1f} ms, {count} syntheses")
     results |= {"ms_inner_optimum": 1e3 * seconds, "syntheses_inner_optimum": count}
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    print(f"{'':34s}{'now':>10s}{'last':>10s}")
+    for key, value in results.items():
+        if isinstance(value, float):
+            last = known.get(key)
+            print(f"  {key:32s}{value:10.4g}{'-' if last is None else format(last, '.4g'):>10s}")
+    RESULTS.write_text(json.dumps(known | results, indent=2) + "\n")
 
 
 if __name__ == "__main__":

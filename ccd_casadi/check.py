@@ -59,7 +59,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     case = load_case(options.case)
     problem = problem_of(case)
-    facts, findings = diagnose(problem, case.suspension.rigid_modes)
+    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.quiet)
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
         print(f"{options.case}: plant: {item.words}", file=sys.stderr)

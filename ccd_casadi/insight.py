@@ -44,7 +44,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             seed=options.seed,
             own=x,
         )
-    responses = post_optimal(done.problem, x)
+    responses = post_optimal(done.problem, x, options.quiet)
     seconds = perf_counter() - began
     found = insight_dict(done, front, responses)
     write_json(folder / "insight.json", found | {"seed": options.seed, "seconds": seconds})

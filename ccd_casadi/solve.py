@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.progress import Progress
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -125,7 +126,9 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"run folder    {folder}")
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    write_report(folder, resolved(case, solution), solution.problem or problem, solution)
+    with Progress(1, "drawing the report", quiet=options.quiet) as bar:
+        write_report(folder, resolved(case, solution), solution.problem or problem, solution)
+        bar.advance()
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code

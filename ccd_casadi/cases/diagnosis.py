@@ -21,6 +21,7 @@ from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require
 from ccd_casadi.plants.plant import Plant, mechanics, theta_words
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 
 MAX_CORNERS = 16
@@ -42,21 +43,44 @@ def points_to_check(problem: CoDesignProblem) -> list[tuple[float, ...]]:
     return list(dict.fromkeys(tuple(float(value) for value in row) for row in rows))
 
 
-@lru_cache(maxsize=4)
 def diagnose(
-    problem: CoDesignProblem, rigid_modes: int | None = None
+    problem: CoDesignProblem, rigid_modes: int | None = None, quiet: bool = True
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
 
     Facts are of the points where the matrices are those of a plant, in the order of
-    `points_to_check`. Raises PlantError where the model's function fails.
+    `points_to_check`; asked again, they are not computed again. Raises PlantError where the
+    model's function fails.
     """
+    return _diagnosed(problem, rigid_modes, _Quiet(quiet))
+
+
+class _Quiet:
+    """Whether there is a bar: equal to any other, since it changes nothing of what is found."""
+
+    def __init__(self, yes: bool) -> None:
+        self.yes = yes
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Quiet)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _diagnosed(
+    problem: CoDesignProblem, rigid_modes: int | None, quiet: _Quiet
+) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     plant = plant_of(problem)
     facts: list[PlantFacts] = []
     findings = list(_outside(problem, plant))
     if findings:
         return (), tuple(findings)
-    for index, theta in enumerate(points_to_check(problem)):
+    points = points_to_check(problem)
+    progress = Progress(len(points), "looking at the plant", quiet=quiet.yes)
+    for index, theta in enumerate(points):
+        progress.advance(int(index > 0))
         place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
         try:
             system = mechanics(plant, theta, derivatives=index == 0)
@@ -79,6 +103,7 @@ def diagnose(
             findings += unit_findings(problem, found, scaled)
         facts.append(found)
     findings = most_limiting(findings)
+    progress.advance()
     counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
     if len(counts) > 1 and rigid_modes is None:
         words = (

@@ -33,6 +33,8 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
+from ccd_casadi.synthesis.derivatives import Sensitivities
 
 WEAK = 1e-6  # a multiplier below this share of ‖∇J‖∞ holds nothing
 
@@ -79,7 +81,7 @@ class _Parameter:
     cost: float = 0.0
 
 
-def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
+def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> PostOptimal:
     """Responses at an optimum x = (θ, ln ω_S, ln ω_T) of the true problem.
 
     Costs 2n true syntheses for n variables, none where the constraints alone determine x.
@@ -102,7 +104,13 @@ def post_optimal(problem: CoDesignProblem, x: Array) -> PostOptimal:
     if Z.shape[1] and kinked:
         determined = False  # the second derivatives of each peak are not known
     elif Z.shape[1]:
-        columns = lagrangian_hessian(problem, x, np.eye(n), kkt.multipliers, quantities.at)
+        with Progress(2 * n, "second derivatives", quiet=quiet) as progress:
+
+            def at(point: Array) -> Sensitivities:
+                progress.advance()
+                return quantities.at(point)
+
+            columns = lagrangian_hessian(problem, x, np.eye(n), kkt.multipliers, at)
         H = np.full((n, n), np.nan) if columns is None else 0.5 * (columns + columns.T)
         reduced = Z.T @ H @ Z
         determined &= bool(np.isfinite(H).all() and np.linalg.eigvalsh(reduced).min() > 0.0)

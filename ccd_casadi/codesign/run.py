@@ -35,6 +35,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.progress import Progress
 from surrogates import design, save
 from surrogates.files import write_whole
 
@@ -216,7 +217,11 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(sampler, outcome.x) if verified is None else verified
-    quality = surrogate_quality(outcome.surrogates, verified.x, seed)
+    with Progress(
+        1, "judging the surrogates", quiet=sampler.quiet or not outcome.surrogates
+    ) as bar:
+        quality = surrogate_quality(outcome.surrogates, verified.x, seed)
+        bar.advance()
     result = result_dict(
         sampler.problem,
         formulation,

@@ -17,6 +17,7 @@ from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import handed_out, measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
 
@@ -72,7 +73,9 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
-        x, design, _ = polish(sampler, x)
+        with Progress(1, "polishing on the truth", quiet=sampler.quiet) as progress:
+            x, design, _ = polish(sampler, x)
+            progress.advance()
         at_bounds = _snapped(problem, x)
         if acceptable(problem, at_bounds, quantities.at(at_bounds)):
             x, design = at_bounds, quantities.at(at_bounds)
@@ -113,7 +116,9 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         inner_gap=float(gap),
         feasible=acceptable(problem, x, design),
         unsuspended=unsuspended,
-        references=check_references(problem, theta, final),
+        references=check_references(
+            problem, theta, final, workers=sampler.workers, quiet=sampler.quiet
+        ),
         robust=_check_robust(problem, theta, final),
         survival=survival(problem, theta, final.controller, final.figures.bandwidth)
         if final.figures.certified

@@ -82,7 +82,7 @@ def _smooth(M: NDArray, x: Array, p: float) -> tuple[Array, Array]:
     U, s, Vh = np.linalg.svd(_scaled(M, x))
     top = np.maximum(s[:, :1], np.finfo(float).tiny)
     w = (s / top) ** (2.0 * p)
-    total = w.sum(axis=1, keepdims=True)
+    total = np.maximum(w.sum(axis=1, keepdims=True), 1.0)  # less only where M is zero
     value = np.log(top[:, 0]) + np.log(total[:, 0]) / (2.0 * p)
     share = np.abs(U) ** 2 - np.abs(Vh.transpose(0, 2, 1)) ** 2
     return value, (share * (w / total)[:, None, :]).sum(axis=2)

@@ -32,6 +32,8 @@ class Progress:
         self._began = self._shown = time.monotonic()
 
     def __enter__(self) -> Self:
+        if self.terminal:  # so that a first step that takes long is seen to be under way
+            self._show(end="")
         return self
 
     def __exit__(
