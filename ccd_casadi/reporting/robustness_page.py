@@ -25,7 +25,6 @@ from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ
 from surrogates.files import write_whole
 
-
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
@@ -110,8 +109,8 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
         return []
     quarter, least = float(np.quantile(hz, 0.25)), float(hz.min())
     return [
-        f"Bandwidth on that hardware: a quarter of the stable plants has {number(quarter, 4)} Hz or "
-        f"less, the slowest {number(least, 4)} Hz, where the design has {number(design, 4)} Hz."
+        f"Bandwidth on that hardware: a quarter of the stable plants has {number(quarter, 4)} Hz "
+        f"or less, the slowest {number(least, 4)} Hz, where the design has {number(design, 4)} Hz."
     ]
 
 
