@@ -3,25 +3,30 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.deployment.c_code import FILES as C_FILES
-from ccd_casadi.deployment.c_code import write_c
-from ccd_casadi.deployment.discretise import Discretisation
-from ccd_casadi.deployment.files import DESIGN_FILES, write_files
-from ccd_casadi.deployment.pipeline import Deployment, Timing, deploy
-from ccd_casadi.reporting.deploy_page import write_report
+from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from surrogates.options import number, positive
 
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.cases.run_folder import FinishedRun
+    from ccd_casadi.deployment.pipeline import Deployment
+
 LEADS = {"auto": None, "on": True, "off": False}
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.deployment.c_code import FILES as C_FILES
+    from ccd_casadi.deployment.c_code import write_c
+    from ccd_casadi.deployment.files import DESIGN_FILES, write_files
+    from ccd_casadi.deployment.pipeline import deploy
+
     finished = read_run(options.run)
     folder = run_folder(options.run, options.out or options.run / "deploy")
     if folder.resolve() == options.run.resolve():
@@ -46,17 +51,19 @@ def command(options: argparse.Namespace) -> ExitCode:
             folder, found.realisation, title=options.run.resolve().name, delay=found.delay,
             verified=found.passed,
         )  # fmt: skip
-    write_report(folder / "report.html", finished, found)
     if not options.quiet:
         print(_summary(finished, found))
         print(f"report        {folder / 'report.html'}")
+    from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
+
+    write_report(folder / "report.html", finished, found)
     if found.passed:
         return ExitCode.DONE
     print(f"not verified: {_shortfall(found)}", file=sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
-def _summary(run: FinishedRun, found: Deployment) -> str:
+def _summary(run: "FinishedRun", found: "Deployment") -> str:
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
     )  # fmt: skip
@@ -85,7 +92,7 @@ def _summary(run: FinishedRun, found: Deployment) -> str:
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 
-def _shortfall(found: Deployment) -> str:
+def _shortfall(found: "Deployment") -> str:
     rate = f"{found.rate_hz:.6g} Hz"
     if found.needed_hz is None:
         return f"{rate} is not enough, and with this delay no rate is; shorten the delay"
@@ -122,7 +129,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--saturation", metavar="NEWTON", type=positive,
         help="clip every u to plus or minus this (default: off)",
     )  # fmt: skip
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 
 
 if __name__ == "__main__":

@@ -4,14 +4,14 @@ import argparse
 from collections.abc import Sequence
 from time import perf_counter
 
-from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.result import versions, write_json
-from ccd_casadi.robust.setpoint import Limits
-from ccd_casadi.robust.study import Demands, robustness, study_dict
+from ccd_casadi.robust.demands import Demands, Limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.progress import Progress
 from surrogates.options import number, positive, whole
 
+LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 _DEFAULT = Demands()
 _MOVE = (
     ("stroke", _DEFAULT.limits.stroke, "m"),
@@ -25,6 +25,10 @@ _MOVE = (
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.result import versions, write_json
+    from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
+
     began = perf_counter()
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
@@ -45,10 +49,21 @@ def command(options: argparse.Namespace) -> ExitCode:
         window=options.window,
         axis=options.axis - 1,
     )
-    found = robustness(finished, demands, options.seed, options.quiet)
-    answer = study_dict(finished, found)
-    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
-    write_json(folder / "robustness.json", answer)
+    with Workers(options.workers, PATIENCE) as workers:
+        found = tried(finished, demands, options.seed, options.quiet, workers)
+
+    def write() -> None:
+        answer = study_dict(finished, found)
+        answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+        write_json(folder / "robustness.json", answer)
+
+    write()  # the last of the figures may not come within its time
+    with Progress(
+        1, f"structured singular value, at most {options.limit:g} s", options.quiet
+    ) as bar:
+        found = with_structured_bound(finished, found, options.limit)
+        bar.advance()
+    write()
     from ccd_casadi.reporting.robustness_page import (  # matplotlib is slow
         conclusion,
         write_robustness,
@@ -84,7 +99,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, default, unit in _MOVE:
         add(f"--{name}", type=positive, default=default, metavar="X",
             help=f"of the move, {unit}; default {default:g}")  # fmt: skip
-    return run(command, arguments, argv)
+    add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
+        help=f"for the structured singular value; default {LIMIT:g}")  # fmt: skip
+    return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 
 if __name__ == "__main__":

@@ -3,20 +3,16 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
-from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of, write_run
-from ccd_casadi.codesign.stored import named_surrogate
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.registry import SHIPPED
-from ccd_casadi.reporting.verdict import terminal_lines
-from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.cases.sections import Case
+    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 _CODES = {
     "verified": ExitCode.DONE,
@@ -25,8 +21,10 @@ _CODES = {
 }
 
 
-def summary(solution: Solution) -> str:
+def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
+    from ccd_casadi.reporting.verdict import terminal_lines
+
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
@@ -54,8 +52,12 @@ def summary(solution: Solution) -> str:
     return "\n".join(lines)
 
 
-def show_findings(case: Case, problem: CoDesignProblem) -> None:
+def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
+    from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.plants.registry import SHIPPED
+
     if case.plant.model in SHIPPED:
         return
     found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
@@ -68,6 +70,14 @@ def show_findings(case: Case, problem: CoDesignProblem) -> None:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.codesign.run import co_design, formulation_of, write_run
+    from ccd_casadi.codesign.stored import named_surrogate
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.sampling.sampler import Sampler
+    from ccd_casadi.sampling.store import SampleStore
+
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is told before anything is written
@@ -86,14 +96,14 @@ def command(options: argparse.Namespace) -> ExitCode:
         formulation = formulation_of(case, options.formulation)
         solution = co_design(sampler, formulation, options.seed, given)
         write_run(folder, case, solution)
-    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
-
-    write_report(folder, case, problem, solution)
     code = _CODES[solution.result["status"]]
     if not options.quiet:
         print(summary(solution))
         print(f"run folder    {folder}")
-    elif code is not ExitCode.DONE:
+    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+
+    write_report(folder, case, problem, solution)
+    if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code
 
@@ -115,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="start from a version of the run folder's surrogates (0002), not by sampling",
     )
     add_scheduler(arguments)
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

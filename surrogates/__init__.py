@@ -11,66 +11,79 @@ Sample (`design`), fit (`fit`), judge (`quality_of`, `extrapolation`), export (`
 >>> bool(abs(float(f([0.5, 1.0])) - np.exp(-0.5) * np.sin(1.0)) < 1e-2)
 True
 
-The package knows nothing of what the function means. scikit-learn is imported when
-something is fitted and not before.
+The package knows nothing of what the function means. Names are imported when they are first
+used: this module alone loads nothing, and scikit-learn comes when something is fitted.
 """
 
 import sys as _sys
+from importlib import import_module as _import_module
+from types import ModuleType as _ModuleType
 
 from surrogates import interrupts as _interrupts
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
     _interrupts.starting()
 
-from surrogates.casadi_export import to_casadi
-from surrogates.covariance import Hyperparameters, Kernel
-from surrogates.extrapolation import Extrapolation, extrapolation
-from surrogates.fitting import Kind, fit, fit_outputs
-from surrogates.gaussian_process import GaussianProcess, condition, loo_errors
-from surrogates.interface import Errors, Surrogate, SurrogateFitError
-from surrogates.polynomial import Polynomial, fit_polynomial
-from surrogates.quality import Quality, Roughness, quality_of
-from surrogates.radial_basis import Basis, RadialBasis, fit_radial_basis
-from surrogates.samples import Samples, checked
-from surrogates.sampling_plan import DesignKind, corners, design, grid, latin_hypercube, sobol
-from surrogates.serialise import SurrogateFileError, load, save
-from surrogates.validation import errors
+del _interrupts
 
-del _interrupts, _sys
+# Every public name, and the module that defines it.
+_PUBLIC = {
+    "Basis": "radial_basis",
+    "DesignKind": "sampling_plan",
+    "Errors": "interface",
+    "Extrapolation": "extrapolation",
+    "GaussianProcess": "gaussian_process",
+    "Hyperparameters": "covariance",
+    "Kernel": "covariance",
+    "Kind": "fitting",
+    "Polynomial": "polynomial",
+    "Quality": "quality",
+    "RadialBasis": "radial_basis",
+    "Roughness": "quality",
+    "Samples": "samples",
+    "Surrogate": "interface",
+    "SurrogateFileError": "serialise",
+    "SurrogateFitError": "interface",
+    "checked": "samples",
+    "condition": "gaussian_process",
+    "corners": "sampling_plan",
+    "design": "sampling_plan",
+    "errors": "validation",
+    "extrapolation": "extrapolation",
+    "fit": "fitting",
+    "fit_outputs": "fitting",
+    "fit_polynomial": "polynomial",
+    "fit_radial_basis": "radial_basis",
+    "grid": "sampling_plan",
+    "latin_hypercube": "sampling_plan",
+    "load": "serialise",
+    "loo_errors": "gaussian_process",
+    "quality_of": "quality",
+    "save": "serialise",
+    "sobol": "sampling_plan",
+    "to_casadi": "casadi_export",
+}
+__all__ = sorted(_PUBLIC)
 
-__all__ = [
-    "Basis",
-    "DesignKind",
-    "Errors",
-    "Extrapolation",
-    "GaussianProcess",
-    "Hyperparameters",
-    "Kernel",
-    "Kind",
-    "Polynomial",
-    "Quality",
-    "RadialBasis",
-    "Roughness",
-    "Samples",
-    "Surrogate",
-    "SurrogateFileError",
-    "SurrogateFitError",
-    "checked",
-    "condition",
-    "corners",
-    "design",
-    "errors",
-    "extrapolation",
-    "fit",
-    "fit_outputs",
-    "fit_polynomial",
-    "fit_radial_basis",
-    "grid",
-    "latin_hypercube",
-    "load",
-    "loo_errors",
-    "quality_of",
-    "save",
-    "sobol",
-    "to_casadi",
-]
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(_import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+class _Package(_ModuleType):
+    """Keeps `surrogates.extrapolation` the function when the module of that name is imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _PUBLIC and isinstance(value, _ModuleType)):
+            super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Package

@@ -16,13 +16,13 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace, scale_plant
+from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
 from ccd_casadi.robust.perturbed import (
     damping_line,
     shift_line,
     single_modes,
     system_of,
-    tolerances,
     worst_in_box,
 )
 from ccd_casadi.robust.signals import closed_loop, gains, noise

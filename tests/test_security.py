@@ -35,8 +35,12 @@ LIVE = {
     "ccd_casadi/sampling/cluster.py",
     "ccd_casadi/support/deadline.py",
 }
-# They import by names that sources spell out: optional packages, and the public face.
-BY_NAME = {"ccd_casadi/support/optional_packages.py", "ccd_casadi/__init__.py"}
+# They import by names that sources spell out: optional packages, what a command needs, names.
+BY_NAME = {
+    "ccd_casadi/support/optional_packages.py",
+    "ccd_casadi/support/command_line.py",
+    "ccd_casadi/__init__.py",
+}
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.box_look import BoxLook, look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -36,7 +37,6 @@ from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import Quality, design, save
 from surrogates.files import write_whole
 
-FORMULATIONS = ("nested", "lifted", "direct")
 Formulation = Nested | Lifted | Direct
 
 

@@ -16,8 +16,10 @@ import numpy as np
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.process_pool import Pool
 
 ModelFunction = Callable[..., Mapping[str, Any]]
+Evaluate = Callable[[Sequence[float]], "Mechanics"]
 
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 # Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
@@ -49,10 +51,12 @@ class Plant:
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
-    plant modelled more closely, by name: a design is certified on them again, not optimised.
-    `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
-    result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
-    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
+    plant modelled more closely, by name, without derivatives: a design is certified on them again,
+    not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
+    reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
+    known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
+    to be checked by the true one. Without `exact_hessian` second derivatives of `hardware` cost too
+    much to be asked for.
     """
 
     names: tuple[str, ...]
@@ -65,6 +69,7 @@ class Plant:
     exact_hessian: bool = True
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
+    nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
 
 

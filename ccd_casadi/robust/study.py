@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,49 +8,37 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.robust.demands import Demands as Demands
+from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate
 from ccd_casadi.robust.perturbed import (
     Judged,
     Line,
-    Tolerances,
     damping_line,
     shift_line,
     single_modes,
     system_of,
-    tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robust.setpoint import Setpoint, setpoint
 from ccd_casadi.robust.signals import Noise, closed_loop, gains, noise
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.deadline import Overrun, Runner
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
 
 
 @dataclass(frozen=True)
-class Demands:
-    """What to try: relative shift and tolerance, damping factors, densities, the move.
-
-    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
-    """
-
-    shift: float = 0.05
-    damping: tuple[float, float] = (0.5, 2.0)
-    tolerance: float = 0.01
-    samples: int = 200
-    sensor: float = 1.0
-    disturbance: float = 1.0
-    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
-    window: float = 1e-6
-    axis: int = 0
-
-
-@dataclass(frozen=True)
 class Study:
     """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `free` whether the moves are those
-    of the plant without its suspension, `moves` the move without and with feedforward."""
+    of the plant without its suspension, `moves` the move without and with feedforward.
+
+    `structured` is None where no flexible mode is in the loop, and where the bound was not computed
+    within the `overrun` seconds that it was given.
+    """
 
     demands: Demands
     hz: Array
@@ -66,6 +54,7 @@ class Study:
     setpoint: Setpoint
     free: bool
     moves: tuple[Move, ...]
+    overrun: float | None = None
 
     @property
     def survives(self) -> bool:
@@ -78,6 +67,36 @@ def robustness(
     run: FinishedRun, demands: Demands | None = None, seed: int = 0, quiet: bool = True
 ) -> Study:
     """Put a run's controller through all that is demanded; nothing is designed anew."""
+    return with_structured_bound(run, tried(run, demands, seed, quiet))
+
+
+def with_structured_bound(run: FinishedRun, found: Study, seconds: float | None = None) -> Study:
+    """The study with its bound of the structured singular value.
+
+    Given `seconds`, it is computed in a process of its own, which is ended after them.
+    """
+    modal = modal_plant(system_of(run), run.problem.suspension)
+    if seconds is None:
+        bound = structured_bound(run.plant, modal, run.controller, found.hz)
+        return replace(found, structured=bound, overrun=None)
+    with Runner() as runner:
+        try:
+            bound = runner.call(
+                seconds, structured_bound, run.plant, modal, run.controller, found.hz
+            )
+        except Overrun:
+            return replace(found, structured=None, overrun=seconds)
+    return replace(found, structured=bound, overrun=None)
+
+
+def tried(
+    run: FinishedRun,
+    demands: Demands | None = None,
+    seed: int = 0,
+    quiet: bool = True,
+    workers: Pool | None = None,
+) -> Study:
+    """Everything but the structured singular value; `workers` share what they can."""
     demands = demands or Demands()
     bandwidth_hz = run.figures.bandwidth / HZ
     loop = loop_data(
@@ -85,7 +104,6 @@ def robustness(
         bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
     )  # fmt: skip
     system, d = system_of(run), demands
-    modal = modal_plant(system, run.problem.suspension)
     profile = setpoint(d.limits)
     free, moves = _moves(run, profile, d)
     closed = closed_loop(run.plant.plant_si(), run.controller)
@@ -95,12 +113,12 @@ def robustness(
         gains=gains(loop.plant, loop.controller),
         margins=margins(run.plant, run.controller, loop.hz, loop.plant, loop.controller),
         noise=noise(closed, d.sensor, d.disturbance),
-        shift=shift_line(run, system, d.shift),
-        damping=damping_line(run, system, *d.damping),
+        shift=shift_line(run, system, d.shift, quiet=quiet),
+        damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
-        structured=structured_bound(run.plant, modal, run.controller, loop.hz),
+        box=worst_in_box(run, system, d.shift, d.damping, quiet),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
+        structured=None,
         setpoint=profile,
         free=free,
         moves=moves,
@@ -164,6 +182,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
             "no_plant": hard.failed,
+            "reduced_model_difference": hard.difference,
             "unstable": sum(not item.stable for item in hard.judged),
             "stable_above_S_max": sum(
                 item.stable and item.peak > run.problem.inner.S_max for item in hard.judged
@@ -186,6 +205,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "stiffness": bound.stiffness,
             "shift": bound.shift,
         },
+        "structured_not_computed_within_s": found.overrun,
         "move": {
             "limits": limits,
             "duration": found.setpoint.duration,

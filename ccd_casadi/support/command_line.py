@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -82,14 +83,23 @@ def run(
     main: Callable[[argparse.Namespace], ExitCode],
     arguments: argparse.ArgumentParser,
     argv: Sequence[str] | None = None,
+    *,
+    needs: Sequence[str] = (),
 ) -> int:
-    """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
+    """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line.
+
+    The modules `needs` are what `main` imports that takes time: they are imported once the options
+    are known to be right, and while a Ctrl-C still finds nothing begun.
+    """
     code = ExitCode.INTERRUPTED
-    begun()
     try:
         options = arguments.parse_args(argv)
     except SystemExit as ended:  # after --help or a wrong option
+        begun()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    for module in needs:
+        import_module(module)
+    begun()
     try:
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with (

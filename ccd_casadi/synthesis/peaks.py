@@ -11,11 +11,15 @@ from scipy.optimize import minimize_scalar
 
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.gradients import design_with_gradients
+from ccd_casadi.kernels.gradients import (
+    DesignPlant,
+    Loop,
+    design_with_gradients,
+    peak_gradients,
+)
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.off_design import Loop, off_design_gradients
 from ccd_casadi.synthesis.weights import Weights
 
 # Around each closed-loop pole in multiples of its width, and over the decades about ω₀: what no
@@ -68,26 +72,24 @@ def local_peaks_with_gradients(
         for i, member in enumerate(members)
         for omega, gain in _peaks(member, (Ak, Bk, Ck), least)
     ]
+    if not found:
+        return ()
     loops = [
         Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega)
         for omega, at in ((omega, members[i]) for omega, i, _ in found)
     ]
     count = plant.dA.shape[0]
-    first = Loop(*base[:3], *slopes, row[Figure.BANDWIDTH])
-    out = []
+    design_plant = DesignPlant(*base[:3], *slopes, w, gamma_backoff)
     try:
-        for k in range(0, len(loops), 2):
-            pair = loops[k : k + 2]
-            rows, _, _ = off_design_gradients(
-                *base, gamma_backoff, *slopes, row, gradient[3], [first, pair[0], pair[-1]]
-            )
-            for (omega, i, gain), raw in zip(found[k : k + 2], rows[1:3], strict=False):
-                to_weights = raw[count:] * w
-                whole = np.array([*raw[:count], to_weights[2], to_weights[7]])
-                if np.isfinite(whole).all():
-                    out.append(LocalPeak(omega * w0, i, float(np.log(gain)), whole))
+        rows = peak_gradients(design_plant, row, gradient[3], loops)
     except np.linalg.LinAlgError:
         return ()
+    out = []
+    for (omega, i, gain), raw in zip(found, rows, strict=True):
+        to_weights = raw[count:] * w
+        whole = np.array([*raw[:count], to_weights[2], to_weights[7]])
+        if np.isfinite(whole).all():
+            out.append(LocalPeak(omega * w0, i, float(np.log(gain)), whole))
     return tuple(sorted(out, key=lambda peak: -peak.ln_gain))
 
 
