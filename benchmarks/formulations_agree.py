@@ -21,11 +21,11 @@ AGREE = 1e-3  # relative
 
 
 def formulations(parameters: int) -> tuple[Any, ...]:
-    """The defaults, but for nested: a Sobol plan, as a grid of five would be large, and six rounds.
+    """The defaults, but for nested: a Sobol plan, as a grid of five would be large, and two rounds.
 
     What is compared are the ends; nested's kinks cost thousands of syntheses with twelve rounds.
     """
-    nested = ccd.Nested(plan="sobol", points=8 * parameters, max_refinements=6)
+    nested = ccd.Nested(plan="sobol", points=8 * parameters, max_refinements=2)
     return nested, ccd.Lifted(), ccd.Direct()
 
 

@@ -161,7 +161,7 @@ def _move_ends(
     costs: Array,
     x: Array,
 ) -> None:
-    """Put the ends that are not verified where the surrogates see them, taught by the truth."""
+    """Put the ends that are not verified where the surrogates see them by now."""
     last = len(costs) - 1
     if not {0, last} & set(todo):
         return
