@@ -5,7 +5,7 @@ steps help no longer. The best one whose controller passes the judge (`certifica
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from time import perf_counter
 
@@ -15,11 +15,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
-from ccd_casadi.fixed_structure.optimality import (
-    Optimality,
-    log_bandwidth_gradient,
-    optimality,
-)
+from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
 from ccd_casadi.fixed_structure.structure import Structure, state_space
 from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
@@ -47,10 +43,11 @@ class SectionsOutcome(StrEnum):
 
 @dataclass(frozen=True)
 class LocalOptimum:
-    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached."""
+    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached, with one κ."""
 
     bandwidth: float
     count: int
+    kappa: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,6 +102,8 @@ def problem_for(
     if family.period is not None:
         fastest = min(fastest, 2.0 / family.period)
     slowest = 1e-3 if family.period is None else min(1e-3, 0.01 * fastest)
+    if structure.frequencies is not None:
+        slowest, fastest = (value / family.omega_0 for value in structure.frequencies)
     return Problem(family, structure, bounds, structure.bounds((slowest, fastest), (1e-6, 1e6)),
                    MARGIN)  # fmt: skip
 
@@ -178,18 +177,15 @@ def bandwidth_and_gradient(
     The gradient is NaN where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
     """
     problem = problem_for(plants, design.structure, bounds, sampling)
-    kappa = _scaled(problem, design.kappa)
+    kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = _optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    found = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
     slope = log_bandwidth_gradient(problem, kappa, found)
     return design.bandwidth, design.bandwidth * slope
 
 
-def _optimality(problem: Problem, point: Point) -> Optimality:
-    return optimality(problem, point)
-
-
-def _scaled(problem: Problem, kappa: Array) -> Array:
+def in_problem_units(problem: Problem, kappa: Array) -> Array:
+    """SI parameters κ in the units of the problem."""
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
 
@@ -202,7 +198,7 @@ def _initial(
         if isinstance(item, StateSpace):
             found.append(fitted(problem, item, rng))
         else:
-            found.append(np.clip(_scaled(problem, item), *problem.box)[None])
+            found.append(np.clip(in_problem_units(problem, item), *problem.box)[None])
     return kept(problem, np.concatenate(found))
 
 
@@ -253,14 +249,16 @@ def _race(problem: Problem, pool: Array, tell: Progress) -> tuple[list[Ascent], 
 
 
 def _distinct(problem: Problem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, ...]:
-    values = sorted((float(np.exp(end.point.tau)) * problem.plants.omega_0 for end in ends
-                     if end.point.assessment.violation <= 1e-4), reverse=True)  # fmt: skip
+    P = problem.plants
+    good = [end.point for end in ends if end.point.assessment.violation <= 1e-4]
     found: list[LocalOptimum] = []
-    for value in values:
+    for point in sorted(good, key=lambda point: -point.tau):
+        value = float(np.exp(point.tau)) * P.omega_0
         if found and value >= found[-1].bandwidth * (1.0 - SAME):
-            found[-1] = LocalOptimum(found[-1].bandwidth, found[-1].count + 1)
+            found[-1] = replace(found[-1], count=found[-1].count + 1)
         else:
-            found.append(LocalOptimum(value, 1))
+            kappa = problem.structure.in_units(point.kappa, P.omega_0, P.force)
+            found.append(LocalOptimum(value, 1, tuple(map(float, kappa))))
     return tuple(found)
 
 
@@ -278,7 +276,7 @@ def _designed(
     structure, bounds, P = problem.structure, problem.bounds, problem.plants
     kappa = structure.in_units(point.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
-    found = _optimality(problem, point)
+    found = optimality(problem, point)
     bandwidth = float(np.exp(point.tau)) * P.omega_0
     judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
     short: dict[str, float] = {}
