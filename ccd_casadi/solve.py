@@ -2,7 +2,8 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.diagnosis import Severity, diagnose, first_seen
@@ -10,6 +11,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.run import FORMULATIONS, Solution, co_design, formulation_of, write_run
 from ccd_casadi.codesign.stored import named_surrogate
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.plants.registry import SHIPPED
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.sampler import Sampler
@@ -29,6 +31,8 @@ def summary(solution: Solution) -> str:
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
+    if solution.sections is not None:
+        return sections_summary(solution.result)
     units = result["units"]
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     lines = [
@@ -46,6 +50,39 @@ def summary(solution: Solution) -> str:
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
         f"binding       {', '.join(result['active']) or 'nothing'}",
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
+        f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
+    ]
+    lines += [f"note          {words}" for words in result.get("notes", ())]
+    return "\n".join(lines)
+
+
+def sections_summary(result: Mapping[str, Any]) -> str:
+    """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
+    units = result["units"]
+    theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
+    certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
+    lines = [
+        f"status        {result['status']}  {result['reason']}".rstrip(),
+        f"theta         {theta}",
+        f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
+        f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant   predicted "
+        f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
+        f"controller    order {controller['order']}, gain {controller['gain']:.4g} N/m",
+        *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
+        f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
+        f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        f"compliance    {1e6 * result['compliance_max']:.4g} um/N at most, "
+        f"{1e6 * result['static_compliance']:.4g} um/N static",
+        f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
+        f"{certificate['plants']} plants: {certificate['norm']:.7g} of a bound at most, poles left "
+        f"of {certificate['max_real_pole']:.4g} 1/s",
+        f"robust        {'passed' if robust['passed'] else 'FAILED'} on {robust['plants']} plants "
+        f"of the box; the worst that was searched: {100.0 * robust['worst_excess']:+.3g} % of a "
+        "bound",
+        f"binding       {', '.join(result['active']) or 'nothing'}",
+        f"optimality    KKT residual {result['kkt']['stationarity'] or 0.0:.1e} over theta, "
+        f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
+        + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]

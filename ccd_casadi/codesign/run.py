@@ -24,12 +24,15 @@ from ccd_casadi.codesign.result import (
     result_dict,
     write_json,
 )
+from ccd_casadi.codesign.sections_result import sections_controller, sections_result
+from ccd_casadi.codesign.sections_run import VerifiedSections, run_sections
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.surrogate_quality import Quality, quality_dict, surrogate_quality
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from surrogates import design, save
 
@@ -45,6 +48,7 @@ class Solution:
     outcome: FormulationResult
     verified: VerifiedDesign | None
     quality: tuple[Quality, ...] = ()
+    sections: VerifiedSections | None = None  # instead of `verified`, of a fixed structure
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -101,6 +105,8 @@ def co_design(
     began = perf_counter()
     name = type(formulation).__name__.lower()
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
+    if sampler.problem.sections is not None and not forbidden:
+        return _of_sections(sampler, formulation, seed, given)
     if forbidden:
         outcome = FormulationResult(None, None, (), (), None, False, forbidden)
     else:
@@ -113,6 +119,29 @@ def co_design(
         if outcome.x is None:
             outcome = rescue(sampler, outcome, seed)
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
+
+
+def _of_sections(
+    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None
+) -> Solution:
+    """A co-design with a controller of fixed structure."""
+    if given is not None:
+        raise UserError("--surrogate: starts no solve with sections; solve the case without it")
+    began, name = perf_counter(), type(formulation).__name__.lower()
+    found = run_sections(sampler, formulation, seed)
+    spent: dict[str, Any] = {
+        "syntheses": found.syntheses, "seconds": perf_counter() - began, "seed": seed,
+    }  # fmt: skip
+    if found.verified is None:
+        return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
+    result = sections_result(
+        sampler.problem, name, found.outcome, found.verified, tolerance=formulation.tolerance,
+        **spent,
+    )  # fmt: skip
+    theta = np.array(found.verified.theta)
+    quality = surrogate_quality(found.outcome.surrogates, theta, seed)
+    result["surrogate_quality"] = clean(quality_dict(quality))
+    return Solution(result, found.outcome, None, quality, found.verified)
 
 
 def conclude(
@@ -178,6 +207,10 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:
         write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
+    if solution.sections is not None:
+        made = solution.sections
+        words = sections_controller(made.problem, made.design)
+        write_json(folder / "controller.json", words)
     if solution.outcome.surrogates:
         save(
             solution.outcome.surrogates,
