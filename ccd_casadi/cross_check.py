@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
-from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.cases.run_folder import read_run, refuse_sections
 from ccd_casadi.codesign.result import clean, figures_dict, versions, write_json
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
@@ -32,6 +32,7 @@ def _problem(
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
         point = (done.weights.omega_S, done.weights.omega_T)
+        refuse_sections(done, "cross_check", "result.json holds the judge's own figures")
         problem, theta = done.problem, done.theta
     else:
         case = load_case(options.case)

@@ -1,4 +1,4 @@
-"""The kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
+"""Kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
 
 import tomllib
 from collections.abc import Callable, Mapping

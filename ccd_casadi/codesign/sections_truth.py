@@ -122,7 +122,7 @@ def sections_kkt(
     symbol = ca.MX.sym("theta", theta.size)
     f, lam = plant.hardware(symbol)
     slopes = ca.Function("slopes", [symbol], [ca.jacobian(f, symbol), ca.jacobian(lam, symbol)])
-    df, dlam = (np.array(value) for value in slopes(theta))
+    dlam = np.array(slopes(theta)[1])
 
     def gradient_at(point: BandwidthSample) -> Array:
         own = np.array(slopes(np.array(point.theta))[0]).ravel()

@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
-from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -271,11 +271,25 @@ def judged_widely(
 
     The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
     """
-    sections, bounds = sections_of_problem(problem), bounds_of(problem)
-    uncertain = uncertain_plant(problem, theta)
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
     if not uncertain.names:
         points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
+    return _judged(problem, uncertain.plants(points), controller), len(points)
+
+
+def judged_corners(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> Certificate:
+    """The same on the model of every option and the corners of the box."""
+    uncertain = uncertain_plant(problem, theta)
+    return _judged(problem, uncertain.plants(uncertain.corners()), controller)
+
+
+def _judged(
+    problem: CoDesignProblem, plants: Sequence[ScaledPlant], controller: StateSpace
+) -> Certificate:
+    sections, bounds = sections_of_problem(problem), bounds_of(problem)
     loose = replace(
         bounds,
         S_max=bounds.S_max * (1.0 + LOOSE),
@@ -284,8 +298,7 @@ def judged_widely(
         compliance_max=_times(bounds.compliance_max),
     )
     integrator = sections.structure.integrator
-    plants = uncertain.plants(points)
-    return certify(plants, controller, loose, sections.sampling, integrator=integrator), len(points)
+    return certify(plants, controller, loose, sections.sampling, integrator=integrator)
 
 
 def _times(value: float | None) -> float | None:

@@ -8,8 +8,10 @@ from scipy.signal import cont2discrete
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
+from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
@@ -239,6 +241,12 @@ def _rates(found: Deployment) -> str:
         )
         for trial in found.trials
     )
+    if found.orders[0].chosen.method is Reduction.NONE and len(found.trials) == 1:
+        words = (
+            f"The loop was designed for {number(found.trials[0].needed_hz)} Hz with Tustin's rule, "
+            "hold and delay in it."
+        )
+        return paragraph(words)
     words = (
         "The least rate from which on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
         "included. The lead makes up for the phase of hold and delay, and raises the gain at half "
@@ -272,6 +280,12 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
     if K.D.shape != (1, 1):
         words = "This controller does not fall apart into scalar channels: no sections."
         return paragraph(words)
+    if run.problem.sections is not None and run.kappa is not None:
+        parts = section_words(run.problem.sections.structure, run.kappa)
+        head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+        rows = tuple((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in parts)
+        words = f"Gain {number(gain_of(run.kappa), 6)} N/m; the sections as they were designed."
+        return paragraph(words) + table_html(Table(head, rows))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
