@@ -27,9 +27,10 @@ from ccd_casadi.cases.checks import (
     too_large,
 )
 from ccd_casadi.cases.diagnosis import Severity, diagnose
-from ccd_casadi.cases.kinds import check_kind, read_options, sections_problem
+from ccd_casadi.cases.kinds import check_kind, read_options, require_scalar, sections_problem
 from ccd_casadi.cases.sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS, SHIPPED
@@ -384,13 +385,11 @@ def problem_of(case: Case) -> CoDesignProblem:
         ),
     )
     try:
-        plant = plant_of(problem)
-        if problem.sections is not None and (plant.inputs, plant.outputs) != (1, 1):
-            words = f"{plant.inputs} inputs and {plant.outputs} outputs"
-            raise PlantError(
-                f'has {words}; controller.structure = "sections" is for one of each: take one '
-                'channel of it, or controller.structure = "h_infinity"'
-            )
+        plants = [plant_of(problem)]
+        if problem.sections is not None:
+            options = problem.sections.uncertainty.options
+            plants += [plant_of(with_options(problem, item)) for item in options]
+            require_scalar(plants)
         if case.plant.model not in SHIPPED:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
                 if finding.severity is Severity.ERROR:

@@ -1,7 +1,7 @@
 """Kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,8 @@ from typing import Any
 from ccd_casadi.cases.sections import ControllerSection, InnerSection, LoopSection, RobustSection
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.plants.plant import Plant
+from ccd_casadi.support.errors import PlantError
 
 SHAPE = 1.1  # of sections, where the case gives none
 MOST_PLANTS = 24  # option sets
@@ -69,6 +71,16 @@ def read_options(path: Path) -> dict[str, Any]:
         if key in found:
             raise ValueError(f"{key} is no option of a plant; drop it")
     return found
+
+
+def require_scalar(plants: Sequence[Plant]) -> None:
+    """Raise PlantError unless every plant has one input and one output."""
+    for plant in plants:
+        if (plant.inputs, plant.outputs) != (1, 1):
+            raise PlantError(
+                f"has {plant.inputs} inputs and {plant.outputs} outputs; controller.structure = "
+                '"sections" is for one of each: take one channel of it, or "h_infinity"'
+            )
 
 
 def sections_problem(
