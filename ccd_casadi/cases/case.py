@@ -387,8 +387,8 @@ def problem_of(case: Case) -> CoDesignProblem:
     try:
         plants = [plant_of(problem)]
         if problem.sections is not None:
-            options = problem.sections.uncertainty.options
-            plants += [plant_of(with_options(problem, item)) for item in options]
+            sets = problem.sections.uncertainty.options
+            plants += [plant_of(with_options(problem, item)) for item in sets]
             require_scalar(plants)
         if case.plant.model not in SHIPPED:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:

@@ -100,7 +100,7 @@ def _read_sections(
     sections = problem.sections
     assert sections is not None
     try:
-        kappa = np.array(table["kappa"], dtype=float)  # type: ignore[index]
+        kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
     except (KeyError, TypeError, ValueError, OverflowError):
         raise UserError(f"{path}: sections.kappa: {words}") from None
     if kappa.shape != (len(sections.structure.names),) or not (np.abs(kappa) < 200.0).all():

@@ -31,17 +31,13 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Structure:
-    """How many of each section; `least_damping` of every pair of zeros and poles of the biquads.
-
-    `frequencies`: the least and largest of K's frequencies in rad/s; None: by the plants.
-    """
+    """How many of each section; `least_damping` of every pair of zeros and poles of the biquads."""
 
     integrator: bool = True
     lead: int = 1
     biquads: int = 2
     roll_off: int = 2
     least_damping: float = 0.0
-    frequencies: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("lead", "biquads", "roll_off"):

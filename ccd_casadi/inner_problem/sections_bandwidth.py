@@ -124,13 +124,13 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     if initial:
         made = synthesise_sections(
             plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
-            initial=initial, only_initial=True,
+            initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
     if made is None or not made.certified:
         made = synthesise_sections(
             plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
-            starts=min(FEW, sections.starts), initial=initial,
+            starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
     return valued(problem, theta, plants, made, spent)
@@ -160,7 +160,8 @@ def race(
     return synthesise_sections(
         plants_of(problem, theta), sections.structure, bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
-        initial=[np.array(kappa) for kappa in sections.anchors], progress=progress,
+        initial=[np.array(kappa) for kappa in sections.anchors],
+        frequencies=sections.frequencies, progress=progress,
     )  # fmt: skip
 
 
@@ -170,7 +171,7 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
     A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
     """
     sections = sections_of_problem(problem)
-    if sections.structure.frequencies is not None:
+    if sections.frequencies is not None:
         return problem
     plant = scaled_plant(problem, problem.start)
     poles = np.abs(np.linalg.eigvals(plant.A))
@@ -179,8 +180,7 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
     if sections.sampling is not None:
         fastest = min(fastest, 2.0 / sections.sampling.period)
         slowest = min(slowest, 0.01 * fastest)
-    structure = replace(sections.structure, frequencies=(slowest, fastest))
-    return replace(problem, sections=replace(sections, structure=structure))
+    return _with(problem, frequencies=(slowest, fastest))
 
 
 def prepared(

@@ -39,7 +39,8 @@ class SectionsProblem:
     with `shape` and `compliance_max` (m/N). A race of `starts` searches from `seed` finds the
     `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
-    before. Both are empty before the race.
+    before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
+    θ; None: by the plant at the start.
     """
 
     structure: Structure = field(default_factory=Structure)
@@ -50,6 +51,7 @@ class SectionsProblem:
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     starts: int = 24
     seed: int = 0
+    frequencies: tuple[float, float] | None = None
     anchors: tuple[tuple[float, ...], ...] = ()
     members: tuple[Member, ...] = ()
 
@@ -66,6 +68,7 @@ class SectionsProblem:
             | {"options": [dict(options) for options in self.uncertainty.options]},
             "starts": self.starts,
             "seed": self.seed,
+            "frequencies": self.frequencies,
             "anchors": self.anchors,
             "members": self.members,
         }

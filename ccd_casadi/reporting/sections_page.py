@@ -80,7 +80,11 @@ def loops_of(verified: "VerifiedSections") -> Loops:
     problem, made = verified.problem, verified.design
     sampling = sections_of_problem(problem).sampling
     inside = problem_for(
-        plants_of(problem, verified.theta), made.structure, bounds_of(problem), sampling
+        plants_of(problem, verified.theta),
+        made.structure,
+        bounds_of(problem),
+        sampling,
+        made.frequencies,
     )
     P = inside.plants
     low = 0.2 * problem.inner.omega_low
