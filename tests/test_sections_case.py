@@ -3,15 +3,19 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from case_documents import TWO_MASS
+from helpers import SUSPENSION, random_plant
 
 from ccd_casadi.cases.case import CaseError, load_case, problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, uncertain_plant
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.store import problem_hash
 
 RUNS = Path(__file__).parent.parent / "runs"
@@ -115,3 +119,27 @@ def test_a_plant_of_several_outputs_is_refused(tmp_path: Path) -> None:
     path.write_text(text + SECTIONS)
     with pytest.raises(CaseError, match="one of each"):
         problem_of(load_case(path))
+
+
+@pytest.mark.parametrize("modal", [True, False])
+def test_derivatives_of_plants_with_single_modes_shifted(modal: bool) -> None:
+    """Against differences of the transfer function, which knows no coordinates."""
+    plant = random_plant(7, rigid=1, flexible=3, inputs=1, outputs=1, modal=modal)
+    theta, h, s = np.array([0.4, 0.6]), 1e-5, 2j * np.pi * 60.0
+
+    def shifted(at: np.ndarray) -> ScaledPlant:
+        systems = (mechanics(plant, tuple(at)),)
+        uncertain = UncertainPlant(systems, SUSPENSION, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
+        return uncertain.plant(np.array([0.02, 0.1, -0.05, 0.07, 1.5, 0.1]))
+
+    def response(at: np.ndarray) -> complex:
+        G = shifted(at).plant_si()
+        return complex((G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B))[0, 0])
+
+    q = shifted(theta)
+    R = np.linalg.inv(s / q.omega_0 * np.eye(len(q.A)) - q.A)
+    for i in range(2):
+        e = h * np.eye(2)[i]
+        numeric = (response(theta + e) - response(theta - e)) / (2.0 * h)
+        exact = q.dC[i] @ R @ q.B + q.C @ R @ q.dA[i] @ R @ q.B + q.C @ R @ q.dB[i]
+        assert exact[0, 0] / q.force == pytest.approx(numeric, rel=1e-6)

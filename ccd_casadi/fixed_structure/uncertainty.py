@@ -72,19 +72,9 @@ class UncertainPlant:
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
         shift, factor = values.get("resonance_shift", 0.0), values.get("damping", 1.0)
         system = self.options[option]
-        modal = modal_plant(system, self.suspension, Perturbation(shift, factor))
-        own = [values.get(f"mode_shift {i}", 0.0) for i in range(1, self.modes + 1)]
-        if any(own):
-            ratio = np.ones(len(modal.natural))
-            flexible = np.flatnonzero(~modal.rigid)
-            ratio[flexible] += own[: len(flexible)]
-            # M⁻¹K = diag h: a mode's frequency times r is its row and column times r. Damping by
-            # ratio goes with the frequency, a given matrix stays, as with the common shift.
-            r = np.sqrt(np.outer(ratio**2, ratio**2))
-            D = modal.D * np.sqrt(r) if system.damping_ratio is not None else modal.D
-            dD = modal.dD * np.sqrt(r) if system.damping_ratio is not None else modal.dD
-            modal = replace(modal, K=modal.K * r, dK=modal.dK * r, D=D, dD=dD,
-                            natural=modal.natural * ratio)  # fmt: skip
+        own = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, self.modes + 1))
+        own = own if any(own) else ()
+        modal = modal_plant(system, self.suspension, Perturbation(shift, factor, own))
         gain = 1.0 + values.get("gain", 0.0)
         if gain != 1.0:
             modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
