@@ -60,6 +60,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
     units = result["units"]
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
+    residual = result["kkt"]["stationarity"]
     certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
@@ -80,7 +81,8 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"of the box; the worst that was searched: {100.0 * robust['worst_excess']:+.3g} % of a "
         "bound",
         f"binding       {', '.join(result['active']) or 'nothing'}",
-        f"optimality    KKT residual {result['kkt']['stationarity'] or 0.0:.1e} over theta, "
+        f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "
+        "theta, "
         f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
         + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",

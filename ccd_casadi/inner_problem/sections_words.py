@@ -10,7 +10,7 @@ from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
-NEAR = 1.5  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
+NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
 
 
 @dataclass(frozen=True)

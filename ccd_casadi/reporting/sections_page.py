@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 POINTS = 700
 ROWS = 40  # of the tables
-PERIODS = 8.0  # of ω_b that the force step is shown for
+SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
+STEPS = 200  # points of it
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def loops_of(verified: "VerifiedSections") -> Loops:
     high = 20.0 * float(np.abs(P.poles).max()) * P.omega_0
     if sampling is not None:
         high = min(high, 0.98 * np.pi / sampling.period)
-    near = np.abs(P.poles.imag) + np.abs(P.poles.real) * np.linspace(-4, 4, 9)[:, None, None]
+    near = np.abs(P.poles.imag) + np.abs(P.poles.real) * np.linspace(-12, 12, 97)[:, None, None]
     omega = np.concatenate([np.geomspace(low, high, POINTS), near.ravel() * P.omega_0])
     omega = np.unique(omega[(omega >= low) & (omega <= high)])
     v = P.variable(omega / P.omega_0)
@@ -219,15 +220,21 @@ def _nyquist(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loop
     curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
     nyquist = Panel("Re L", "Im L", tuple(curves), x_range=(-3.0, 1.0), y_range=(-1.75, 1.75),
                     legend="upper right")  # fmt: skip
-    seconds = PERIODS * HZ / verified.design.bandwidth
-    sampling = sections_of_problem(verified.problem).sampling
-    plants = plants_of(verified.problem, verified.theta)
+    certificate = verified.design.certificate
+    assert certificate is not None
     assert verified.design.controller is not None
-    steps = [force_step(p, verified.design.controller, sampling, seconds) for p in plants]
+    sampling = sections_of_problem(verified.problem).sampling
+    slow = min(-plant.stability for plant in certificate.plants)
+    if sampling is not None:
+        slow = -float(np.log1p(-slow)) / sampling.period
+    times = np.geomspace(0.02 / verified.design.bandwidth, SETTLED / slow, STEPS)
+    plants = plants_of(verified.problem, verified.theta)
+    steps = [force_step(p, verified.design.controller, sampling, times) for p in plants]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
     step = Panel("time (ms)", "y after a step of 1 N (µm)", (Curve(1e3 * t, y[0], "the model"),),
-                 (Band(1e3 * t, y.min(axis=0), y.max(axis=0), "all plants"),))  # fmt: skip
+                 (Band(1e3 * t, y.min(axis=0), y.max(axis=0), "all plants"),), log_x=True,
+                 legend="upper left")  # fmt: skip
     svg = figure_lines([[nyquist, step]], key="sections-nyquist", heights=(3.9,),
                        title="Nyquist plot of every plant, and a step of force")  # fmt: skip
     rows = np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
@@ -239,42 +246,52 @@ def _nyquist(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loop
 
 
 def force_step(
-    plant: ScaledPlant, K: StateSpace, sampling: Sampling | None, seconds: float
+    plant: ScaledPlant, K: StateSpace, sampling: Sampling | None, times: Array
 ) -> tuple[Array, Array]:
-    """Times in s and y in m after a step of 1 N, exact at these times.
+    """Times in s near the given ones, and y in m after a step of 1 N, exact at them.
 
-    Sampled: u_k reaches the plant after the delay, over whole periods and a rest.
+        y_n = C (I - A)⁻¹ (I - Aⁿ) B
+
+    of the loop over one step: a period, or where the loop is continuous the first of the times.
     """
-    G = plant.plant_si()
+    step = float(times[0]) if sampling is None else sampling.period
+    A, B, C = _over_a_step(plant.plant_si(), K, sampling, step)
+    counts = np.unique(np.maximum(np.round(times / step), 1.0).astype(int))
+    final = np.linalg.solve(np.eye(len(A)) - A, B)
+    y = [float(C @ (final - np.linalg.matrix_power(A, int(n)) @ final)) for n in counts]
+    return np.asarray(step * counts, float), np.array(y)
+
+
+def _over_a_step(
+    G: StateSpace, K: StateSpace, sampling: Sampling | None, T: float
+) -> tuple[Array, Array, Array]:
+    """The loop from a force to y in discrete time, the delay's whole periods and rest exact.
+
+    u_k reaches the plant after the delay: over the first part of a period an older one still acts.
+    """
+    n, m = len(G.A), len(K.A)
     if sampling is None:
         A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-        B = np.vstack([G.B, np.zeros((len(K.A), 1))])
-        step = seconds / POINTS
-        Ad, Bd = _held(A, B, step)
-        x, y = np.zeros((len(A), 1)), []
-        for _ in range(POINTS):
-            y.append(float((G.C @ x[: len(G.A)])[0, 0]))
-            x = Ad @ x + Bd
-        return np.asarray(step * np.arange(POINTS)), np.array(y, float)
-    T = sampling.period
+        A, B = _held(A, np.vstack([G.B, np.zeros((m, 1))]), T)
+        return A, B[:, 0], np.append(G.C[0], np.zeros(m))
     whole = int(np.floor(sampling.delay / T + 1e-9))
     rest = max(sampling.delay - whole * T, 0.0)
     first, second = _held(G.A, G.B, rest), _held(G.A, G.B, T - rest)
-    # Tustin: (I - A T/2)⁻¹ once, as in z = (1 + wT/2)/(1 - wT/2)
-    inverse = np.linalg.inv(np.eye(len(K.A)) - 0.5 * T * K.A)
-    Ak, Bk = inverse @ (np.eye(len(K.A)) + 0.5 * T * K.A), inverse @ K.B * T
+    inverse = np.linalg.inv(np.eye(m) - 0.5 * T * K.A)  # Tustin
+    Ak, Bk = inverse @ (np.eye(m) + 0.5 * T * K.A), T * inverse @ K.B
     Ck, Dk = K.C @ inverse, K.D + 0.5 * T * K.C @ inverse @ K.B
-    count = max(2, int(np.ceil(seconds / T)))
-    x, k, y = np.zeros((len(G.A), 1)), np.zeros((len(K.A), 1)), []
-    old = [0.0] * (whole + 2)  # u_k, u_{k-1}, …
-    for _ in range(count):
-        out = float((G.C @ x)[0, 0])
-        y.append(out)
-        old = [float((Ck @ k)[0, 0] - Dk[0, 0] * out), *old[:-1]]
-        k = Ak @ k - Bk * out
-        x = first[0] @ x + first[1] * (old[whole + 1] + 1.0)
-        x = second[0] @ x + second[1] * (old[whole] + 1.0)
-    return np.asarray(T * np.arange(count)), np.array(y, float)
+
+    def moved(state: Array, force: float) -> Array:
+        x, k, old = state[:n], state[n : n + m], state[n + m :]
+        e = -G.C @ x
+        u = np.concatenate([Ck @ k + Dk @ e, old])  # u_k, u_{k-1}, …
+        x = first[0] @ x + first[1][:, 0] * (u[whole + 1] + force)
+        x = second[0] @ x + second[1][:, 0] * (u[whole] + force)
+        return np.concatenate([x, Ak @ k + Bk @ e, u[:-1]])
+
+    size = n + m + whole + 1
+    A = np.array([moved(row, 0.0) for row in np.eye(size)]).T
+    return A, moved(np.zeros(size), 1.0), np.append(G.C[0], np.zeros(size - n))
 
 
 def _held(A: Array, B: Array, T: float) -> tuple[Array, Array]:
