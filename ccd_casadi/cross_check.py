@@ -23,7 +23,7 @@ def _problem(
 ) -> "tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]":
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
-    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.cases.run_folder import read_run, refuse_sections
     from ccd_casadi.inner_problem.problem import true_inner
 
     asked = (options.omega_S_hz, options.omega_T_hz)
@@ -35,6 +35,7 @@ def _problem(
         if options.theta is not None:
             raise CaseError(f"{options.case}: a run has its own theta; leave out --theta")
         point = (done.weights.omega_S, done.weights.omega_T)
+        refuse_sections(done, "cross_check", "result.json holds the judge's own figures")
         problem, theta = done.problem, done.theta
     else:
         case = load_case(options.case)

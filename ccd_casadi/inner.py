@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -31,10 +32,17 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise CaseError(f"{case.path}: give both --omega-s-hz and --omega-t-hz, or neither")
     began = perf_counter()
     cost = hardware_cost(plant_of(problem), theta)
+    if problem.sections is not None and single[0] is not None:
+        raise CaseError(
+            f"{case.path}: sections have no weights' frequencies; leave out --omega-s-hz and "
+            "--omega-t-hz"
+        )
     head: dict[str, Any] = {
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": cost,
     }
+    if problem.sections is not None:
+        return _sections(problem, theta, head, options, began)
     rows: tuple[DesignFigures, ...] = ()
     if single[0] is not None:
         point = (HZ * single[0], HZ * single[1])
@@ -72,6 +80,59 @@ def _best_at(
         return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
 
     return min(design_choices(problem), key=peak)
+
+
+def _sections(
+    problem: "CoDesignProblem",
+    theta: tuple[float, ...],
+    head: dict[str, Any],
+    options: argparse.Namespace,
+    began: float,
+) -> ExitCode:
+    """A full race of a fixed structure at θ, worst plants added, and the judge over the box."""
+    import numpy as np
+
+    from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.codesign.sections_result import active_of, design_dict, sections_controller
+    from ccd_casadi.inner_problem.sections_bandwidth import (
+        judged_widely,
+        prepared,
+        sections_of_problem,
+        with_range,
+        worst_members,
+    )
+
+    sections = replace(sections_of_problem(problem), seed=options.seed)
+    asked = replace(with_range(replace(problem, sections=sections)), start=theta)
+    tell = None if options.quiet else lambda words: print(words, file=sys.stderr, flush=True)
+    asked, made = prepared(asked, tell)
+    if not made.certified:
+        answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
+        _print(answer, (), options, began)
+        return ExitCode.INFEASIBLE
+    worst = worst_members(asked, theta, made)[0]
+    assert made.controller is not None
+    wide, checked = judged_widely(asked, theta, made.controller, worst)
+    answer = head | {
+        "status": "verified" if wide.passed else "not_verified",
+        **design_dict(asked, made),
+        "active": active_of(made),
+        "feasible": True,
+        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * made.bandwidth,
+        "robust": {
+            "plants": checked,
+            "passed": wide.passed,
+            "words": wide.words,
+            "bandwidth_hz": wide.bandwidth / HZ,
+            "worst_excess": float(np.expm1(worst.value)),
+        },
+        "syntheses": 1,
+    }
+    if options.out is not None:
+        folder = run_folder(options.case, options.out)
+        write_json(folder / "controller.json", sections_controller(asked, made))
+    _print(answer, (), options, began)
+    return ExitCode.DONE if wide.passed else ExitCode.NOT_VERIFIED
 
 
 def _design(

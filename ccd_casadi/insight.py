@@ -18,7 +18,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     import numpy as np
 
-    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.cases.run_folder import read_run, refuse_sections
     from ccd_casadi.codesign.insight import insight_dict
     from ccd_casadi.codesign.pareto import pareto_front
     from ccd_casadi.codesign.post_optimal import post_optimal
@@ -29,6 +29,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
     began = perf_counter()
     done = read_run(options.run)
+    refuse_sections(done, "insight", "report.html of the run shows what binds, with multipliers")
     folder = run_folder(options.run, options.out or options.run)
     x = np.array([*done.theta, *np.log([done.weights.omega_S, done.weights.omega_T])])
     with (

@@ -2,9 +2,9 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
@@ -30,6 +30,8 @@ def summary(solution: "Solution") -> str:
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
+    if solution.sections is not None:
+        return sections_summary(solution.result)
     units = result["units"]
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     lines = [
@@ -48,6 +50,43 @@ def summary(solution: "Solution") -> str:
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
         f"binding       {', '.join(result['active']) or 'nothing'}",
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
+        f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
+    ]
+    lines += [f"note          {words}" for words in result.get("notes", ())]
+    return "\n".join(lines)
+
+
+def sections_summary(result: Mapping[str, Any]) -> str:
+    """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
+    from ccd_casadi.inner_problem.sections_words import SectionWords
+
+    units = result["units"]
+    theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
+    residual = result["kkt"]["stationarity"]
+    certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
+    lines = [
+        f"status        {result['status']}  {result['reason']}".rstrip(),
+        f"theta         {theta}",
+        f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
+        f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant   predicted "
+        f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
+        f"controller    order {controller['order']}, gain {controller['gain']:.4g} N/m",
+        *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
+        f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
+        f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        f"compliance    {1e6 * result['compliance_max']:.4g} um/N at most, "
+        f"{1e6 * result['static_compliance']:.4g} um/N static",
+        f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
+        f"{certificate['plants']} plants: {certificate['norm']:.7g} of a bound at most, poles left "
+        f"of {certificate['max_real_pole']:.4g} 1/s",
+        f"robust        {'passed' if robust['passed'] else 'FAILED'} on {robust['plants']} plants "
+        f"of the box; the worst that was searched: {100.0 * robust['worst_excess']:+.3g} % of a "
+        "bound",
+        f"binding       {', '.join(result['active']) or 'nothing'}",
+        f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "
+        "theta, "
+        f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
+        + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]

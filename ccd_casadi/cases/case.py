@@ -8,7 +8,7 @@ import inspect
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,10 @@ from ccd_casadi.cases.checks import (
     too_large,
 )
 from ccd_casadi.cases.diagnosis import Severity, diagnose
+from ccd_casadi.cases.kinds import check_kind, read_options, require_scalar, sections_problem
 from ccd_casadi.cases.sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS, SHIPPED
@@ -148,7 +150,13 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         if not below < above:
             words = f"is {above:g}, not above {low} = {below:g}; give {high} > {low}, so that {why}"
             raise fail(f"weights.{high}", words)
+    check_kind(sections, fail)
     plant = _plant(data["plant"], path, fail)
+    files = sections["robust"].plants
+    absolute = tuple(str((path.parent / file).resolve()) for file in files)
+    for file, place in zip(files, absolute, strict=True):
+        _plant(dict(data["plant"]) | _options_in(file, place, fail), path, fail)
+    sections["robust"] = replace(sections["robust"], plants=absolute)
     theta = _theta(data["theta"], fail)
     needed = _MODEL_THETA.get(plant.model or "")
     if needed is not None:
@@ -181,9 +189,9 @@ def _section(
             raise fail(f"{name}.{key}", wrong)
         value = table[key]
         if isinstance(value, list):
-            whole = item.type == tuple[int, int]
-            value = tuple(v if whole else float(v) for v in value)
-        elif item.type is float:
+            kept = item.type in (tuple[int, int], tuple[str, ...])
+            value = tuple(v if kept else float(v) for v in value)
+        elif item.type in (float, float | None):
             value = float(value)
         values[key] = value
     return kind(**values)
@@ -235,6 +243,13 @@ def _plant(
             raise fail(f"plant.{data}", words)
         options[data] = str(place)  # absolute, as a function's file
     return PlantSection(model, function, options)
+
+
+def _options_in(file: str, place: str, fail: Callable[[str, str], CaseError]) -> dict[str, Any]:
+    try:
+        return read_options(Path(place))
+    except ValueError as error:
+        raise fail("robust.plants", f"{shown(file)}: {error}") from None
 
 
 def _option(value: Any) -> str | None:
@@ -373,10 +388,17 @@ def problem_of(case: Case) -> CoDesignProblem:
         ),
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
-        robust=_robust(case.robust),
+        robust=None if case.controller.structure == "sections" else _robust(case.robust),
+        sections=sections_problem(
+            case.controller, case.loop, case.robust, inner, _option_sets(case)
+        ),
     )
     try:
-        plant_of(problem)
+        plants = [plant_of(problem)]
+        if problem.sections is not None:
+            sets = problem.sections.uncertainty.options
+            plants += [plant_of(with_options(problem, item)) for item in sets]
+            require_scalar(plants)
         if case.plant.model not in SHIPPED:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
                 if finding.severity is Severity.ERROR:
@@ -389,6 +411,22 @@ def problem_of(case: Case) -> CoDesignProblem:
         words = f"{function} raised {described(error)}; mend it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
+
+
+def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
+    """The plant options of every file that [robust] names, data files by their absolute path."""
+    found = []
+    for file in case.robust.plants:
+
+        def fail(key: str, words: str) -> CaseError:
+            return CaseError(one_line(f"{case.path}: {key}: {words}"))
+
+        options = _options_in(file, file, fail)
+        data = DATA.get(case.plant.model or "")
+        if data in options:
+            options[data] = str((case.path.parent / options[data]).resolve())
+        found.append(tuple(sorted((key, _frozen(value)) for key, value in options.items())))
+    return tuple(found)
 
 
 def _robust(section: RobustSection) -> RobustSet | None:

@@ -82,6 +82,11 @@ def factors(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers above 0"
 
 
+def files(value: Any) -> str | None:
+    good = isinstance(value, list | tuple) and all(isinstance(v, str) and v for v in value)
+    return None if good else f"is {shown(value)}; give a list of file names in quotes"
+
+
 def rows(width: int) -> Check:
     """A list of rows of `width` finite numbers."""
 

@@ -15,13 +15,15 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.sections import Case
+from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import judged_corners
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import DesignFigures
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
@@ -49,6 +51,7 @@ class FinishedRun:
     sampled_judge: Callable[[ScaledPlant], tuple[bool, float, float, float]] | None = None
     sampled_responses: Callable[[Array], tuple[np.ndarray, np.ndarray]] | None = None
     period: float = 0.0
+    kappa: Array | None = None  # of a fixed structure, SI
 
 
 def read_run(folder: Path) -> FinishedRun:
@@ -66,6 +69,8 @@ def read_run(folder: Path) -> FinishedRun:
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
     theta = _theta(folder / "result.json", result, problem)
+    if problem.sections is not None:
+        return _read_sections(folder, case, problem, theta, result)
     frequencies = [_number(folder / "result.json", result, k) for k in ("omega_S_hz", "omega_T_hz")]
     weights = problem.weights.at(HZ * frequencies[0], HZ * frequencies[1])
     plant = scaled_plant(problem, theta)
@@ -81,6 +86,49 @@ def read_run(folder: Path) -> FinishedRun:
         words = f"is not certified on the plant of case.toml: {figures.outcome.value}"
         raise UserError(f"{path}: {words}; solve the case again")
     return FinishedRun(folder, case, problem, theta, plant, weights, controller, figures, result)
+
+
+def _read_sections(
+    folder: Path,
+    case: Case,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    result: Mapping[str, Any],
+) -> FinishedRun:
+    """A run with a controller of fixed structure: rebuilt from κ, judged on the corners of its set.
+
+    `figures` are those of the continuous loop with the model; hold and delay are not in them.
+    """
+    path = folder / "controller.json"
+    table = read_json(path).get("sections")
+    words = "is no list of parameters of the case's structure; solve the case again"
+    sections = problem.sections
+    assert sections is not None
+    try:
+        kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise UserError(f"{path}: sections.kappa: {words}") from None
+    if kappa.shape != (len(sections.structure.names),) or not (np.abs(kappa) < 200.0).all():
+        raise UserError(f"{path}: sections.kappa: {words}")
+    controller = state_space(sections.structure, kappa)
+    judged = judged_corners(problem, theta, controller)
+    if not judged.passed:
+        words = f"is not certified on the plants of case.toml: {judged.words}"
+        raise UserError(f"{path}: {words}; solve the case again")
+    plant, weights = scaled_plant(problem, theta), problem.weights
+    figures = measure(
+        plant, controller, weights, gamma=UNBOUNDED, omega_low=problem.inner.omega_low
+    )
+    return FinishedRun(
+        folder, case, problem, theta, plant, weights, controller, figures, result, kappa=kappa
+    )
+
+
+def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:
+    """Raise UserError where a command is for mixed sensitivity only."""
+    if run.problem.sections is not None:
+        words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'
+        raise UserError(f"{run.folder / 'case.toml'}: controller.structure: {words}")
 
 
 def read_json(path: Path) -> Mapping[str, Any]:

@@ -17,6 +17,8 @@ from ccd_casadi.cases.checks import (
     choice,
     count,
     factors,
+    files,
+    flag,
     interval,
     number,
     points,
@@ -87,6 +89,8 @@ class InnerSection:
     )
     sweep_points: tuple[int, int] = _key(points, (20, 20))
     method: str = _key(choice("search", "sweep"), "search")
+    shape: float | None = _key(number(1.0, 10.0, "give 1 to 10", closed=True), None)
+    compliance_max: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,10 @@ class RobustSection:
     `resonance_shift` s: flexible frequencies at `shifts` places from -s to +s (relative), each with
     damping times 1 and every factor of `damping`. `design_at`: which end of that range, or its
     middle, the controller is synthesised for; "auto" tries all three and keeps the best.
+
+    With sections the box between these ends counts, searched for its worst plants, and besides:
+    `mode_shift` of each flexible mode on its own, `gain` of the whole plant, `plants`: TOML files
+    of plant options (loads, positions).
     """
 
     resonance_shift: float = _key(
@@ -113,6 +121,40 @@ class RobustSection:
     shifts: int = _key(count(2), 5)
     damping: tuple[float, ...] = _key(factors, ())
     design_at: str = _key(choice("auto", "low", "nominal", "high"), "auto")
+    mode_shift: float = _key(
+        number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True), 0.0
+    )
+    gain: float = _key(number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True), 0.0)
+    plants: tuple[str, ...] = _key(files, ())
+
+
+@dataclass(frozen=True)
+class ControllerSection:
+    """[controller]: "h_infinity", of full order by mixed sensitivity, or "sections".
+
+    The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
+    of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
+    The search starts at `starts` places.
+    """
+
+    structure: str = _key(choice("h_infinity", "sections"), "h_infinity")
+    integrator: bool = _key(flag, True)
+    lead: int = _key(count(0), 1)
+    biquads: int = _key(count(0), 2)
+    roll_off: int = _key(count(0), 2)
+    weighted_level: float | None = _key(POSITIVE, None)
+    least_damping: float = _key(
+        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True), 0.0
+    )
+    starts: int = _key(count(1), 24)
+
+
+@dataclass(frozen=True)
+class LoopSection:
+    """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
+
+    rate_hz: float | None = _key(POSITIVE, None)
+    delay_us: float = _key(number(0.0, 1e6, "give 0 to 1e6", closed=True), 0.0)
 
 
 @dataclass(frozen=True)
@@ -177,6 +219,8 @@ class Case:
     inner: InnerSection
     suspension: SuspensionSection
     robust: RobustSection
+    controller: ControllerSection
+    loop: LoopSection
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
@@ -189,6 +233,8 @@ SECTIONS: dict[str, type] = {
     "inner": InnerSection,
     "suspension": SuspensionSection,
     "robust": RobustSection,
+    "controller": ControllerSection,
+    "loop": LoopSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,

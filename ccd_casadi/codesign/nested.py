@@ -50,11 +50,17 @@ class Nested:
 
 
 def solve_nested(
-    sampler: Sampler, options: Nested, *, seed: int, given: Surrogates | None = None
+    sampler: Sampler,
+    options: Nested,
+    *,
+    seed: int,
+    given: Surrogates | None = None,
+    gradients: bool = False,
 ) -> FormulationResult:
     """Sample a design over θ, then rounds of fit, IPOPT and truth; the best verified θ wins.
 
-    With a `given` surrogate the design is what that was fitted to.
+    With a `given` surrogate the design is what that was fitted to; `gradients`: the surrogate is
+    fitted to the envelope's gradients too.
     """
     problem = sampler.problem
     lower, upper = box(problem)
@@ -76,7 +82,7 @@ def solve_nested(
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
-        surrogate = fit_bandwidth(problem, local, seed, options.kernel)
+        surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
         program = nested_program(problem, to_casadi(surrogate, std=False))
         program = replace(program, lower=low, upper=high)
         try:
@@ -122,15 +128,26 @@ def solve_nested(
 
 
 def fit_bandwidth(
-    problem: CoDesignProblem, samples: list[BandwidthSample], seed: int, kind: str = "matern52"
+    problem: CoDesignProblem,
+    samples: list[BandwidthSample],
+    seed: int,
+    kind: str = "matern52",
+    gradients: bool = False,
 ) -> GaussianProcess:
-    """An interpolating Gaussian process of ω_b*(θ) in rad/s over the whole box."""
+    """An interpolating Gaussian process of ω_b*(θ) in rad/s over the whole box.
+
+    With `gradients` of those samples that have one, if most do.
+    """
+    sloped = [sample for sample in samples if np.isfinite(sample.gradient).all()]
+    gradients = gradients and len(sloped) > len(samples) // 2
+    samples = sloped if gradients else samples
+    dY = np.array([sample.gradient for sample in samples]) if gradients else None
     X = np.array([sample.theta for sample in samples])
     Y = np.array([sample.bandwidth for sample in samples])
     lower, upper = box(problem)
     noise = 1e-7 * float(np.abs(Y).max())
     return best_left_out(
-        fit(X, Y, lower=lower, upper=upper, noise=noise, seed=seed, kernel=kernel)
+        fit(X, Y, dY, lower=lower, upper=upper, noise=noise, seed=seed, kernel=kernel)
         for kernel in kernels_of(kind)
     )
 

@@ -104,8 +104,8 @@ def result_dict(
         "checks": checks,
         "active": list(verified.active),
         "inner_gap": verified.inner_gap,
-        "kkt": _kkt(verified.kkt),
-        "globality": _globality(outcome.outer),
+        "kkt": kkt_dict(verified.kkt),
+        "globality": globality_dict(outcome.outer),
         "box_look": _box_look(look),
         "without_suspension": {
             "stable": verified.unsuspended.certificate.stable,
@@ -268,7 +268,7 @@ def clean(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _kkt(certificate: KktCertificate) -> dict[str, Any]:
+def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
     second = certificate.second_order
     return asdict(certificate) | {
         "second_order": None if second is None or math.isinf(second) else second,
@@ -300,7 +300,7 @@ def _box_look(look: BoxLook | None) -> dict[str, Any]:
     return found | {"moved": look.moved}
 
 
-def _globality(solution: OuterSolution | None) -> dict[str, Any]:
+def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
     """Starts tried, distinct local optima of the last problem solved, the best J of each."""
     if solution is None:
         return {"starts": 0, "optima": []}

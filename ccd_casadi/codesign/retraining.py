@@ -57,6 +57,9 @@ def open_run(
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
+        if problem.sections is not None:
+            words = "retraining is for mixed sensitivity so far; solve goes on from its samples"
+            raise UserError(f"{folder / 'case.toml'}: controller.structure: {words}")
         formulation = _formulation(folder)
         with (
             pool(scheduler, workers, PATIENCE) as evaluators,

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,21 +20,25 @@ from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import (
+    clean,
     controller_dict,
     infeasible_dict,
     predicted_bandwidth,
     result_dict,
     write_json,
 )
+from ccd_casadi.codesign.sections_result import sections_controller, sections_result
+from ccd_casadi.codesign.sections_run import run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
-from ccd_casadi.codesign.surrogate_quality import surrogate_quality
+from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
 from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.progress import Progress
 from surrogates import design, save
@@ -109,6 +114,8 @@ def co_design(
         return conclude(each, name, outcome, formulation.tolerance, seed, began)
 
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
+    if sampler.problem.sections is not None and not forbidden:
+        return _of_sections(sampler, formulation, seed, given)
     if forbidden:
         return concluded(sampler, FormulationResult(None, None, (), (), None, False, forbidden))
 
@@ -196,6 +203,29 @@ def _best(found: list[VerifiedDesign], tolerance: float) -> VerifiedDesign:
     return min(stationary or near, key=lambda item: item.objective)
 
 
+def _of_sections(
+    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None
+) -> Solution:
+    """A co-design with a controller of fixed structure."""
+    if given is not None:
+        raise UserError("--surrogate: starts no solve with sections; solve the case without it")
+    began, name = perf_counter(), type(formulation).__name__.lower()
+    found = run_sections(sampler, formulation, seed)
+    spent: dict[str, Any] = {
+        "syntheses": found.syntheses, "seconds": perf_counter() - began, "seed": seed,
+    }  # fmt: skip
+    if found.verified is None:
+        return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
+    result = sections_result(
+        sampler.problem, name, found.outcome, found.verified, tolerance=formulation.tolerance,
+        **spent,
+    )  # fmt: skip
+    theta = np.array(found.verified.theta)
+    quality = surrogate_quality(found.outcome.surrogates, theta, seed)
+    result["surrogate_quality"] = clean(quality_dict(quality))
+    return Solution(result, found.outcome, None, quality, sections=found.verified)
+
+
 def conclude(
     sampler: Sampler,
     formulation: str,
@@ -275,6 +305,10 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:
         write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
+    if solution.sections is not None:
+        made = solution.sections
+        words = sections_controller(made.problem, made.design)
+        write_json(folder / "controller.json", words)
     if solution.outcome.surrogates:
         save(
             solution.outcome.surrogates,

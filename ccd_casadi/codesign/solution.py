@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from surrogates import Quality
@@ -21,3 +22,4 @@ class Solution:
     verified: VerifiedDesign | None
     quality: tuple[Quality, ...] = ()
     problem: CoDesignProblem | None = None
+    sections: VerifiedSections | None = None  # instead of `verified`, of a fixed structure

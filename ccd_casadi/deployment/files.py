@@ -9,6 +9,7 @@ from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop
 from ccd_casadi.deployment.sections import Root, Section, sections_of
+from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.interchange import DesignFile, named_controller, named_plant, write_mat
@@ -111,7 +112,7 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
             "members": [_member(item) for item in found.members],
         },
         "methods": {trial.conversion.label: trial.needed_hz for trial in found.trials},
-        "channels": [_channel(item, run.figures.bandwidth) for item in found.orders],
+        "channels": [_channel(item, run) for item in found.orders],
         "theta": dict(zip(run.problem.names, run.theta, strict=True)),
         "versions": versions(),
         "seed": seed,
@@ -141,7 +142,7 @@ def _figures(figures: DesignFigures) -> dict[str, Any]:
     }
 
 
-def _channel(item: ChannelOrders, bandwidth: float) -> dict[str, Any]:
+def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
     K = item.chosen.controller
     scalar = K.D.shape == (1, 1)
     return {
@@ -153,7 +154,7 @@ def _channel(item: ChannelOrders, bandwidth: float) -> dict[str, Any]:
         "method": item.chosen.method.value,
         "smallest_order_at_S_max": item.strict.order,
         "orders": [_row(row) for row in item.rows],
-        "sections": _sections(K, bandwidth) if scalar else None,
+        "sections": _sections(K, run) if scalar else None,
     }
 
 
@@ -164,8 +165,10 @@ def _row(row: Reduced) -> dict[str, Any]:
     )
 
 
-def _sections(K: StateSpace, bandwidth: float) -> dict[str, Any]:
-    found = sections_of(K, bandwidth)
+def _sections(K: StateSpace, run: FinishedRun) -> dict[str, Any]:
+    if run.problem.sections is not None and run.kappa is not None:
+        return sections_dict(run.problem.sections.structure, run.kappa)
+    found = sections_of(K, run.figures.bandwidth)
     return {
         "gain": found.gain,
         "gain_at_bandwidth": found.gain_at_bandwidth,

@@ -18,7 +18,7 @@ from ccd_casadi.deployment.discretise import (
     nice_rate,
 )
 from ccd_casadi.deployment.realisation import Realisation, realise
-from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
+from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction, reductions, smallest
 from ccd_casadi.deployment.robust_set import (
     Member,
     MemberLoop,
@@ -34,9 +34,10 @@ from ccd_casadi.deployment.sampled import (
     sensitivity_loop,
     together,
 )
-from ccd_casadi.deployment.simulation import MeasuredSensitivity, measure_set
+from ccd_casadi.deployment.simulation import MeasuredSensitivity, measure_sensitivity, measure_set
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.deployment.timing import Timing as Timing
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import StateSpace
@@ -181,6 +182,8 @@ def deploy(
     All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
     where no sampling rate is enough, or the given one is no rate for this loop.
     """
+    if run.problem.sections is not None:
+        return _deploy_sections(run, run.problem.sections, timing, saturation, seed, progress)
     inner, full = run.problem.inner, run.figures
     bandwidth_hz = full.bandwidth / HZ
     if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
@@ -338,6 +341,71 @@ def _badness(figures: SampledFigures | None) -> float:
     if figures is None:
         return np.inf
     return figures.sensitivity_peak if figures.stable else 1e9 * figures.spectral_radius
+
+
+def _deploy_sections(
+    run: FinishedRun,
+    sections: SectionsProblem,
+    timing: Timing,
+    saturation: float | None,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Deployment:
+    """The sections as they are: nothing is reduced, at the case's rate and delay by Tustin's rule.
+
+    Where the case gives no rate, the one that is needed is searched as for any controller.
+    """
+    inner, full, K = run.problem.inner, run.figures, run.controller
+    channel = split(run.plant, K)[0]
+    G, designed = run.plant.plant_si(), sections.sampling
+    whole = Reduced(len(K.A), Reduction.NONE, K, full)
+    limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
+    tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
+    if designed is None:
+        progress("rate")
+        bandwidth, conversions = full.bandwidth, _conversions(timing, tustin.warp)
+        target = Target(SAMPLED_PEAK * inner.S_max, bandwidth, SAMPLED_BANDWIDTH)
+    else:
+        # What was designed is the sampled loop: that is what a given rate or delay is held against.
+        conversions = [tustin]
+        own = loop_at(G, K, tustin, designed.period, designed.delay)
+        bandwidth = own.bandwidth
+        target = Target(inner.S_max * (1.0 + 1e-3), bandwidth, SAMPLED_BANDWIDTH)
+        timing = replace(timing, rate_hz=timing.rate_hz or designed.rate_hz)
+        if timing.delay is None and timing.delay_samples == Timing.delay_samples:
+            timing = replace(timing, delay=designed.delay)
+    trials = []
+    for conversion in conversions:
+        progress(f"rate for {conversion.label}")
+
+        def met(rate: float, conversion: Conversion = conversion) -> bool:
+            return target.met(loop_at(G, K, conversion, 1.0 / rate, timing.delay_at(rate)))
+
+        if designed is None:
+            also = () if timing.rate_hz is None else (timing.rate_hz,)
+            trials.append(Trial(conversion, needed_rate(met, bandwidth / HZ, also)))
+        else:
+            given = timing.rate_hz or designed.rate_hz
+            trials.append(Trial(conversion, given if met(given) else designed.rate_hz))
+    best = min(trials, key=lambda t: float("inf") if t.needed_hz is None else t.needed_hz)
+    if timing.rate_hz is None and best.needed_hz is None:
+        words = f"no sampling rate up to {FASTEST * bandwidth / HZ:.3g} Hz keeps S_max to 5 %"
+        remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
+        raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
+    rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
+    delay, period = timing.delay_at(rate), 1.0 / rate
+    realisation = realise([channel], [discretise(K, best.conversion, period, delay)], saturation)
+    held = sampled_plant(G, period, delay)
+    sampled = sampled_figures(sensitivity_loop(held, realisation.system))
+    progress("simulation")
+    measured = None
+    if sampled.stable:
+        measured = measure_sensitivity(held, realisation.system, full.bandwidth, seed)
+    orders = (ChannelOrders(channel, (whole,), whole, whole),)
+    return Deployment(
+        orders, limits, K, full, tuple(trials), target, rate, delay, best.conversion, held,
+        realisation, sampled, measured,
+    )  # fmt: skip
 
 
 def _orders(

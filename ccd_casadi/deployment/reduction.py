@@ -43,6 +43,7 @@ class Reduction(StrEnum):
     PERTURBATION = "singular perturbation"
     COPRIME = "coprime factors"
     CLOSED_LOOP = "closed-loop balancing"
+    NONE = "as designed"
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.inner_problem.search import search_inner
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
@@ -127,6 +128,7 @@ class CoDesignProblem:
     suspension: Suspension
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
     robust: RobustSet | None = None
+    sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -135,6 +137,8 @@ class CoDesignProblem:
         """
         w, robust = self.weights, self.robust
         perturbed = {} if robust is None else {"robust": vars(robust)}
+        if self.sections is not None:
+            perturbed["sections"] = self.sections.identity() | {"omega_T": w.omega_T}
         return {
             "numerics": NUMERICS,
             "plant": self.source.identity(),
@@ -288,6 +292,7 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     >>> round(best.bandwidth / ccd.HZ, 2), best.active
     (58.23, ('S_max', 'omega_T lower'))
     """
+    _require_mixed(problem)
     return best_choice(problem, theta)[1]
 
 
@@ -320,11 +325,19 @@ def true_design(
     >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
     (True, [-0.21, -0.138])
     """
+    _require_mixed(problem)
     if len(design_choices(problem)) > 1:
         raise ValueError("a synthesis needs one design plant: take one of design_choices(problem)")
     return evaluate(
         scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
     )
+
+
+def _require_mixed(problem: CoDesignProblem) -> None:
+    if problem.sections is not None:
+        raise UserError(
+            "the problem asks for a fixed structure; use sections_value(problem, theta)"
+        )
 
 
 def box(problem: CoDesignProblem) -> tuple[Array, Array]:

@@ -35,11 +35,13 @@ class Perturbation:
     """A plant off its model: flexible frequencies times 1 + `shift`, damping times `damping`.
 
     Mode shapes stay. Modal damping ratios are multiplied by `damping`, or a given damping matrix,
-    which a shift leaves alone.
+    which a shift leaves alone. `modes` shift single flexible modes besides, the lowest first; those
+    that it does not reach stay.
     """
 
     shift: float = 0.0
     damping: float = 1.0
+    modes: tuple[float, ...] = ()
 
 
 NOMINAL = Perturbation()
@@ -84,11 +86,11 @@ def modal_plant(
     lam = np.where(rigid, 0.0, lam)
     modes = _aligned(modes, lam, rigid, system.C)
     root = np.sqrt(lam)
-    ratio = 1.0 + perturbation.shift
+    ratio = (1.0 + perturbation.shift) * (1.0 + _own_shifts(perturbation, rigid))
     h = np.where(rigid, w_r**2, ratio**2 * lam)
     given = system.damping_ratio is None
-    zeta = 0.0 if given else float(system.damping_ratio or 0.0)
-    zeta *= perturbation.damping * ratio  # of the model's own root, so that g is a function of λ
+    model = 0.0 if given else float(system.damping_ratio or 0.0)
+    zeta = model * perturbation.damping * ratio  # of the model's own root: g is a function of λ
     g = np.where(rigid, 2.0 * suspension.damping_ratio * w_r, 2.0 * zeta * root)
 
     def to_modal(matrix: Array) -> Array:
@@ -98,7 +100,7 @@ def modal_plant(
     dM, dD, dK, dB, dC = system.derivatives
     dM, dK = to_modal(dM), to_modal(dK)
     dA = dK - dM * lam  # M⁻¹K moves by dK - dM Λ where M = I
-    dh = dM * h + _divided_differences(lam, h, rigid, np.full_like(lam, ratio**2)) * dA
+    dh = dM * h + _divided_differences(lam, h, rigid, ratio**2) * dA
     slope_g = np.divide(zeta, root, out=np.zeros_like(root), where=~rigid)
     dg = dM * g + _divided_differences(lam, g, rigid, slope_g) * dA
     C = system.C @ modes
@@ -133,6 +135,18 @@ def require_damping(modal: ModalPlant) -> None:
         f"the mode at {natural[i] / (2.0 * np.pi):.5g} Hz {words}: no synthesis holds an infinite "
         "resonance; return a damping matrix that reaches it, or damping_ratio, such as 0.005"
     )
+
+
+def _own_shifts(perturbation: Perturbation, rigid: np.ndarray) -> Array:
+    """The relative shift of each mode on its own.
+
+    Each branch of eigenvalues then has a function of its own, of which the divided differences
+    hold as they do for one, where eigenvalues are apart.
+    """
+    out = np.zeros(rigid.size)
+    flexible = np.flatnonzero(~rigid)[: len(perturbation.modes)]
+    out[flexible] = perturbation.modes[: len(flexible)]
+    return out
 
 
 def _aligned(modes: Array, lam: Array, rigid: np.ndarray, C: Array) -> Array:

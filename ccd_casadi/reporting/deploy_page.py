@@ -9,9 +9,12 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
 from ccd_casadi.deployment.words import reason_words
+from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
@@ -246,6 +249,12 @@ def _rates(found: Deployment) -> str:
         )
         for trial in found.trials
     )
+    if found.orders[0].chosen.method is Reduction.NONE and len(found.trials) == 1:
+        words = (
+            f"The loop was designed for {number(found.trials[0].needed_hz)} Hz with Tustin's rule, "
+            "hold and delay in it."
+        )
+        return paragraph(words)
     words = (
         "The least rate from which on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
         "included. The lead makes up for the phase of hold and delay, and raises the gain at half "
@@ -279,6 +288,8 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
     if K.D.shape != (1, 1):
         words = "This controller does not fall apart into scalar channels: no sections."
         return paragraph(words)
+    if run.problem.sections is not None and run.kappa is not None:
+        return _as_designed(run.problem.sections.structure, run.kappa)
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
@@ -289,6 +300,14 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
         f"{number(found.gain_at_bandwidth, 6)} N/m at ω_b; every section has the gain 1 at s = 0. "
         "A negative ζ, or a negative frequency of a single root, is one in the right half plane."
     )
+    return paragraph(words) + table_html(Table(head, rows))
+
+
+def _as_designed(structure: Structure, kappa: Array) -> str:
+    parts = section_words(structure, kappa)
+    rows = tuple((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in parts)
+    words = f"Gain {number(gain_of(kappa), 6)} N/m; the sections as they were designed."
+    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
     return paragraph(words) + table_html(Table(head, rows))
 
 

@@ -43,6 +43,7 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
+from ccd_casadi.reporting.sections_page import sections_conclusion, sections_sections
 from ccd_casadi.reporting.slices import (
     caption_slices,
     figure_slices,
@@ -87,11 +88,13 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
         STATUS[status],
         _reason(solution),
         f"{case.path.name} · {result['formulation']} formulation · {now}",
-        conclusion(result),
+        sections_conclusion(result) if solution.sections is not None else conclusion(result),
         warned=worst(result) is State.WARNED,
         verdict=verdict_html(result),
     )
     sections = []
+    if solution.sections is not None:
+        sections = sections_sections(problem, solution)
     if solution.verified is not None:
         truths = read_truths(folder / "samples.sqlite", problem)
         sections = [

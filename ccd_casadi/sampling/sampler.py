@@ -12,6 +12,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design, true_inner
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
@@ -39,6 +40,7 @@ class BandwidthSample:
     shortfall: str
     violation: float
     syntheses: int
+    kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
 
     @property
     def feasible(self) -> bool:
@@ -213,6 +215,8 @@ def inner_unit(
 ) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
     """Solve the inner problem at one θ; every synthesis becomes a row."""
     problem, problem_key, key, theta = task
+    if problem.sections is not None:
+        return sections_unit(problem, key, theta)
     began = perf_counter()
     result = true_inner(problem, theta)
     each = (perf_counter() - began) / max(result.syntheses, 1)
@@ -234,6 +238,47 @@ def inner_unit(
         "syntheses": len(rows),
     }
     return list(rows.values()), (key, theta, payload)
+
+
+def sections_unit(
+    problem: CoDesignProblem, key: str, theta: tuple[float, ...]
+) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
+    """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
+    value = sections_value(problem, theta)
+    design, judged = value.design, value.design.certificate
+    worst = None if judged is None or not judged.worst else max(judged.worst.values())
+    peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
+    highest = max(peaks, key=lambda plant: plant.S_peak, default=None)
+    row = Sample(
+        key=key,
+        theta=theta,
+        omega_S=0.0,
+        omega_T=0.0,
+        outcome=design.outcome.name.lower(),
+        reason=design.words,
+        gamma_opt=np.nan,
+        gamma_lower_bound=np.nan,
+        gamma=np.nan,
+        bandwidth=value.bandwidth,
+        sensitivity_peak=np.nan if highest is None else highest.S_peak,
+        sensitivity_peak_frequency=np.nan if highest is None else highest.S_peak_frequency,
+        sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
+        max_real_pole=np.nan,
+        norm=np.nan if worst is None else worst,
+        norm_bound=1.0,
+        certified=value.feasible,
+        seconds=design.seconds,
+    )
+    payload = {
+        "bandwidth": _number(value.bandwidth),
+        "gradient": [_number(v) for v in value.gradient] if value.feasible else None,
+        "kappa": [float(v) for v in design.kappa] if value.feasible else [],
+        "active": sorted(name for name, mu in design.multipliers.items() if mu > 0.0),
+        "shortfall": "" if value.feasible else design.words,
+        "violation": _number(np.log(max(design.short.values()))) if design.short else None,
+        "syntheses": value.syntheses,
+    }
+    return [row], (key, theta, payload)
 
 
 def design_unit(
@@ -290,7 +335,9 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
     nan = float("nan")
     gradient = payload["gradient"] or [None] * len(theta)
     active, shortfall = payload["active"], payload["shortfall"]
-    positive = [payload[key] for key in ("bandwidth", "omega_S", "omega_T")] if feasible else []
+    kappa = payload.get("kappa")
+    sized = ("bandwidth",) if kappa is not None else ("bandwidth", "omega_S", "omega_T")
+    positive = [payload[key] for key in sized] if feasible else []
     violation, syntheses = payload["violation"], payload["syntheses"]
     if (
         len(gradient) != len(theta)
@@ -299,18 +346,20 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
         or not (violation is None or type(violation) is float)
         or not all(isinstance(word, str) for word in [shortfall, *active])
         or type(syntheses) is not int
+        or not all(type(v) is float for v in kappa or ())
     ):
         raise ValueError("a stored result holds what none is made of")
     return BandwidthSample(
         theta=theta,
         bandwidth=payload["bandwidth"] if feasible else nan,
         gradient=tuple(nan if v is None else v for v in gradient),
-        omega_S=payload["omega_S"] if feasible else nan,
-        omega_T=payload["omega_T"] if feasible else nan,
+        omega_S=payload["omega_S"] if feasible and kappa is None else nan,
+        omega_T=payload["omega_T"] if feasible and kappa is None else nan,
         active=tuple(active),
         shortfall=shortfall,
         violation=np.inf if violation is None else violation,
         syntheses=syntheses,
+        kappa=tuple(kappa or ()),
     )
 
 

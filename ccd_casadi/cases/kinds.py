@@ -1,0 +1,116 @@
+"""Kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
+
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.sections import ControllerSection, InnerSection, LoopSection, RobustSection
+from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.plants.plant import Plant
+from ccd_casadi.support.errors import PlantError
+
+SHAPE = 1.1  # of sections, where the case gives none
+MOST_PLANTS = 24  # option sets
+# Keys that only one kind looks at, by section.
+_OF_SECTIONS = {
+    "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
+    "loop": ("rate_hz", "delay_us"),
+    "robust": ("mode_shift", "gain", "plants"),
+    "inner": ("shape", "compliance_max"),
+}
+_OF_H_INFINITY = {
+    "robust": ("shifts", "design_at"),
+    "inner": ("gamma_backoff", "sweep_points", "method"),
+}
+
+
+def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception]) -> None:
+    """Raise where a key is given that has no effect on the chosen kind of inner problem."""
+    controller, loop = sections["controller"], sections["loop"]
+    structured = controller.structure == "sections"
+    other, remedy = (
+        (_OF_H_INFINITY, 'has no effect on controller.structure = "sections"; drop it')
+        if structured
+        else (_OF_SECTIONS, 'has an effect with controller.structure = "sections" only; drop it, '
+              "or choose that structure")
+    )  # fmt: skip
+    for name, keys in other.items():
+        table = sections[name]
+        for item in fields(table):
+            if item.name in keys and getattr(table, item.name) != item.default:
+                raise fail(f"{name}.{item.name}", remedy)
+    if not structured:
+        return
+    if loop.delay_us and loop.rate_hz is None:
+        words = "a delay needs a sampled loop, whose poles decide its stability; give loop.rate_hz"
+        raise fail("loop.delay_us", words)
+    if controller.biquads == 0 and controller.least_damping:
+        words = "has no effect with biquads = 0; drop it"
+        raise fail("controller.least_damping", words)
+    if controller.roll_off == 0 and controller.weighted_level is not None:
+        words = "is 0: KS would not fall, and weighted_level holds at no frequency; give 1 or more"
+        raise fail("controller.roll_off", words)
+    if len(sections["robust"].plants) > MOST_PLANTS:
+        raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
+
+
+def read_options(path: Path) -> dict[str, Any]:
+    """An option set of the plant: a TOML file of plain keys. Raises ValueError with a remedy."""
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ValueError("there is no such file; give its path relative to the case file") from None
+    except OSError as error:
+        raise ValueError(f"cannot be read: {error.strerror}; name a readable file") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"is not valid TOML: {error}; mend it") from None
+    for key in ("model", "function"):
+        if key in found:
+            raise ValueError(f"{key} is no option of a plant; drop it")
+    return found
+
+
+def require_scalar(plants: Sequence[Plant]) -> None:
+    """Raise PlantError unless every plant has one input and one output."""
+    for plant in plants:
+        if (plant.inputs, plant.outputs) != (1, 1):
+            raise PlantError(
+                f"has {plant.inputs} inputs and {plant.outputs} outputs; controller.structure = "
+                '"sections" is for one of each: take one channel of it, or "h_infinity"'
+            )
+
+
+def sections_problem(
+    controller: ControllerSection,
+    loop: LoopSection,
+    robust: RobustSection,
+    inner: InnerSection,
+    options: tuple[tuple[tuple[str, object], ...], ...],
+) -> SectionsProblem | None:
+    """The problem of a fixed structure; None where the case asks for none."""
+    if controller.structure != "sections":
+        return None
+    return SectionsProblem(
+        structure=Structure(
+            integrator=controller.integrator,
+            lead=controller.lead,
+            biquads=controller.biquads,
+            roll_off=controller.roll_off,
+            least_damping=controller.least_damping,
+        ),
+        shape=SHAPE if inner.shape is None else inner.shape,
+        weighted_level=controller.weighted_level,
+        compliance_max=inner.compliance_max,
+        sampling=None if loop.rate_hz is None else Sampling(loop.rate_hz, loop.delay_us),
+        uncertainty=Uncertainty(
+            robust.resonance_shift,
+            robust.mode_shift,
+            (min(1.0, *robust.damping, 1.0), max(1.0, *robust.damping, 1.0)),
+            robust.gain,
+            options,
+        ),
+        starts=controller.starts,
+    )

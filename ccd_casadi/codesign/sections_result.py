@@ -1,0 +1,185 @@
+"""result.json and controller.json of a co-design with a controller of fixed structure."""
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.result import (
+    clean,
+    controller_dict,
+    globality_dict,
+    kkt_dict,
+    versions,
+)
+from ccd_casadi.codesign.sections_run import VerifiedSections
+from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.support.units import HZ
+
+BINDS = {
+    "S_MAX": "S_max",
+    "SHAPE": "shape",
+    "S_LOW": "S_low",
+    "KS": "weighted_level of KS",
+    "T": "weighted_level of T",
+    "GS": "compliance_max",
+}
+WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
+
+
+def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
+    """A certified design's figures under the contract's keys, the worst of its plants."""
+    judged = made.certificate
+    assert judged is not None
+    highest = max(judged.plants, key=lambda plant: plant.S_peak)
+    sampling = sections_of_problem(problem).sampling
+    grown = max(plant.stability for plant in judged.plants)
+    if sampling is not None:  # of the spectral radius: the real part that it comes from
+        grown = float(np.log1p(grown)) / sampling.period
+    ratios = judged.worst
+    return {
+        "omega_S_hz": None,
+        "omega_T_hz": None,
+        "outcome": made.outcome.name.lower(),
+        "reason": "" if made.certified else made.words,
+        "bandwidth_hz": made.bandwidth / HZ,
+        "gamma_opt": None,
+        "gamma": None,
+        "gamma_lower_bound": None,
+        "sensitivity_peak": highest.S_peak,
+        "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
+        "sensitivity_low": max(plant.S_low for plant in judged.plants),
+        "compliance_max": max(plant.GS for plant in judged.plants),
+        "static_compliance": max(plant.static_compliance for plant in judged.plants),
+        "KS_max": max(plant.KS for plant in judged.plants),
+        "certificate": {
+            "stable": all(plant.stable for plant in judged.plants),
+            "max_real_pole": grown,
+            "norm": max(ratios.values()),
+            "norm_bound": WORST,
+            "passed": judged.passed,
+            "plants": len(judged.plants),
+            "figures_over_bounds": ratios,
+        },
+        "controller": sections_dict(made.structure, made.kappa)
+        | {
+            "kappa": made.kappa.tolist(),
+            "local_optima": [
+                {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
+                for item in made.local_optima
+            ],
+            "multipliers": made.multipliers,
+            "at_range": [f"{name} {end}" for name, end, _ in made.at_box],
+            "kkt_residual": made.kkt_residual,
+        },
+    }
+
+
+def active_of(made: SectionsDesign) -> list[str]:
+    """What binds the controller."""
+    return [word for name, word in BINDS.items() if made.multipliers.get(name, 0.0) > 1e-6]
+
+
+def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str, Any]:
+    """`robust`: the judge on a lattice of the box, and the worst plant that was searched."""
+    wide: Certificate = verified.wide
+    stable = [plant for plant in wide.plants if plant.stable]
+    return {
+        "stable": len(stable) == len(wide.plants),
+        "plants": verified.checked,
+        "passed": wide.passed,
+        "bandwidth_hz": wide.bandwidth / HZ,
+        "worst_sensitivity_peak": max((plant.S_peak for plant in stable), default=None),
+        "worst_excess": float(np.expm1(verified.worst.value)),
+        "worst_plant": {
+            "option": verified.worst.option,
+            "point": verified.worst.point.tolist(),
+        },
+        "set": [
+            {"option": option, "point": list(point)}
+            for option, point in sections_of_problem(verified.problem).members
+        ],
+        "words": wide.words,
+    }
+
+
+def sections_result(
+    problem: CoDesignProblem,
+    formulation: str,
+    outcome: FormulationResult,
+    verified: VerifiedSections,
+    *,
+    tolerance: float,
+    syntheses: int,
+    seconds: float,
+    seed: int,
+) -> dict[str, Any]:
+    """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
+    made = verified.design
+    error = abs(verified.predicted / made.bandwidth - 1.0)
+    plant = plant_of(problem)
+    lam = constraint_values(plant, verified.theta)
+    checks = {
+        "certificate": made.certified,
+        "constraints": bool((lam <= 1e-9).all()),
+        "prediction": bool(error <= tolerance),
+        "inner_optimum": bool(verified.race_gap <= tolerance),
+        "robust": verified.wide.passed,
+    }
+    failed = [name for name, passed in checks.items() if not passed]
+    words = "" if not failed else "failed: " + ", ".join(failed)
+    notes = list(plant.notes(verified.theta))
+    sections = sections_of_problem(problem)
+    if sections.weighted_level is None:
+        notes.append("KS and T are not bounded: the case gives no controller.weighted_level")
+    bounds = [name for name in verified.kkt.active if name not in plant.constraint_names]
+    met = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
+    result = {
+        **design_dict(verified.problem, made),
+        "status": "not_verified" if failed else "verified",
+        "reason": "; ".join(part for part in (words, outcome.message) if part),
+        "formulation": formulation,
+        "theta": dict(zip(problem.names, verified.theta, strict=True)),
+        "units": dict(zip(problem.names, problem.units, strict=True)),
+        "objective": verified.objective,
+        "hardware_cost": verified.hardware_cost,
+        "surrogate_bandwidth_hz": verified.predicted / HZ,
+        "verification_error": error,
+        "checks": checks,
+        "active": [*bounds, *active_of(made), *met],
+        "inner_gap": verified.race_gap,
+        "race": [
+            {"bandwidth_hz": value / HZ, "searches": count}
+            for value, count in verified.raced.optima
+        ],
+        "rounds": verified.rounds,
+        "kkt": kkt_dict(verified.kkt),
+        "globality": globality_dict(outcome.outer),
+        "robust": wide_dict(problem, verified),
+        "notes": notes,
+        "iterates": [asdict(iterate) for iterate in outcome.iterates],
+        "syntheses": syntheses,
+        "seconds": seconds,
+        "seed": seed,
+        "versions": versions(),
+    }
+    return clean(result)
+
+
+def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
+    """controller.json: the state space in SI, the sections, and how they run."""
+    assert made.controller is not None
+    sampling = sections_of_problem(problem).sampling
+    words = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
+    if sampling is not None:
+        words["loop"] = {
+            "rate_hz": sampling.rate_hz,
+            "delay_us": sampling.delay_us,
+            "method": "tustin",
+        }
+    return controller_dict(made.controller) | {"sections": words}

@@ -1,0 +1,239 @@
+"""A co-design with a controller of fixed structure: anchors, formulation, polish, race, judge.
+
+The formulation works on ω_b*(θ) of the problem's anchors and plant set. At its end a full race and
+a search for worse plants ask whether these were good enough at the θ that was found; if not, what
+they find joins, and the outer problem is solved again, a few times at most.
+"""
+
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.kkt import KktCertificate
+from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.sections_truth import (
+    TrueBandwidth,
+    objective,
+    polish_sections,
+    sections_kkt,
+    solve_direct_sections,
+)
+from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import (
+    joined,
+    judged_widely,
+    prepared,
+    race,
+    sections_of_problem,
+    sections_value,
+    with_range,
+    worst_members,
+)
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+
+AGAIN = 3  # times that the outer problem is solved at most
+BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
+
+
+@dataclass(frozen=True)
+class Raced:
+    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count)."""
+
+    certified: bool
+    bandwidth: float
+    kappa: tuple[float, ...]
+    optima: tuple[tuple[float, int], ...]
+
+
+@dataclass(frozen=True)
+class VerifiedSections:
+    """The design of a run at θ, and what was found out about it.
+
+    `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
+    `worst` the worst plant that was found. `race_gap`: by how much (relative) the race at the end
+    beats the design. `predicted` is what the surrogate says at θ, rad/s.
+    """
+
+    problem: CoDesignProblem
+    theta: tuple[float, ...]
+    design: SectionsDesign
+    objective: float
+    hardware_cost: float
+    kkt: KktCertificate
+    race_gap: float
+    raced: Raced
+    wide: Certificate
+    checked: int
+    worst: Excess
+    predicted: float
+    rounds: int
+
+
+@dataclass(frozen=True)
+class SectionsRun:
+    """What `run_sections` ends with; `verified` None where no design was found."""
+
+    outcome: FormulationResult
+    verified: VerifiedSections | None
+    syntheses: int
+
+
+def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> SectionsRun:
+    """Sections' co-design on the sampler's store and workers."""
+    quiet = sampler.quiet
+    spent = 0
+    problem = _seeded(sampler.problem, seed)
+    problem, first = _prepared(sampler.store, problem, quiet)
+    spent += 1
+    rounds = 0
+    while True:
+        rounds += 1
+        asked = Sampler(problem, sampler.store, sampler.workers, quiet=quiet)
+        outcome = _formulated(asked, formulation, seed)
+        if outcome.x is None:
+            words = first if first and not sections_of_problem(problem).anchors else ""
+            if asked.nearest is not None:
+                words = asked.nearest.shortfall
+            outcome = replace(outcome, message=words or outcome.message)
+            return SectionsRun(outcome, None, spent + asked.syntheses)
+        best, _ = polish_sections(asked, outcome.x[: len(problem.names)])
+        value = sections_value(problem, best.theta)
+        raced = _raced(sampler.store, problem, best.theta, quiet)
+        better = raced.certified and raced.bandwidth > value.design.bandwidth * (1.0 + BETTER)
+        worst, members = worst_members(
+            problem, best.theta, value.design, 0, _teller("at the end", quiet)
+        )
+        spent += 1
+        gap = 0.0
+        if raced.certified:
+            gap = raced.bandwidth / value.design.bandwidth - 1.0
+        if not (better or members) or rounds == AGAIN:
+            break
+        spent += asked.syntheses
+        kappa = np.array(raced.kappa) if better else value.design.kappa
+        problem = joined(problem, kappa, members)
+    verified = _verified(asked, outcome, best, value.design, raced, gap, worst, rounds)
+    sampler.trace.extend(asked.trace)
+    return SectionsRun(outcome, verified, spent + asked.syntheses)
+
+
+def _verified(
+    asked: Sampler,
+    outcome: FormulationResult,
+    best: BandwidthSample,
+    made: SectionsDesign,
+    raced: Raced,
+    gap: float,
+    worst: Excess,
+    rounds: int,
+) -> VerifiedSections:
+    problem = asked.problem
+    assert made.controller is not None
+    wide, checked = judged_widely(problem, best.theta, made.controller, worst)
+    predicted = best.bandwidth
+    if outcome.surrogates:
+        predicted = float(outcome.surrogates[0].predict(np.array(best.theta)[None, :])[0])
+    return VerifiedSections(
+        problem=problem,
+        theta=best.theta,
+        design=made,
+        objective=objective(problem, best),
+        hardware_cost=hardware_cost(plant_of(problem), best.theta),
+        kkt=sections_kkt(problem, best, TrueBandwidth(asked, "certificate")),
+        race_gap=float(max(gap, 0.0)),
+        raced=raced,
+        wide=wide,
+        checked=checked,
+        worst=worst,
+        predicted=predicted,
+        rounds=rounds,
+    )
+
+
+def _formulated(
+    asked: Sampler, formulation: Nested | Lifted | Direct, seed: int
+) -> FormulationResult:
+    if isinstance(formulation, Direct):
+        return solve_direct_sections(asked, formulation.starts, seed=seed)
+    if isinstance(formulation, Nested):
+        return solve_nested(asked, formulation, seed=seed)
+    # The constituents ω_S and ω_T do not exist here: what is lifted are the exact gradients.
+    points = formulation.points or 6 * len(asked.problem.names)
+    options = Nested("sobol", points, formulation.starts, formulation.tolerance,
+                     formulation.max_refinements, formulation.kernel)  # fmt: skip
+    return solve_nested(asked, options, seed=seed, gradients=True)
+
+
+def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
+    return with_range(replace(problem, sections=replace(sections_of_problem(problem), seed=seed)))
+
+
+def _prepared(
+    store: SampleStore, problem: CoDesignProblem, quiet: bool
+) -> tuple[CoDesignProblem, str]:
+    """Anchors and members, from the store where an earlier run has found them."""
+    key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
+    known = store.get_result(key)
+    if known is None:
+        found, made = prepared(problem, _teller("race at the start", quiet))
+        sections = sections_of_problem(found)
+        known = {
+            "anchors": [list(a) for a in sections.anchors],
+            "members": [[option, list(point)] for option, point in sections.members],
+            "words": "" if made.certified else made.words,
+        }
+        owner = problem_hash({"race": problem_hash(problem.identity())})
+        store.put_unit([], (key, owner, problem.start, known), None)
+    try:
+        anchors = tuple(tuple(map(float, a)) for a in known["anchors"])
+        members = tuple((int(o), tuple(map(float, p))) for o, p in known["members"])
+        words = str(known["words"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise store.damaged() from error
+    sections = replace(sections_of_problem(problem), anchors=anchors, members=members)
+    return replace(problem, sections=sections), words
+
+
+def _raced(
+    store: SampleStore, problem: CoDesignProblem, theta: tuple[float, ...], quiet: bool
+) -> Raced:
+    """A full race at θ, from the store where it was run before."""
+    owner = problem_hash({"race": problem_hash(problem.identity())})
+    key = sample_key(owner, theta, 0.0, 0.0)
+    known = store.get_result(key)
+    if known is None:
+        made = race(problem, theta, _teller("race at the end", quiet))
+        known = {
+            "certified": made.certified,
+            "bandwidth": float(made.bandwidth) if made.certified else 0.0,
+            "kappa": [float(v) for v in made.kappa] if made.certified else [],
+            "optima": [[item.bandwidth, item.count] for item in made.local_optima],
+        }
+        store.put_unit([], (key, owner, theta, known), None)
+    try:
+        optima = tuple((float(value), int(count)) for value, count in known["optima"])
+        kappa = tuple(map(float, known["kappa"]))
+        return Raced(bool(known["certified"]), float(known["bandwidth"]), kappa, optima)
+    except (KeyError, TypeError, ValueError) as error:
+        raise store.damaged() from error
+
+
+def _teller(label: str, quiet: bool) -> Callable[[str], None]:
+    """Lines of progress on stderr."""
+
+    def tell(words: str) -> None:
+        if not quiet:
+            with suppress(OSError, ValueError):  # a stream that fails ends the printing
+                print(f"{label}: {words}", file=sys.stderr, flush=True)
+
+    return tell

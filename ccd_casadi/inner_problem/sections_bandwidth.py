@@ -1,0 +1,305 @@
+"""ω_b*(θ) of a fixed structure: one reproducible function of θ with its envelope gradient.
+
+A full race at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of the climbs
+from all anchors, and from nothing else: it depends neither on the order in which θ are asked for
+nor on the number of workers. Where no anchor climbs to a certified design a race of a few seeded
+starts is run at that θ, which is a function of θ too.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import (
+    Bounds,
+    Certificate,
+    SectionsDesign,
+    bandwidth_and_gradient,
+    certify,
+    synthesise_sections,
+)
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+
+MOST_ANCHORS = 3
+DISTINCT = 0.1  # relative: local optima further below the best are no anchors
+ROUNDS = 6  # of a design on the set and a search for plants that are worse
+AT_ONCE = 3  # plants added in a round
+APART = 1e-4  # of the box: members that are closer are the same plant
+FEW = 8  # starts of the race at a θ where no anchor ends certified
+SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
+CHECKED = 200  # plants that the judge looks at in the end
+LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
+
+Progress = Callable[[str], None]
+
+
+def sections_of_problem(problem: CoDesignProblem) -> SectionsProblem:
+    """The sections of a problem that has them."""
+    assert problem.sections is not None
+    return problem.sections
+
+
+def bounds_of(problem: CoDesignProblem) -> Bounds:
+    """The bounds on every plant, SI."""
+    sections, inner = sections_of_problem(problem), problem.inner
+    weighted = sections.weighted_level is not None
+    return Bounds(
+        S_max=inner.S_max,
+        S_low=inner.S_low,
+        omega_low=inner.omega_low,
+        shape=sections.shape,
+        weighted_level=sections.weighted_level,
+        weights=problem.weights if weighted else None,
+        compliance_max=sections.compliance_max,
+    )
+
+
+def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
+    """The model at θ with every option set, and the box of what may differ from it."""
+    u = sections_of_problem(problem).uncertainty
+    systems = [mechanics(plant_of(problem), theta)]
+    for options in u.options:
+        systems.append(mechanics(plant_of(with_options(problem, options)), theta))
+    return UncertainPlant(
+        tuple(systems), problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift,
+        u.damping, u.gain,
+    )  # fmt: skip
+
+
+def with_options(
+    problem: CoDesignProblem, options: Sequence[tuple[str, object]]
+) -> CoDesignProblem:
+    """The problem with some options of its plant replaced."""
+    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
+    source: PlantSource = replace(problem.source, options=merged)
+    return replace(problem, source=source)
+
+
+def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
+    """The plant set at θ: its members, or the corners of the box where none are known yet."""
+    uncertain = uncertain_plant(problem, theta)
+    return uncertain.plants(_points(problem, uncertain))
+
+
+def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+    members = sections_of_problem(problem).members
+    if not members:
+        return uncertain.corners()
+    return [(option, np.array(point)) for option, point in members]
+
+
+@dataclass(frozen=True)
+class SectionsValue:
+    """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
+
+    `syntheses`: climbs from anchors and races that it took.
+    """
+
+    theta: tuple[float, ...]
+    bandwidth: float
+    gradient: tuple[float, ...]
+    design: SectionsDesign
+    syntheses: int
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the judge confirms a design at θ."""
+        return self.design.certified
+
+
+def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> SectionsValue:
+    """The best certified design from the problem's anchors at θ, and the envelope gradient."""
+    sections = sections_of_problem(problem)
+    plants, bounds = plants_of(problem, theta), bounds_of(problem)
+    initial = [np.array(kappa) for kappa in sections.anchors]
+    made: SectionsDesign | None = None
+    spent = 0
+    if initial:
+        made = synthesise_sections(
+            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+            initial=initial, only_initial=True, frequencies=sections.frequencies,
+        )  # fmt: skip
+        spent += 1
+    if made is None or not made.certified:
+        made = synthesise_sections(
+            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+            starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
+        )  # fmt: skip
+        spent += 1
+    return valued(problem, theta, plants, made, spent)
+
+
+def valued(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    plants: Sequence[ScaledPlant],
+    made: SectionsDesign,
+    spent: int,
+) -> SectionsValue:
+    """A design as a value of ω_b*(θ)."""
+    point = tuple(float(v) for v in theta)
+    bandwidth, gradient = np.nan, np.full(len(point), np.nan)
+    if made.certified:
+        sampling = sections_of_problem(problem).sampling
+        bandwidth, gradient = bandwidth_and_gradient(plants, bounds_of(problem), made, sampling)
+    return SectionsValue(point, float(bandwidth), tuple(map(float, gradient)), made, spent)
+
+
+def race(
+    problem: CoDesignProblem, theta: Sequence[float], progress: Progress | None = None
+) -> SectionsDesign:
+    """A full race at θ: the problem's starts, and its anchors beside them."""
+    sections = sections_of_problem(problem)
+    return synthesise_sections(
+        plants_of(problem, theta), sections.structure, bounds_of(problem),
+        sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
+        initial=[np.array(kappa) for kappa in sections.anchors],
+        frequencies=sections.frequencies, progress=progress,
+    )  # fmt: skip
+
+
+def with_range(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with the range of K's frequencies, by the plant at its start, alike at every θ.
+
+    A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
+    """
+    sections = sections_of_problem(problem)
+    if sections.frequencies is not None:
+        return problem
+    plant = scaled_plant(problem, problem.start)
+    poles = np.abs(np.linalg.eigvals(plant.A))
+    fastest = FASTEST * max(1.0, float(poles.max())) * plant.omega_0
+    slowest = SLOWEST * plant.omega_0
+    if sections.sampling is not None:
+        fastest = min(fastest, 2.0 / sections.sampling.period)
+        slowest = min(slowest, 0.01 * fastest)
+    return _with(problem, frequencies=(slowest, fastest))
+
+
+def prepared(
+    problem: CoDesignProblem, progress: Progress | None = None
+) -> tuple[CoDesignProblem, SectionsDesign]:
+    """The problem with anchors and members: a full race at its start θ, worst plants added.
+
+    The design is the race's last; where it is not certified the problem has no anchors, and each
+    θ is raced on its own.
+    """
+    problem = with_range(problem)
+    uncertain = uncertain_plant(problem, problem.start)
+    members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
+    problem = _with(problem, members=members)
+    made = race(problem, problem.start, progress)
+    if not made.certified:
+        return problem, made
+    anchors = _anchors(made)
+    for turn in range(ROUNDS):
+        found = worst_members(problem, problem.start, made, turn, progress)[1]
+        if not found:
+            break
+        problem = _with(problem, members=(*sections_of_problem(problem).members, *found))
+        problem = _with(problem, anchors=anchors)
+        made = sections_value(problem, problem.start).design
+        if not made.certified:
+            return problem, made
+        anchors = _anchors(made)
+    return _with(problem, anchors=anchors), made
+
+
+def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
+    """The certified design's κ first, then those of the other local optima near it."""
+    own = tuple(map(float, made.kappa))
+    others = [
+        optimum.kappa
+        for optimum in made.local_optima
+        if (1.0 - DISTINCT) * made.bandwidth <= optimum.bandwidth < (1.0 - 1e-3) * made.bandwidth
+    ]
+    return (own, *others)[:MOST_ANCHORS]
+
+
+def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
+    """The problem with one more anchor, first, and more members."""
+    sections = sections_of_problem(problem)
+    own = tuple(float(v) for v in kappa)
+    anchors = (own, *(a for a in sections.anchors if a != own))[: MOST_ANCHORS + 1]
+    return _with(problem, anchors=anchors, members=(*sections.members, *members))
+
+
+def _with(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
+    return replace(problem, sections=replace(sections_of_problem(problem), **changes))  # type: ignore[arg-type]
+
+
+def worst_members(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    turn: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Excess, tuple[Member, ...]]:
+    """The worst plant of the box for a design, and those to add: past a bound, each a new one."""
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    heads, count = worst_plants(
+        uncertain, sections.structure, made.kappa, made.bandwidth, bounds_of(problem),
+        sections.sampling, seed=sections.seed + turn,
+    )  # fmt: skip
+    if progress is not None:
+        progress(f"worst of {count} plants: {np.expm1(heads[0].value):+.3%} of a bound")
+    width = uncertain.box[1] - uncertain.box[0]
+    known = list(sections.members)
+    found: list[Member] = []
+    for head in heads:
+        near = [
+            float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
+            for option, point in (*known, *found)
+            if option == head.option
+        ]
+        if head.value > WITHIN and (not near or min(near) > APART) and len(found) < AT_ONCE:
+            found.append((head.option, tuple(map(float, head.point))))
+    return heads[0], tuple(found)
+
+
+def judged_widely(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace, worst: Excess
+) -> tuple[Certificate, int]:
+    """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
+
+    The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
+    """
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
+    if not uncertain.names:
+        points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
+    return _judged(problem, uncertain.plants(points), controller), len(points)
+
+
+def judged_corners(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> Certificate:
+    """The same on the model of every option and the corners of the box."""
+    uncertain = uncertain_plant(problem, theta)
+    return _judged(problem, uncertain.plants(uncertain.corners()), controller)
+
+
+def _judged(
+    problem: CoDesignProblem, plants: Sequence[ScaledPlant], controller: StateSpace
+) -> Certificate:
+    sections, bounds = sections_of_problem(problem), bounds_of(problem)
+    loose = replace(
+        bounds,
+        S_max=bounds.S_max * (1.0 + LOOSE),
+        S_low=bounds.S_low * (1.0 + LOOSE),
+        weighted_level=_times(bounds.weighted_level),
+        compliance_max=_times(bounds.compliance_max),
+    )
+    integrator = sections.structure.integrator
+    return certify(plants, controller, loose, sections.sampling, integrator=integrator)
+
+
+def _times(value: float | None) -> float | None:
+    return None if value is None else value * (1.0 + LOOSE)

@@ -1,0 +1,74 @@
+"""The second kind of inner problem: a controller of fixed structure on a set of plants.
+
+    ω_b*(θ) = max ω_b over κ  s.t. on every plant: stable, ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low,
+              |S(jω)| <= shape (ω/ω_b)/√2 below ω_b, |W_KS KS| and |W_T T| <= weighted_level,
+              |GS| <= compliance_max
+
+Everything is plain values, as in `problem`: it is hashed, sent to workers and kept in the store.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from ccd_casadi.fixed_structure import Sampling, Structure
+
+Options = tuple[tuple[str, object], ...]
+Member = tuple[int, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What may differ from the model; the defaults are: nothing.
+
+    `damping`: least and largest factor. `options`: further option sets of the plant (loads,
+    positions), each what differs from the case's own.
+    """
+
+    resonance_shift: float = 0.0
+    mode_shift: float = 0.0
+    damping: tuple[float, float] = (1.0, 1.0)
+    gain: float = 0.0
+    options: tuple[Options, ...] = ()
+
+
+@dataclass(frozen=True)
+class SectionsProblem:
+    """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
+
+    `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as
+    with `shape` and `compliance_max` (m/N). A race of `starts` searches from `seed` finds the
+    `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
+    on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
+    before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
+    θ; None: by the plant at the start.
+    """
+
+    structure: Structure = field(default_factory=Structure)
+    shape: float | None = 1.1
+    weighted_level: float | None = None
+    compliance_max: float | None = None
+    sampling: Sampling | None = None
+    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    starts: int = 24
+    seed: int = 0
+    frequencies: tuple[float, float] | None = None
+    anchors: tuple[tuple[float, ...], ...] = ()
+    members: tuple[Member, ...] = ()
+
+    def identity(self) -> dict[str, Any]:
+        """What determines ω_b*(θ), as plain values."""
+        structure, sampling = self.structure, self.sampling
+        return {
+            "structure": vars(structure),
+            "shape": self.shape,
+            "weighted_level": self.weighted_level,
+            "compliance_max": self.compliance_max,
+            "sampling": None if sampling is None else vars(sampling),
+            "uncertainty": vars(self.uncertainty)
+            | {"options": [dict(options) for options in self.uncertainty.options]},
+            "starts": self.starts,
+            "seed": self.seed,
+            "frequencies": self.frequencies,
+            "anchors": self.anchors,
+            "members": self.members,
+        }

@@ -1,0 +1,94 @@
+"""A controller of fixed structure as a motion engineer reads it: sections in Hz and damping."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import Kind
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+NEAR = 1.1  # ratio of the frequencies of zeros and poles up to which a biquad is a notch
+
+
+@dataclass(frozen=True)
+class SectionWords:
+    """What a section is; frequencies in Hz, damping ratios; None where it has none."""
+
+    kind: str
+    zero_hz: float | None = None
+    zero_damping: float | None = None
+    pole_hz: float | None = None
+    pole_damping: float | None = None
+
+    @property
+    def text(self) -> str:
+        """`notch: zeros 176.3 Hz (0.05), poles 190 Hz (0.7)`."""
+        parts = []
+        for name, hz, damping in (
+            ("zero", self.zero_hz, self.zero_damping),
+            ("pole", self.pole_hz, self.pole_damping),
+        ):
+            if hz is not None:
+                pair = "" if damping is None else f" (damping {damping:.3g})"
+                parts.append(f"{name}{'' if damping is None else 's'} {hz:.4g} Hz{pair}")
+        return f"{self.kind}: {', '.join(parts)}"
+
+
+def section_words(structure: Structure, kappa: Array) -> list[SectionWords]:
+    """The sections of κ in SI, in the order of the structure."""
+    values = dict(zip(structure.names, np.exp(np.asarray(kappa, float)).tolist(), strict=True))
+    hz = {name: value / HZ for name, value in values.items()}
+    found = []
+    if structure.integrator:
+        found.append(SectionWords("integrator with zero", zero_hz=hz["integrator"], pole_hz=0.0))
+    for i in range(1, structure.lead + 1):
+        zero, pole = hz[f"lead {i} zero"], hz[f"lead {i} pole"]
+        found.append(SectionWords("lead" if zero < pole else "lag", zero, None, pole))
+    for i in range(1, structure.biquads + 1):
+        zero, pole = hz[f"biquad {i} zeros"], hz[f"biquad {i} poles"]
+        dampings = values[f"biquad {i} zeros damping"], values[f"biquad {i} poles damping"]
+        found.append(SectionWords(_biquad(zero, pole, *dampings), zero, dampings[0], pole,
+                                  dampings[1]))  # fmt: skip
+    for i in range(1, structure.roll_off // 2 + 1):
+        found.append(SectionWords("roll-off", pole_hz=hz[f"roll-off {i}"],
+                                  pole_damping=values[f"roll-off {i} damping"]))  # fmt: skip
+    if structure.roll_off % 2:
+        found.append(SectionWords("roll-off", pole_hz=hz["roll-off real"]))
+    return found
+
+
+def _biquad(zero: float, pole: float, zero_damping: float, pole_damping: float) -> str:
+    if max(zero / pole, pole / zero) <= NEAR:
+        return "notch" if zero_damping < pole_damping else "resonance filter"
+    return "skewed notch, lead" if zero < pole else "skewed notch, lag"
+
+
+def gain_of(kappa: Array) -> float:
+    """The factor k in N/m: |K| between the integrator's zero and the first other section."""
+    return float(np.exp(kappa[0]))
+
+
+def sections_dict(structure: Structure, kappa: Array) -> dict[str, Any]:
+    """`controller` of result.json and `sections` of controller.json."""
+    units = {Kind.GAIN: "N/m", Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
+    rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
+    return {
+        "structure": {
+            "integrator": structure.integrator,
+            "lead": structure.lead,
+            "biquads": structure.biquads,
+            "roll_off": structure.roll_off,
+            "least_damping": structure.least_damping,
+        },
+        "order": structure.order,
+        "parameters": [
+            {"name": name, "value": value / HZ if kind is Kind.FREQUENCY else value,
+             "unit": units[kind]}
+            for name, kind, value in rows
+        ],
+        "gain": gain_of(kappa),
+        "sections": [vars(item) for item in section_words(structure, kappa)],
+    }  # fmt: skip

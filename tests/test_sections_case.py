@@ -1,0 +1,145 @@
+"""The case file of a fixed structure: its keys, its mistakes, and that today's cases stay."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from case_documents import TWO_MASS
+from helpers import SUSPENSION, random_plant
+
+from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, uncertain_plant
+from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.sampling.store import problem_hash
+
+RUNS = Path(__file__).parent.parent / "runs"
+SECTIONS = '\n[controller]\nstructure = "sections"\n'
+
+
+def written(folder: Path, *added: str, inner: str = "") -> Case:
+    text = TWO_MASS.read_text().replace("[inner]", f"[inner]\n{inner}")
+    path = folder / "case.toml"
+    path.write_text(text + "\n".join(added))
+    return load_case(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [
+        ("two_mass", "2a5479d5116230d03ce19bab75bdb6406cc3c732001c0fb1e99bb669e4f31fb7"),
+        ("rib_stage", "fbbe9d26a68c51374bba5af38bf2247730814027daf5a61a2119990d41426f59"),
+    ],
+)
+def test_samples_of_mixed_sensitivity_keep_their_keys(name: str, digest: str) -> None:
+    """The hash of before the sections: a store of a year ago answers."""
+    assert problem_hash(problem_of(load_case(RUNS / f"{name}.toml")).identity()) == digest
+
+
+def test_the_shipped_case_comes_back_and_says_what_it_means(tmp_path: Path) -> None:
+    case = load_case(RUNS / "two_mass_built.toml")
+    again = tmp_path / "again.toml"
+    again.write_text(case_to_toml(case))
+    assert replace(load_case(again), path=case.path) == case
+    problem = problem_of(case)
+    assert problem.robust is None
+    assert problem.sections is not None
+    assert problem.sections.structure.order == 8
+    assert problem.sections.sampling is not None
+    assert problem.sections.sampling.delay == pytest.approx(1e-4)
+    bounds = bounds_of(problem)
+    assert (bounds.S_max, bounds.shape, bounds.weighted_level) == (1.75, 1.1, 8.426)
+    assert bounds.weights is not None
+    assert bounds.weights.omega_T == problem.inner.omega_T[0]
+    box = uncertain_plant(problem, problem.start).box
+    assert box.tolist() == [[-0.03, 0.5], [0.03, 2.0]]
+    assert len(plants_of(problem, problem.start)) == 5
+
+
+def test_what_determines_a_design_determines_its_key(tmp_path: Path) -> None:
+    changes = ("biquads = 3", "weighted_level = 8.0", "least_damping = 0.1", "starts = 7")
+    cases = [written(tmp_path, SECTIONS + line) for line in ("", *changes)]
+    cases.append(written(tmp_path, SECTIONS, inner="compliance_max = 1e-6"))
+    cases.append(written(tmp_path, SECTIONS, "[loop]\nrate_hz = 8000.0"))
+    cases.append(written(tmp_path, SECTIONS, "[robust]\ngain = 0.05"))
+    hashes = [problem_hash(problem_of(case).identity()) for case in cases]
+    assert len(set(hashes)) == len(hashes)
+
+
+@pytest.mark.parametrize(
+    ("words", "added"),
+    [
+        ("controller.lead: has an effect with", ("[controller]\nlead = 2",)),
+        ("loop.rate_hz: has an effect with", ("[loop]\nrate_hz = 1e4",)),
+        ("robust.gain: has an effect with", ("[robust]\ngain = 0.1",)),
+        ("robust.design_at: has no effect on", (SECTIONS, '[robust]\ndesign_at = "high"')),
+        ("give loop.rate_hz", (SECTIONS, "[loop]\ndelay_us = 10.0")),
+        ("controller.structure: is 'pid'", ('[controller]\nstructure = "pid"',)),
+        ("controller.integrator: is 1; give true or false", (SECTIONS + "integrator = 1",)),
+        ("least_damping: has no effect with biquads = 0",
+         (SECTIONS + "biquads = 0\nleast_damping = 0.1",)),
+        ("there is no such file", (SECTIONS, '[robust]\nplants = ["none.toml"]')),
+        ("controller.biquad: unknown key; did you mean biquads", (SECTIONS + "biquad = 1",)),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line_with_a_remedy(
+    tmp_path: Path, words: str, added: tuple[str, ...]
+) -> None:
+    with pytest.raises(CaseError) as caught:
+        written(tmp_path, *added)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_option_sets_are_plants_of_the_set(tmp_path: Path) -> None:
+    """Another damping ratio as an option set; a wrong key is told by its own name."""
+    (tmp_path / "soft.toml").write_text("zeta = 0.02\n")
+    case = written(tmp_path, SECTIONS, '[robust]\nplants = ["soft.toml"]')
+    problem = problem_of(case)
+    model, soft = plants_of(problem, (60.0, 60.0))[:2]
+    assert soft.A.trace() < 1.5 * model.A.trace() < 0.0
+    assert hardware_cost(plant_of(problem), (60.0, 60.0)) == 120.0
+    moved = tmp_path / "run" / "case.toml"
+    moved.parent.mkdir()
+    moved.write_text(case_to_toml(case))
+    assert problem_of(load_case(moved)).identity() == problem.identity()
+    (tmp_path / "soft.toml").write_text("zetta = 0.02\n")
+    with pytest.raises(CaseError, match="zetta"):
+        written(tmp_path, SECTIONS, '[robust]\nplants = ["soft.toml"]')
+
+
+def test_a_plant_of_several_outputs_is_refused(tmp_path: Path) -> None:
+    text = (RUNS / "rib_stage.toml").read_text()
+    path = tmp_path / "rib.toml"
+    path.write_text(text + SECTIONS)
+    with pytest.raises(CaseError, match="one of each"):
+        problem_of(load_case(path))
+
+
+@pytest.mark.parametrize("modal", [True, False])
+def test_derivatives_of_plants_with_single_modes_shifted(modal: bool) -> None:
+    """Against differences of the transfer function, which knows no coordinates."""
+    plant = random_plant(7, rigid=1, flexible=3, inputs=1, outputs=1, modal=modal)
+    theta, h, s = np.array([0.4, 0.6]), 1e-5, 2j * np.pi * 60.0
+
+    def shifted(at: np.ndarray) -> ScaledPlant:
+        systems = (mechanics(plant, tuple(at)),)
+        uncertain = UncertainPlant(systems, SUSPENSION, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
+        return uncertain.plant(np.array([0.02, 0.1, -0.05, 0.07, 1.5, 0.1]))
+
+    def response(at: np.ndarray) -> complex:
+        G = shifted(at).plant_si()
+        return complex((G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B))[0, 0])
+
+    q = shifted(theta)
+    R = np.linalg.inv(s / q.omega_0 * np.eye(len(q.A)) - q.A)
+    for i in range(2):
+        e = h * np.eye(2)[i]
+        numeric = (response(theta + e) - response(theta - e)) / (2.0 * h)
+        exact = q.dC[i] @ R @ q.B + q.C @ R @ q.dA[i] @ R @ q.B + q.C @ R @ q.dB[i]
+        assert exact[0, 0] / q.force == pytest.approx(numeric, rel=1e-6)

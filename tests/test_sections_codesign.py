@@ -1,0 +1,221 @@
+"""Co-design with a fixed structure: a PID with roll-off climbs in a fraction of a second."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import problem
+
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.run import solve
+from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.inner import main as inner_main
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+from ccd_casadi.inner_problem.sections_bandwidth import (
+    judged_corners,
+    judged_widely,
+    prepared,
+    sections_value,
+    with_range,
+    worst_members,
+)
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.insight import main as insight_main
+from ccd_casadi.robustness import main as robustness_main
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.solve import main as solve_main
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Workers
+
+PID = SectionsProblem(
+    structure=Structure(biquads=0),
+    weighted_level=8.426,
+    uncertainty=Uncertainty(resonance_shift=0.03),
+    starts=4,
+)
+
+
+def quick(sections: SectionsProblem = PID) -> CoDesignProblem:
+    case = problem(sections=sections, start=(60.0, 60.0))
+    return replace(case, inner=replace(case.inner, S_low=0.2))
+
+
+@pytest.fixture(scope="module")
+def anchored() -> CoDesignProblem:
+    found, made = prepared(quick())
+    assert made.certified
+    return found
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_envelope_gradient_is_the_slope_of_the_true_function(
+    anchored: CoDesignProblem, sampled: bool
+) -> None:
+    case = anchored
+    if sampled:
+        sections = replace(PID, sampling=Sampling(8000.0, 80.0))
+        case = prepared(quick(sections))[0]
+    theta, h = np.array([61.0, 58.0]), 1e-3
+    value = sections_value(case, theta)
+    assert value.feasible
+    for i in range(2):
+        ends = [sections_value(case, theta + sign * h * np.eye(2)[i]) for sign in (1.0, -1.0)]
+        numeric = (ends[0].bandwidth - ends[1].bandwidth) / (2.0 * h)
+        assert value.gradient[i] == pytest.approx(numeric, rel=1e-4)
+
+
+def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path: Path) -> None:
+    """In any order, by one worker or two, from the store or computed."""
+    thetas = np.array([[58.0, 58.0], [62.0, 57.0], [66.0, 69.0]])
+
+    def asked(order: list[int], workers: int, name: str) -> list[tuple]:
+        with Workers(workers) as pool, SampleStore(tmp_path / name) as store:
+            found = Sampler(anchored, store, pool).bandwidths(thetas[order])
+        return [(s.theta, s.bandwidth, s.gradient, s.kappa) for s in found]
+
+    first = asked([0, 1, 2], 1, "a.sqlite")
+    assert all(np.isfinite(item[1]) for item in first)
+    assert asked([2, 0, 1], 2, "b.sqlite") == [first[2], first[0], first[1]]
+    assert asked([0, 1, 2], 1, "a.sqlite") == first
+
+
+def test_three_formulations_agree_and_a_resumed_run_is_the_same(tmp_path: Path) -> None:
+    store = tmp_path / "samples.sqlite"
+    case = replace(quick(replace(PID, uncertainty=Uncertainty())), lower=(58.0, 58.0),
+                   upper=(62.0, 62.0))  # fmt: skip
+    nested = solve(case, Nested(plan="sobol", points=4), store=store)
+    others = [solve(case, kind, store=store) for kind in (Lifted(points=4), Direct(starts=1))]
+    for found in (nested, *others):
+        result = found.result
+        assert result["status"] == "verified", result["reason"]
+        assert result["omega_S_hz"] is None
+        assert result["kkt"]["stationarity"] < 1e-4
+        assert result["objective"] == pytest.approx(nested.result["objective"], rel=1e-3)
+    before = store.stat().st_mtime_ns
+    again = solve(case, Nested(plan="sobol", points=4), store=store)
+    assert store.stat().st_mtime_ns == before
+    for key in ("theta", "objective", "bandwidth_hz", "syntheses", "controller"):
+        assert again.result[key] == nested.result[key]
+
+
+def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) -> None:
+    """The judge on two hundred plants between and beside those that were designed for."""
+    theta = anchored.start
+    made = sections_value(anchored, theta).design
+    worst, missing = worst_members(anchored, theta, made)
+    assert not missing
+    assert made.controller is not None
+    judged, plants = judged_widely(anchored, theta, made.controller, worst)
+    assert judged.passed
+    assert plants > 200
+    wild = replace(made.controller, C=1.2 * made.controller.C)
+    assert not judged_corners(anchored, theta, wild).passed
+
+
+def test_the_range_of_frequencies_is_that_of_the_start() -> None:
+    """Alike at every θ, or ω_b* would move with it where it binds."""
+    case = with_range(quick())
+    assert case.sections is not None
+    assert case.sections.frequencies is not None
+    assert with_range(replace(case, start=(70.0, 70.0))) == replace(case, start=(70.0, 70.0))
+
+
+def test_mixed_sensitivity_is_not_answered_for_sections() -> None:
+    with pytest.raises(UserError, match="sections_value"):
+        true_inner(quick(), (60.0, 60.0))
+
+
+def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
+    case = quick(replace(PID, starts=2))
+    case = replace(case, inner=replace(case.inner, S_low=1e-5))
+    found = solve(case, Direct(starts=1))
+    assert found.result["status"] == "infeasible"
+    assert found.result["reason"]
+
+
+QUICK = """
+[plant]
+model = "two_mass"
+[theta.m1]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[theta.m2]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[objective]
+w1 = 0.0995
+w2 = -0.9950
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 2e7
+A_l = 1.0
+A_u = 1e-2
+[inner]
+S_max = 1.75
+S_low = 0.2
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1800.0]
+omega_T_hz = [25.0, 1000.0]
+[controller]
+structure = "sections"
+biquads = 0
+weighted_level = 8.426
+starts = 4
+[loop]
+rate_hz = 8000.0
+delay_us = 80.0
+[sampling]
+points = 2
+"""
+
+
+def test_commands_on_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case, run = tmp_path / "quick.toml", tmp_path / "run"
+    case.write_text(QUICK)
+    common = ["--quiet", "--workers", "1"]
+    arguments = [str(case), "--out", str(run), "--workers", "1"]
+    assert solve_main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "lead: zero" in printed
+    result = json.loads((run / "result.json").read_text())
+    controller = json.loads((run / "controller.json").read_text())
+    assert controller["sections"]["loop"] == {
+        "rate_hz": 8000.0, "delay_us": 80.0, "method": "tustin"
+    }  # fmt: skip
+    assert len(controller["A"]) == result["controller"]["order"] == 4
+    page = (run / "report.html").read_text()
+    assert "Nyquist" in page
+    assert "roll-off" in page
+
+    assert inner_main([str(case), "--theta", "m1=59,m2=59", *common]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "verified"
+    assert answer["gamma_opt"] is None
+
+    assert deploy_main([str(run), *common]) == 0
+    deployed = json.loads((run / "deploy" / "deploy.json").read_text())
+    assert (deployed["rate_hz"], deployed["delay"]) == pytest.approx((8000.0, 8e-5))
+    assert deployed["sampled"]["bandwidth_hz"] >= result["bandwidth_hz"] * (1.0 - 1e-6)
+    assert deployed["sampled"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+
+    assert robustness_main([str(run), "--samples", "5", *common]) == 0
+    assert insight_main([str(run), *common]) == 2
+    assert "controller.structure" in capsys.readouterr().err
+
+    controller["sections"]["kappa"][0] += 3.0  # 20 times the gain
+    (run / "controller.json").write_text(json.dumps(controller))
+    assert deploy_main([str(run), *common]) == 2
+    assert "not certified" in capsys.readouterr().err
