@@ -25,7 +25,7 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from ccd_casadi.support.progress import Progress, duration
+from ccd_casadi.support.progress import Progress
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate")
@@ -88,7 +88,7 @@ def ensure_compiled() -> None:
         count = min(len(PARTS), _cores())
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
-            f" about {duration(SECONDS / count)} on {count} core{'s' if count > 1 else ''}"
+            f" about {SECONDS / count:.0f} s on {count} core{'s' if count > 1 else ''}"
         )
         try:
             done = _compile(kernels, count)
