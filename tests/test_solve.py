@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +211,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
 ) -> None:
     """To the last bit, seconds aside; the pool is started although the work is short."""
-    monkeypatch.setattr("ccd_casadi.solve.PATIENCE", 0.0)
+    monkeypatch.setattr(import_module("ccd_casadi.solve"), "PATIENCE", 0.0)
     quick = "\n[sampling]\npoints = 2\nlifted_points = 12\n[outer]\nstarts = 2\n"
     case = changed(tmp_path, more=quick + "max_refinements = 0\n")
     for workers in ("1", "2"):
