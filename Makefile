@@ -6,13 +6,19 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test lint docs bench setup setup-test clean
+.PHONY: solve test test-processors lint docs bench setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
 test: setup-test lint docs
 	$(BIN)/python -m pytest -n 2
+	$(BIN)/python benchmarks/processors.py --other
+
+# The suite under the kernels that OpenBLAS has for other processors, three times each, with
+# examples drawn anew: an hour or more on two cores.
+test-processors: setup-test
+	$(BIN)/python benchmarks/processors.py
 
 lint: setup-test
 	$(BIN)/ruff check .
@@ -29,12 +35,16 @@ bench: setup-test
 setup: .venv/.ready
 setup-test: .venv/.ready-test
 
-# The compiled kernels are built once here, so that the first solve does not wait for them.
+# The kernels are compiled once here, so that the first solve does not wait for them; what they need
+# is installed first, the other wheels meanwhile.
 .venv/.ready: requirements.lock pyproject.toml
 	test -d .venv || $(PYTHON) -m venv .venv
-	$(PIP) -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
-	$(BIN)/python -m ccd_casadi.kernels
+	$(PIP) -c requirements.lock numba scipy
+	$(BIN)/python -m ccd_casadi.kernels & kernels=$$!; \
+	$(PIP) -r requirements.lock && \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e . \
+	|| { kill $$kernels; exit 1; }; \
+	wait $$kernels
 	touch $@
 
 .venv/.ready-test: .venv/.ready requirements-test.lock

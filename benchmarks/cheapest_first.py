@@ -19,7 +19,7 @@ settings.register_profile(
     deadline=None,
     suppress_health_check=tuple(HealthCheck),
 )
-settings.load_profile("mutants")
+os.environ["HYPOTHESIS_PROFILE"] = "mutants"  # which tests/conftest.py loads
 _FILE = Path(os.environ["MUTATION_ORDER"])
 _seconds: dict[str, float] = {}
 

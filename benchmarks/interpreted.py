@@ -3,7 +3,11 @@
 Only the LAPACK wrappers stay compiled; they cannot be interpreted.
 """
 
+import os
+
 import numpy as np
+
+os.environ["CCD_CASADI_COMPILES"] = "1"  # only the wrappers are, and not on two processes
 
 import ccd_casadi.kernels.compiled as gate
 import ccd_casadi.kernels.lapack

@@ -23,7 +23,7 @@ from ccd_casadi.codesign.retraining import CoDesignTruth
 from ccd_casadi.reporting.retrained_run import open_run
 from surrogates import sobol
 from surrogates.acquisition import objective_and_violation
-from surrogates.judgement import STARTS, fit_all
+from surrogates.iteration import STARTS, fit_all
 from surrogates.optimum import predicted_optimum
 from surrogates.retraining import Settings, retrain, thinned
 

@@ -1,9 +1,8 @@
-"""Error of plain, gradient-enhanced and pieced surrogates against the number of true syntheses.
+"""Error of plain and gradient-enhanced surrogates against the number of true syntheses.
 
 The lifted data of case study 1: ω_b, ln‖S‖∞ and ln|S(jω_low)| over (m1, m2, ln ω_S, ln ω_T),
 judged on 1,000 unseen designs. ‖S‖∞ is the larger of two local peaks, and kinked where they are
-equal: "pieces" has a gradient-enhanced process for each, told apart by where the peak is. Prints
-a table, writes surrogate_error.json beside this file.
+equal. Prints a table, writes surrogate_error.json beside this file.
 """
 
 import json
@@ -20,13 +19,12 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.units import HZ
-from surrogates import Surrogate, design, fit_maximum, fit_outputs, pieces_of
-from surrogates.maximum import least_of_a_piece
+from surrogates import design, fit_outputs
 
 HERE = Path(__file__).parent
 COUNTS = (16, 24, 32, 48, 64, 128, 256)
 UNSEEN = 1000
-KINDS = ("plain", "gradient", "pieces")
+KINDS = ("plain", "gradient")
 Z95 = 1.959963984540054
 
 
@@ -70,13 +68,7 @@ def _row(samples, X, Y, lower, upper, count, kind):
     values = np.array([sample.values[:3] for sample in samples])
     slopes = np.array([sample.gradients[:3] for sample in samples])
     options = {"lower": lower, "upper": upper, "seed": 0, "starts": 1}
-    surrogates: list[Surrogate] = list(
-        fit_outputs(points, values, None if kind == "plain" else slopes, **options)
-    )
-    if kind == "pieces":
-        least = least_of_a_piece(len(lower), gradients=True)
-        pieces = pieces_of([sample.peak_frequency for sample in samples], least)
-        surrogates[1] = fit_maximum(points, values[:, 1], pieces, slopes[:, 1], **options)
+    surrogates = fit_outputs(points, values, None if kind == "plain" else slopes, **options)
     seconds = perf_counter() - began
     both = [surrogate.predict(X, return_std=True) for surrogate in surrogates]
     error = np.array([mean for mean, _ in both]).T - Y

@@ -9,7 +9,7 @@ Names are imported when they are first used: this module alone loads neither num
 """
 
 import sys
-from importlib import import_module, metadata
+from importlib import import_module
 from types import ModuleType
 
 if sys.argv[:1] == ["-m"]:  # a command is starting, not a library: its first import is this
@@ -34,6 +34,7 @@ _PUBLIC = {
     "compare": "codesign.comparison",
     "deploy": "deployment.pipeline",
     "load_case": "cases.case",
+    "parse_case": "cases.case",
     "plant_from_control": "synthesis.interchange",
     "problem_of": "cases.case",
     "read_run": "cases.run_folder",
@@ -50,6 +51,8 @@ __all__ = [*_PUBLIC, "__version__"]
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
+        from importlib import metadata  # slow to import
+
         return metadata.version("ccd-casadi")
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,15 +6,13 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.cases.diagnosis import Severity, diagnose
-from ccd_casadi.cases.plant_report import SHARES, plant_report
-from ccd_casadi.codesign.result import clean
 from ccd_casadi.support.command_line import ExitCode, parser, run
 
 
 def text(found: dict[str, Any]) -> str:
     """The diagnosis for a terminal."""
+    from ccd_casadi.cases.plant_report import SHARES
+
     theta = ", ".join(f"{name} = {value:.6g}" for name, value in found["theta"].items())
     lines = [
         f"plant         {found['plant']}: {found['inputs']} inputs, {found['outputs']} outputs",
@@ -54,6 +52,11 @@ def text(found: dict[str, Any]) -> str:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.diagnosis import Severity, diagnose
+    from ccd_casadi.cases.plant_report import plant_report
+    from ccd_casadi.codesign.result import clean
+
     case = load_case(options.case)
     problem = problem_of(case)
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
@@ -71,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.check", "Look at a case's plant before designing anything.")
     arguments.add_argument("--json", action="store_true", help="the diagnosis as JSON")
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -2,18 +2,16 @@
 
 import argparse
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.comparison import Comparison, compare, comparison_dict
-from ccd_casadi.codesign.result import write_json
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.codesign.comparison import Comparison
 
-def table(comparison: Comparison) -> str:
+
+def table(comparison: "Comparison") -> str:
     """The methods in a few columns for the terminal."""
     lines = [f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'s':>8}  status"]
     for method in comparison.methods:
@@ -30,6 +28,13 @@ def table(comparison: Comparison) -> str:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.toml_writer import case_to_toml
+    from ccd_casadi.codesign.comparison import compare, comparison_dict
+    from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.sampling.cluster import pool
+
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)
@@ -40,15 +45,15 @@ def command(options: argparse.Namespace) -> ExitCode:
     (folder / "case.toml").write_text(case_to_toml(case))
     answer = comparison_dict(comparison, options.seed)
     write_json(folder / "compare.json", answer)
+    if not options.quiet:
+        print(table(comparison))
+        print("\n".join(answer["conclusions"]["sentences"]))
+        print(f"run folder    {folder}")
     from ccd_casadi.reporting.compare_page import (
         write_comparison_report,  # matplotlib is slow to import
     )
 
     write_comparison_report(folder, comparison, answer)
-    if not options.quiet:
-        print(table(comparison))
-        print("\n".join(answer["conclusions"]["sentences"]))
-        print(f"run folder    {folder}")
     statuses = {method.figures["status"] for method in comparison.methods if method.solution}
     if statuses == {"infeasible"}:
         return ExitCode.INFEASIBLE
@@ -59,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.compare", "Every method on one case.")
     add_scheduler(arguments)
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.comparison"])
 
 
 if __name__ == "__main__":

@@ -7,22 +7,25 @@ design that is not certified does not count, and among those that are the lowest
 import argparse
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
-from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.result import clean, figures_dict, versions, write_json
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.backends.judgement import AGREE, Verdict, verdicts
-from ccd_casadi.synthesis.backends.mixed import RICCATI, TITLES, every_backend
+from surrogates.options import positive
+
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.inner_problem.problem import CoDesignProblem
+    from ccd_casadi.synthesis.backends.judgement import Verdict
 
 
 def _problem(
     options: argparse.Namespace,
-) -> tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]:
+) -> "tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]":
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
+    from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.inner_problem.problem import true_inner
+
     asked = (options.omega_S_hz, options.omega_T_hz)
     if (asked[0] is None) != (asked[1] is None):
         words = "give both --omega-s-hz and --omega-t-hz, or neither"
@@ -51,6 +54,11 @@ def _problem(
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
+    from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.inner_problem.problem import scaled_plant
+    from ccd_casadi.synthesis.backends.judgement import verdicts
+    from ccd_casadi.synthesis.backends.mixed import RICCATI, every_backend
+
     problem, theta, point = _problem(options)
     results = every_backend(
         scaled_plant(problem, theta),
@@ -72,7 +80,9 @@ def command(options: argparse.Namespace) -> ExitCode:
     return ExitCode.DONE if own.holds else ExitCode.NOT_VERIFIED
 
 
-def _table(found: Sequence[Verdict]) -> str:
+def _table(found: "Sequence[Verdict]") -> str:
+    from ccd_casadi.synthesis.backends.mixed import TITLES
+
     lines = [
         f"{'back end':18s} {'gamma claimed':>13s} {'certified':>11s} {'bandwidth':>12s} "
         f"{'peak of S':>9s} {'seconds':>8s}  verdict"
@@ -94,7 +104,10 @@ def _cell(value: float, form: str, unit: str = "") -> str:
     return "-" if math.isnan(value) else f"{value:{form}}{unit}"
 
 
-def _conclusion(found: Sequence[Verdict]) -> str:
+def _conclusion(found: "Sequence[Verdict]") -> str:
+    from ccd_casadi.synthesis.backends.judgement import AGREE
+    from ccd_casadi.synthesis.backends.mixed import TITLES
+
     right = [TITLES[item.result.backend] for item in found if item.holds]
     wrong = [TITLES[item.result.backend] for item in found if item.holds is False]
     if not right:
@@ -105,11 +118,13 @@ def _conclusion(found: Sequence[Verdict]) -> str:
 
 
 def _json(
-    problem: CoDesignProblem,
+    problem: "CoDesignProblem",
     theta: tuple[float, ...],
     point: tuple[float, float],
-    found: Sequence[Verdict],
+    found: "Sequence[Verdict]",
 ) -> dict[str, Any]:
+    from ccd_casadi.codesign.result import clean, figures_dict, versions
+
     return {
         "theta": dict(zip(problem.names, theta, strict=True)),
         "omega_S_hz": point[0] / HZ,
@@ -139,24 +154,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
     for name in ("S", "T"):
         arguments.add_argument(
-            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=_positive, metavar="X",
+            f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
             help="with the other one; without both the best pair at theta, or the run's",
         )  # fmt: skip
     arguments.add_argument(
-        "--limit", type=_positive, default=60.0, metavar="SECONDS",
+        "--limit", type=positive, default=60.0, metavar="SECONDS",
         help="for each optional back end (default: 60)",
     )  # fmt: skip
-    return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
+    needs = ["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends.mixed"]
+    return run(command, arguments, argv, needs=needs)
 
 
 if __name__ == "__main__":

@@ -1,30 +1,33 @@
 """`python -m ccd_casadi.deploy RUN_DIR`: the run's controller as one that can be built."""
 
 import argparse
-import math
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.deployment.c_code import FILES as C_FILES
-from ccd_casadi.deployment.c_code import write_c
-from ccd_casadi.deployment.discretise import Discretisation
-from ccd_casadi.deployment.files import DESIGN_FILES, write_files
-from ccd_casadi.deployment.pipeline import Deployment, Timing, deploy
-from ccd_casadi.deployment.robust_set import place_words
-from ccd_casadi.deployment.words import status_words
-from ccd_casadi.reporting.deploy_page import write_report
+from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError, one_line
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
+from surrogates.options import number, positive
+
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.cases.run_folder import FinishedRun
+    from ccd_casadi.deployment.pipeline import Deployment
 
 LEADS = {"auto": None, "on": True, "off": False}
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.deployment.c_code import FILES as C_FILES
+    from ccd_casadi.deployment.c_code import write_c
+    from ccd_casadi.deployment.files import DESIGN_FILES, write_files
+    from ccd_casadi.deployment.pipeline import deploy
+
     require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
     status = finished.result.get("status")
@@ -57,17 +60,22 @@ def command(options: argparse.Namespace) -> ExitCode:
             folder, found.realisation, title=options.run.resolve().name, delay=found.delay,
             verified=found.passed,
         )  # fmt: skip
-    write_report(folder / "report.html", finished, found)
     if not options.quiet:
         print(_summary(finished, found))
         print(f"report        {folder / 'report.html'}")
+    from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
+
+    write_report(folder / "report.html", finished, found)
     if found.passed:
         return ExitCode.DONE
     print(one_line(f"not verified: {_shortfall(finished, found)}"), file=sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 
-def _summary(run: FinishedRun, found: Deployment) -> str:
+def _summary(run: "FinishedRun", found: "Deployment") -> str:
+    from ccd_casadi.deployment.robust_set import place_words
+    from ccd_casadi.deployment.words import status_words
+
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
     )  # fmt: skip
@@ -103,7 +111,7 @@ def _summary(run: FinishedRun, found: Deployment) -> str:
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
 
 
-def _shortfall(run: FinishedRun, found: Deployment) -> str:
+def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
     """What is not kept, and at which rate it would be."""
     if not found.shortfalls:
         return f"the run itself is not: {found.unverified}"
@@ -124,15 +132,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         "Reduce, discretise and verify a run's controller, and write it as C, JSON and .mat.",
     )
     arguments.add_argument(
-        "--rate-hz", metavar="X", type=_positive,
+        "--rate-hz", metavar="X", type=positive,
         help="sampling rate (default: the next round one above what is needed)",
     )  # fmt: skip
     delay = arguments.add_mutually_exclusive_group()
     delay.add_argument(
-        "--delay", metavar="SECONDS", type=_natural, help="from reading y to the new u, in s"
+        "--delay", metavar="SECONDS", type=number(), help="from reading y to the new u, in s"
     )
     delay.add_argument(
-        "--delay-samples", metavar="X", type=_natural, default=Timing.delay_samples,
+        "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
         help="the same in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
@@ -148,27 +156,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="go on with a run that is not verified; its controller is never called so",
     )  # fmt: skip
     arguments.add_argument(
-        "--saturation", metavar="NEWTON", type=_positive,
+        "--saturation", metavar="NEWTON", type=positive,
         help="clip every u to plus or minus this (default: off)",
     )  # fmt: skip
-    return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    value = _natural(text)
-    if value == 0.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
-    return value
-
-
-def _natural(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 on")
-    return value
+    return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 
 
 if __name__ == "__main__":

@@ -3,15 +3,19 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ccd_casadi.plants.imported.matrices import read_rows, reduced_table
-from ccd_casadi.plants.imported.modal_table import ModalTable, write_modal_table
-from ccd_casadi.plants.imported.results import results_table
 from ccd_casadi.support.command_line import ExitCode, run, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
 
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.plants.imported.modal_table import ModalTable
 
-def _table(folder: Path, options: argparse.Namespace) -> ModalTable:
+
+def _table(folder: Path, options: argparse.Namespace) -> "ModalTable":
+    from ccd_casadi.plants.imported.matrices import read_rows, reduced_table
+    from ccd_casadi.plants.imported.results import results_table
+
     columns = read_rows(folder / "index.csv")[0]
     if "results" in columns:
         return results_table(folder)
@@ -23,6 +27,8 @@ def _table(folder: Path, options: argparse.Namespace) -> ModalTable:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.plants.imported.modal_table import write_modal_table
+
     folder: Path = options.run
     try:
         table = _table(folder, options)
@@ -54,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--static-correction", action="store_true", help="of matrices: exact static compliance"
     )
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.plants.imported.results"])
 
 
 if __name__ == "__main__":

@@ -5,30 +5,24 @@ import json
 import sys
 from collections.abc import Sequence
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
-from ccd_casadi.codesign.result import clean, controller_dict, figures_dict, versions, write_json
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    best_choice,
-    design_choices,
-    plant_of,
-    scaled_plant,
-    true_design,
-)
-from ccd_casadi.inner_problem.sweep import active_constraints
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
-from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from surrogates.options import positive
+
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.inner_problem.problem import CoDesignProblem
+    from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
+    from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+    from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.inner_problem.problem import best_choice, plant_of
+    from ccd_casadi.plants.plant import hardware_cost
+
     case = load_case(options.case)
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
@@ -67,19 +61,28 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 
 def _best_at(
-    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
-) -> CoDesignProblem:
+    problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
+) -> "CoDesignProblem":
     """The problem with the design plant whose controller has the least peak of S there."""
+    import numpy as np
 
-    def peak(choice: CoDesignProblem) -> float:
+    from ccd_casadi.inner_problem.problem import design_choices, true_design
+
+    def peak(choice: "CoDesignProblem") -> float:
         return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
 
     return min(design_choices(problem), key=peak)
 
 
 def _design(
-    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
+    problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
 ) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
+    from ccd_casadi.codesign.result import clean, controller_dict, figures_dict
+    from ccd_casadi.inner_problem.problem import scaled_plant
+    from ccd_casadi.inner_problem.sweep import active_constraints
+    from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
+    from ccd_casadi.synthesis.synthesis import synthesise
+
     plant = scaled_plant(problem, theta)
     made = synthesise(
         plant,
@@ -108,10 +111,12 @@ def _design(
 
 def _print(
     answer: dict[str, Any],
-    rows: tuple[DesignFigures, ...],
+    rows: "tuple[DesignFigures, ...]",
     options: argparse.Namespace,
     began: float,
 ) -> None:
+    from ccd_casadi.codesign.result import clean, figures_dict, versions
+
     answer = answer | {
         "seconds": perf_counter() - began,
         "seed": options.seed,
@@ -133,21 +138,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments.add_argument(
             f"--omega-{name.lower()}-hz",
             dest=f"omega_{name}_hz",
-            type=_frequency,
+            type=positive,
             metavar="X",
             help=f"with the other one: a single synthesis at this omega_{name}",
         )
-    return run(command, arguments, argv)
-
-
-def _frequency(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a frequency above 0")
-    return value
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
 
 
 if __name__ == "__main__":

@@ -9,22 +9,24 @@ import argparse
 from collections.abc import Sequence
 from time import perf_counter
 
-import numpy as np
-
-from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.insight import insight_dict
-from ccd_casadi.codesign.pareto import pareto_front
-from ccd_casadi.codesign.post_optimal import post_optimal
-from ccd_casadi.codesign.result import write_json
-from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
 from ccd_casadi.support.process_pool import PATIENCE
+from surrogates.options import whole
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    import numpy as np
+
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.insight import insight_dict
+    from ccd_casadi.codesign.pareto import pareto_front
+    from ccd_casadi.codesign.post_optimal import post_optimal
+    from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.sampling.sampler import Sampler
+    from ccd_casadi.sampling.store import SampleStore
+
     began = perf_counter()
     done = read_run(options.run)
     folder = run_folder(options.run, options.out or options.run)
@@ -45,22 +47,16 @@ def command(options: argparse.Namespace) -> ExitCode:
     seconds = perf_counter() - began
     found = insight_dict(done, front, responses)
     write_json(folder / "insight.json", found | {"seed": options.seed, "seconds": seconds})
-    from ccd_casadi.reporting.insight_page import write_insight  # matplotlib is slow to import
-
-    write_insight(folder, done, front, responses)
     verified = [point for point in front.points if point.verified]
     if not options.quiet:
         efficient = sum(point.efficient for point in verified)
         print(f"front         {len(verified)} of {len(front.points)} points verified, ", end="")
         print(f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")
         print(f"written       {folder / 'insight.html'}")
+    from ccd_casadi.reporting.insight_page import write_insight  # matplotlib is slow to import
+
+    write_insight(folder, done, front, responses)
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
-
-
-def _count(text: str) -> int:
-    if not (text.isdecimal() and len(text) < 5 and int(text) >= 2):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number of points from 2 to 9999")
-    return int(text)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,10 +65,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "ccd_casadi.insight", "Weight against bandwidth, and what the optimum answers to."
     )
     arguments.add_argument(
-        "--points", metavar="N", type=_count, default=20, help="of the front (default: 20)"
+        "--points", metavar="N", type=whole(2, 9999), default=20, help="of the front (default: 20)"
     )
     add_scheduler(arguments)
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.insight"])
 
 
 if __name__ == "__main__":

@@ -5,15 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 
-from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.result import versions, write_json
-from ccd_casadi.deployment.given_controller import with_controller
-from ccd_casadi.robust.setpoint import Limits
-from ccd_casadi.robust.study import Demands, robustness, study_dict
+from ccd_casadi.robust.demands import Demands, Limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.progress import Progress
+from surrogates.options import number, positive, whole
 
+LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 _DEFAULT = Demands()
 _MOVE = (
     ("stroke", _DEFAULT.limits.stroke, "m"),
@@ -27,8 +26,11 @@ _MOVE = (
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.result import versions, write_json
+    from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
+
     began = perf_counter()
-    require("slycot", "slicot")  # margins and the structured bound need it: before anything else
     finished = read_run(options.run)
     outputs = finished.plant.C.shape[0]
     if options.axis > outputs:
@@ -38,6 +40,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise UserError(f"--damping: is {low:g} {high:g}; give a factor up to 1 and one from 1")
     place = options.out or options.run
     if options.controller is not None:
+        from ccd_casadi.deployment.given_controller import with_controller
+
         finished = with_controller(finished, options.controller)
         if options.out is None:  # the run's own page stays
             place = options.run / f"robustness_{options.controller.stem}"
@@ -53,10 +57,21 @@ def command(options: argparse.Namespace) -> ExitCode:
         window=options.window,
         axis=options.axis - 1,
     )
-    found = robustness(finished, demands, options.seed, options.quiet)
-    answer = study_dict(finished, found)
-    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
-    write_json(folder / "robustness.json", answer)
+    with Workers(options.workers, PATIENCE) as workers:
+        found = tried(finished, demands, options.seed, options.quiet, workers)
+
+    def write() -> None:
+        answer = study_dict(finished, found)
+        answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+        write_json(folder / "robustness.json", answer)
+
+    write()  # the last of the figures may not come within its time
+    with Progress(
+        1, f"structured singular value, at most {options.limit:g} s", options.quiet
+    ) as bar:
+        found = with_structured_bound(finished, found, options.limit)
+        bar.advance()
+    write()
     from ccd_casadi.reporting.robustness_page import (  # matplotlib is slow
         conclusion,
         write_robustness,
@@ -69,6 +84,9 @@ def command(options: argparse.Namespace) -> ExitCode:
     return ExitCode.DONE
 
 
+PERCENT = number(0.0, 50.0, strict=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
@@ -77,43 +95,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     add = arguments.add_argument
     words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
     add("--controller", type=Path, metavar="FILE", help=words)
-    add("--shift", type=_percent, default=5.0, metavar="PERCENT", help="of resonances; default 5")
-    add("--damping", type=_positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
+    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
+    add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
         help="factors of the damping; default 0.5 2")  # fmt: skip
-    add("--tolerance", type=_percent, default=1.0, metavar="PERCENT",
+    add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
         help="of every hardware parameter; default 1")  # fmt: skip
-    add("--samples", type=_count, default=200, metavar="N", help="of random hardware; default 200")
-    add("--noise", type=_positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
-    add("--disturbance", type=_positive, default=1.0, metavar="X",
+    add("--samples", type=whole(1), default=200, metavar="N",
+        help="of random hardware; default 200")  # fmt: skip
+    add("--noise", type=positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
+    add("--disturbance", type=positive, default=1.0, metavar="X",
         help="force at every actuator, N/√Hz; default 1")  # fmt: skip
-    add("--axis", type=_count, default=1, metavar="N", help="output that moves; default 1")
+    add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
     for name, default, unit in _MOVE:
-        add(f"--{name}", type=_positive, default=default, metavar="X",
+        add(f"--{name}", type=positive, default=default, metavar="X",
             help=f"of the move, {unit}; default {default:g}")  # fmt: skip
-    return run(command, arguments, argv)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no number above 0; give one")
-    return value
-
-
-def _percent(text: str) -> float:
-    value = _positive(text)
-    if value >= 50.0:
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is not below 50 %; give a smaller share")
-    return value
-
-
-def _count(text: str) -> int:
-    if not (text.isdecimal() and len(text) < 7 and int(text) >= 1):
-        raise argparse.ArgumentTypeError(f"{text[:20]!r} is no whole number from 1; give one")
-    return int(text)
+    add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
+        help=f"for the structured singular value; default {LIMIT:g}")  # fmt: skip
+    return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 
 if __name__ == "__main__":

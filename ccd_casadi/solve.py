@@ -4,31 +4,16 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.case import load_case, problem_of
-from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
-from ccd_casadi.cases.sections import Case
-from ccd_casadi.cases.unit_findings import peak_words, unit_findings
-from ccd_casadi.codesign.run import (
-    FORMULATIONS,
-    Solution,
-    co_design,
-    formulation_of,
-    resolved,
-    write_run,
-)
-from ccd_casadi.codesign.stored import named_surrogate
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.facts import facts_of
-from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.registry import SHIPPED
-from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.cases.sections import Case
+    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 _CODES = {
     "verified": ExitCode.DONE,
@@ -37,7 +22,7 @@ _CODES = {
 }
 
 
-def summary(solution: Solution) -> str:
+def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     result = solution.result
     if result["status"] == "infeasible":
@@ -65,8 +50,13 @@ def summary(solution: Solution) -> str:
     return "\n".join(lines)
 
 
-def show_findings(case: Case, problem: CoDesignProblem) -> None:
+def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
+    from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
+    from ccd_casadi.cases.unit_findings import peak_words
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.plants.registry import SHIPPED
+
     if case.plant.model in SHIPPED:
         for words in peak_words(problem.inner.S_max):
             print(f"warning: {words}", file=sys.stderr)
@@ -80,8 +70,15 @@ def show_findings(case: Case, problem: CoDesignProblem) -> None:
         print(f"note: {words}", file=sys.stderr)
 
 
-def with_units(solution: Solution, problem: CoDesignProblem) -> Solution:
+def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit."""
+    from ccd_casadi.cases.unit_findings import unit_findings
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.plants.facts import facts_of
+    from ccd_casadi.plants.modal import modal_plant
+    from ccd_casadi.plants.plant import mechanics
+    from ccd_casadi.plants.scaling import scale_plant
+
     if solution.result["status"] == "verified":
         return solution
     modal = modal_plant(mechanics(plant_of(problem), problem.start), problem.suspension)
@@ -93,6 +90,14 @@ def with_units(solution: Solution, problem: CoDesignProblem) -> Solution:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
+    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.codesign.run import co_design, formulation_of, resolved, write_run
+    from ccd_casadi.codesign.stored import named_surrogate
+    from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.sampling.sampler import Sampler
+    from ccd_casadi.sampling.store import SampleStore
+
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is told before anything is written
@@ -111,14 +116,14 @@ def command(options: argparse.Namespace) -> ExitCode:
         formulation = formulation_of(case, options.formulation)
         solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
         write_run(folder, case, solution)
-    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
-
-    write_report(folder, resolved(case, solution), solution.problem or problem, solution)
     code = _CODES[solution.result["status"]]
     if not options.quiet:
         print(summary(solution))
         print(f"run folder    {folder}")
-    elif code is not ExitCode.DONE:
+    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+
+    write_report(folder, resolved(case, solution), solution.problem or problem, solution)
+    if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code
 
@@ -140,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="start from a version of the run folder's surrogates (0002), not by sampling",
     )
     add_scheduler(arguments)
-    return run(command, arguments, argv)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Smooth surrogates of expensive functions, for use inside CasADi.
 
-Sample (`design`), fit (`fit`; a kind, or `kind="auto"`), judge (`assess`, `extrapolation`),
-export (`to_casadi`) and keep (`save`, `load`):
+Sample (`design`), fit (`fit`), judge (`quality_of`, `extrapolation`), export (`to_casadi`) and keep
+(`save`, `load`):
 
 >>> import numpy as np
 >>> X = design("sobol", [0.0, 0.0], [1.0, 2.0], 32, seed=1)
@@ -11,89 +11,79 @@ export (`to_casadi`) and keep (`save`, `load`):
 >>> bool(abs(float(f([0.5, 1.0])) - np.exp(-0.5) * np.sin(1.0)) < 1e-2)
 True
 
-The package knows nothing of what the function means. scikit-learn is imported when
-something is fitted and not before.
+The package knows nothing of what the function means. Names are imported when they are first
+used: this module alone loads nothing, and scikit-learn comes when something is fitted.
 """
 
 import sys as _sys
+from importlib import import_module as _import_module
+from types import ModuleType as _ModuleType
 
-from surrogates import ctrl_c as _ctrl_c
+from surrogates import interrupts as _interrupts
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _ctrl_c.starting()
+    _interrupts.starting()
 
-from surrogates import casadi_members as _casadi_members  # registers their expressions
-from surrogates.assessment import Assessment, assess
-from surrogates.casadi_export import to_casadi
-from surrogates.designs import DesignKind, corners, design, grid, latin_hypercube, sobol
-from surrogates.diagnostics import Diagnosis, Roughness, diagnose
-from surrogates.extrapolation import Extrapolation, extrapolation
-from surrogates.fitting import Kind, fit
-from surrogates.gaussian_process import GaussianProcess, condition, loo_errors
-from surrogates.interface import Surrogate, SurrogateFitError
-from surrogates.kernels import Hyperparameters, Kernel
-from surrogates.maximum import Maximum, fit_maximum, pieces_of
-from surrogates.network import Network, fit_network
-from surrogates.outputs import fit_outputs
-from surrogates.polynomial import Polynomial, fit_polynomial
-from surrogates.radial_basis import Basis, RadialBasis, fit_radial_basis
-from surrogates.samples import Samples, checked
-from surrogates.selection import Candidate, Choice, choose
-from surrogates.serialise import SurrogateFileError, load, save
-from surrogates.sparse_process import SparseProcess, fit_sparse
-from surrogates.transform import Exponential, Transform
-from surrogates.validation import Errors, cross_validate, errors
+del _interrupts
 
-del _casadi_members, _ctrl_c, _sys
+# Every public name, and the module that defines it.
+_PUBLIC = {
+    "Basis": "radial_basis",
+    "DesignKind": "sampling_plan",
+    "Errors": "interface",
+    "Extrapolation": "extrapolation",
+    "GaussianProcess": "gaussian_process",
+    "Hyperparameters": "covariance",
+    "Kernel": "covariance",
+    "Kind": "fitting",
+    "Polynomial": "polynomial",
+    "Quality": "quality",
+    "RadialBasis": "radial_basis",
+    "Roughness": "quality",
+    "Samples": "samples",
+    "Surrogate": "interface",
+    "SurrogateFileError": "serialise",
+    "SurrogateFitError": "interface",
+    "checked": "samples",
+    "condition": "gaussian_process",
+    "corners": "sampling_plan",
+    "design": "sampling_plan",
+    "errors": "validation",
+    "extrapolation": "extrapolation",
+    "fit": "fitting",
+    "fit_outputs": "fitting",
+    "fit_polynomial": "polynomial",
+    "fit_radial_basis": "radial_basis",
+    "grid": "sampling_plan",
+    "latin_hypercube": "sampling_plan",
+    "load": "serialise",
+    "loo_errors": "gaussian_process",
+    "quality_of": "quality",
+    "save": "serialise",
+    "sobol": "sampling_plan",
+    "to_casadi": "casadi_export",
+}
+__all__ = sorted(_PUBLIC)
 
-__all__ = [
-    "Assessment",
-    "Basis",
-    "Candidate",
-    "Choice",
-    "DesignKind",
-    "Diagnosis",
-    "Errors",
-    "Exponential",
-    "Extrapolation",
-    "GaussianProcess",
-    "Hyperparameters",
-    "Kernel",
-    "Kind",
-    "Maximum",
-    "Network",
-    "Polynomial",
-    "RadialBasis",
-    "Roughness",
-    "Samples",
-    "SparseProcess",
-    "Surrogate",
-    "SurrogateFileError",
-    "SurrogateFitError",
-    "Transform",
-    "assess",
-    "checked",
-    "choose",
-    "condition",
-    "corners",
-    "cross_validate",
-    "design",
-    "diagnose",
-    "errors",
-    "extrapolation",
-    "fit",
-    "fit_maximum",
-    "fit_network",
-    "fit_outputs",
-    "fit_polynomial",
-    "fit_radial_basis",
-    "fit_sparse",
-    "grid",
-    "latin_hypercube",
-    "load",
-    "loo_errors",
-    "pieces_of",
-    "save",
-    "sobol",
-    "to_casadi",
-]
+
+def __getattr__(name: str) -> object:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(_import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+class _Package(_ModuleType):
+    """Keeps `surrogates.extrapolation` the function when the module of that name is imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _PUBLIC and isinstance(value, _ModuleType)):
+            super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Package

@@ -4,7 +4,7 @@ With y ~ N(μ(x), diag σ²(x)), J and g are linearised in y,
 
     σ_J² = Σ_i (∂J/∂y_i)² σ_i²,      σ_g² = Σ_i (∂g/∂y_i)² σ_i²,
 
-and the merit of a point is EI(x) Π_j P(g_j <= 0), times the hope of any truth there, where with
+and the merit of a point is EI(x) Π_j P(g_j <= 0), times the chance of a value there, where with
 the best known J* and u = (J* - J(x, μ)) / σ_J the expected improvement is
 EI = σ_J (u Φ(u) + φ(u)).
 Source: Schonlau, Welch and Jones (1998); batches by the kriging believer of Ginsbourger,
@@ -18,9 +18,9 @@ import casadi as ca
 import numpy as np
 
 from surrogates.casadi_export import to_casadi
-from surrogates.designs import sobol
 from surrogates.gaussian_process import GaussianProcess, condition
 from surrogates.interface import Array
+from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth
 
 NEAR = 1e-4  # of the box, largest component: nearer to a known point nothing is evaluated
@@ -32,7 +32,7 @@ EXACT = 1e-9  # violation allowed of a constraint without any deviation
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class Posterior:
     """Surrogates of a truth, one an output, conditioned on observations that all have a value.
 
     failed (f, d): points where the truth was asked and has no value.
@@ -57,7 +57,7 @@ class Belief:
         """Distances (m,) of X (m, d) to the nearest point asked before, shares of the box."""
         return distances(self.truth, X, np.vstack([self.observed.X, self.failed]))
 
-    def hope(self, X: Array) -> Array:
+    def chance_of_value(self, X: Array) -> Array:
         """A guess (m,) at the probability that the truth has a value at X (m, d).
 
         r_f² / (r_f² + r_k²) of the distances to the nearest failed and known point, 0 within
@@ -70,7 +70,7 @@ class Belief:
         guess = to_failed**2 / np.maximum(to_failed**2 + to_known**2, 1e-300)
         return np.where(to_failed < AVOID, 0.0, guess)
 
-    def believing(self, x: Array) -> "Belief":
+    def with_prediction_at(self, x: Array) -> "Posterior":
         """The same with its own prediction at x (d,) taken for an observation."""
         truth, old = self.truth, self.observed
         mean = to_casadi(list(self.surrogates), std=False)
@@ -112,15 +112,15 @@ def objective_and_violation(truth: Truth, X: Array, Y: Array) -> tuple[Array, Ar
     return J, np.array(truth.constraints(X.T, Y.T)).max(axis=0)
 
 
-def expected_improvement(belief: Belief, X: Array, best: float | None) -> Array:
+def expected_improvement(posterior: Posterior, X: Array, best: float | None) -> Array:
     """EI of J under `best`, times the probability of feasibility, (m,) at X (m, d), in units of J.
 
     Without a best known J the probability alone, times the spread of J.
     """
     from scipy.special import ndtr
 
-    truth = belief.truth
-    pairs = [process.predict(X, return_std=True) for process in belief.surrogates]
+    truth = posterior.truth
+    pairs = [process.predict(X, return_std=True) for process in posterior.surrogates]
     mean, std = (np.array(part).T for part in zip(*pairs, strict=True))
     J, J_std, g, g_std = _linearised(truth, X, mean, std)
     certain = g_std <= EXACT
@@ -128,7 +128,7 @@ def expected_improvement(belief: Belief, X: Array, best: float | None) -> Array:
         each = np.where(certain, g <= EXACT, ndtr(-g / np.where(certain, 1.0, g_std)))
         feasible = each.prod(axis=0)
         if best is None:
-            return feasible * float(np.ptp(belief.values()[0]))
+            return feasible * float(np.ptp(posterior.values()[0]))
         u = (best - J) / J_std
         density = np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
         gain = J_std * (u * ndtr(u) + density)
@@ -149,34 +149,37 @@ def _linearised(truth: Truth, X: Array, mean: Array, std: Array) -> tuple[Array,
     return outputs[0].ravel(), J_std, outputs[1], np.sqrt((to_y**2 * variance[:, None]).sum(axis=0))
 
 
-def spread(belief: Belief, X: Array) -> Array:
+def scaled_deviation(posterior: Posterior, X: Array) -> Array:
     """Root of the mean square deviation of the outputs, in units of their own spread, (m,)."""
-    scale = np.maximum(np.ptp(belief.observed.Y, axis=0), 1e-100)
+    scale = np.maximum(np.ptp(posterior.observed.Y, axis=0), 1e-100)
     each = [
         process.predict(X, return_std=True)[1] / size
-        for process, size in zip(belief.surrogates, scale, strict=True)
+        for process, size in zip(posterior.surrogates, scale, strict=True)
     ]
     return np.nan_to_num(np.sqrt(np.mean(np.square(each), axis=0)))
 
 
 def maximiser(
-    belief: Belief, explore: bool, near: Sequence[Array], seed: int
+    posterior: Posterior, explore: bool, near: Sequence[Array], seed: int
 ) -> tuple[Array, float]:
     """The point (d,) of largest merit that is not known yet, and its merit; 0 where none helps.
 
     Merit is the expected improvement, or the deviation to `explore`. Seeded candidates over the
     box and around `near`, then ever closer around the best of them.
     """
-    truth = belief.truth
+    truth = posterior.truth
     lower, upper = truth.lower, truth.upper
     rng = np.random.default_rng(seed)
-    J, _ = belief.values()
-    at = belief.incumbent()
+    J, _ = posterior.values()
+    at = posterior.incumbent()
     best = None if at is None else float(J[at])
 
     def merit(X: Array) -> Array:
-        found = spread(belief, X) if explore else expected_improvement(belief, X, best)
-        return np.where(belief.distance(X) > NEAR, found * belief.hope(X), 0.0)
+        if explore:
+            found = scaled_deviation(posterior, X)
+        else:
+            found = expected_improvement(posterior, X, best)
+        return np.where(posterior.distance(X) > NEAR, found * posterior.chance_of_value(X), 0.0)
 
     def cloud(centre: Array, scale: float) -> Array:
         step = scale * rng.standard_normal((CLOUD, len(lower))) * (upper - lower)
@@ -192,26 +195,32 @@ def maximiser(
 
 
 def choose(
-    belief: Belief, first: Array | None, count: int, explore: int, near: Sequence[Array], seed: int
+    posterior: Posterior,
+    first: Array | None,
+    count: int,
+    explore: int,
+    near: Sequence[Array],
+    seed: int,
 ) -> Array:
     """A batch (<= count, d): `first`, then by improvement, the last `explore` by deviation.
 
-    Each is believed before the next is sought; `first` is left out where it is known already.
+    The prediction at each counts as true before the next is sought (kriging believer); `first`
+    is left out where it is known already.
     """
     chosen: list[Array] = []
 
     def take(x: Array) -> None:
-        nonlocal belief
+        nonlocal posterior
         chosen.append(x)
-        belief = belief.believing(x)
+        posterior = posterior.with_prediction_at(x)
 
-    if first is not None and belief.distance(first[None])[0] > NEAR:
+    if first is not None and posterior.distance(first[None])[0] > NEAR:
         take(first)
     room = count - len(chosen)
     for number in range(room):
-        x, merit = maximiser(belief, number >= room - explore, near, seed + number)
+        x, merit = maximiser(posterior, number >= room - explore, near, seed + number)
         if merit <= 0.0:  # nothing to be gained: then to be learnt
-            x, merit = maximiser(belief, True, near, seed + number)
+            x, merit = maximiser(posterior, True, near, seed + number)
         if merit > 0.0:
             take(x)
-    return np.array(chosen).reshape(-1, len(belief.truth.lower))
+    return np.array(chosen).reshape(-1, len(posterior.truth.lower))

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from surrogates.covariance import ROOT5, Kernel
 from surrogates.flat_limit import (
     UNDER_ROOT,
     FlatLimit,
@@ -21,8 +22,9 @@ from surrogates.flat_limit import (
     remainder_of_matern,
 )
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
-from surrogates.interface import Array, Surrogate
-from surrogates.kernels import ROOT5, Kernel
+from surrogates.interface import Array, Surrogate, no_deviation
+from surrogates.polynomial import Polynomial, total_degree
+from surrogates.radial_basis import DEGREES, Basis, RadialBasis
 
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
@@ -78,7 +80,7 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     p = process.hyperparameters
     lengths = p.length_scales
     n, d = process.X.shape
-    unit = (x - ca.DM(process.lower)) / ca.DM(process.upper - process.lower)
+    unit = in_unit_box(process, x)
     z, s = squared_distances(unit, process.X, lengths)
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
     if process.flat is not None:
@@ -103,6 +105,43 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     variance = p.signal_variance - ca.sumsqr(ca.mtimes(ca.DM(half), k))
     floor = VARIANCE_FLOOR * p.signal_variance
     return mean, process.band * process.output_scale * ca.sqrt(ca.fmax(variance, floor))
+
+
+@expression.register
+def _(polynomial: Polynomial, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
+    phi = legendre_products(polynomial.exponents, 2.0 * in_unit_box(polynomial, x) - 1.0)
+    value = ca.dot(ca.DM(polynomial.coefficients), phi)
+    if not std:
+        return (value,)
+    leverage = ca.sumsqr(ca.mtimes(ca.DM(polynomial.root), phi))
+    return value, ca.sqrt(polynomial.residual_variance * (1.0 + leverage))
+
+
+@expression.register
+def _(surrogate: RadialBasis, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
+    if std:
+        raise no_deviation("radial basis function")
+    unit = in_unit_box(surrogate, x)
+    d = surrogate.lower.size
+    _, s = squared_distances(unit, surrogate.X, np.ones(d))
+    match surrogate.basis:
+        case Basis.CUBIC:
+            phi = s * ca.sqrt(s + UNDER_ROOT)
+        case Basis.QUINTIC:
+            phi = -s * s * ca.sqrt(s + UNDER_ROOT)
+        case Basis.MULTIQUADRIC:
+            phi = -ca.sqrt(1.0 + surrogate.epsilon**2 * s)
+        case Basis.GAUSSIAN:
+            phi = ca.exp(-(surrogate.epsilon**2) * s)
+    v = 2.0 * unit - 1.0
+    tail = products_of(total_degree(d, DEGREES[surrogate.basis]), [ca.MX.ones(d), v, v * v])
+    sum_ = ca.dot(ca.DM(surrogate.weights), phi) + ca.dot(ca.DM(surrogate.tail), tail)
+    return (surrogate.output_mean + surrogate.output_scale * sum_,)
+
+
+def in_unit_box(surrogate: Surrogate, x: ca.MX) -> ca.MX:
+    """x̂ = (x - lower) / (upper - lower)."""
+    return (x - ca.DM(surrogate.lower)) / ca.DM(surrogate.upper - surrogate.lower)
 
 
 def flat_mean(flat: FlatLimit, unit: ca.MX) -> ca.MX:

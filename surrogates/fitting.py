@@ -1,38 +1,30 @@
-"""One way to fit every surrogate of the package.
+"""One way to fit every surrogate of the package."""
 
-A kind is named, or chosen by cross-validation (`selection`).
-"""
-
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from surrogates.covariance import Kernel
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate, SurrogateFitError
-from surrogates.kernels import Kernel
 from surrogates.maximum_likelihood import fit_process
-from surrogates.network import fit_network
-from surrogates.polynomial import fit_polynomial
-from surrogates.radial_basis import fit_radial_basis
-from surrogates.samples import Samples, checked
-from surrogates.sparse_process import fit_sparse
-from surrogates.transform import Transform, exponential, logarithms
+from surrogates.polynomial import Polynomial, fit_polynomial
+from surrogates.radial_basis import RadialBasis, fit_radial_basis
+from surrogates.samples import checked
 
 Noise = ArrayLike | None
 E = TypeVar("E", bound=StrEnum)
 
 
 class Kind(StrEnum):
-    """The kinds of surrogate, and 'auto' for the one cross-validation prefers."""
+    """The kinds of surrogate."""
 
     GAUSSIAN_PROCESS = "gaussian_process"
-    SPARSE_PROCESS = "sparse_process"
     POLYNOMIAL = "polynomial"
     RADIAL_BASIS = "radial_basis"
-    NETWORK = "network"
-    AUTO = "auto"
 
 
 @overload
@@ -56,15 +48,10 @@ def fit(
     Y: ArrayLike,
     dY: ArrayLike | None = None,
     *,
-    kind: Kind | str = ...,
-    transform: Transform | str = ...,
+    kind: Kind | str,
     lower: ArrayLike | None = ...,
     upper: ArrayLike | None = ...,
-    kernel: Kernel | str = ...,
     noise: Noise = ...,
-    gradient_noise: float | None = ...,
-    seed: int = ...,
-    starts: int = ...,
 ) -> Surrogate: ...
 def fit(
     X: ArrayLike,
@@ -72,7 +59,6 @@ def fit(
     dY: ArrayLike | None = None,
     *,
     kind: Kind | str = Kind.GAUSSIAN_PROCESS,
-    transform: Transform | str = Transform.IDENTITY,
     lower: ArrayLike | None = None,
     upper: ArrayLike | None = None,
     kernel: Kernel | str = Kernel.MATERN52,
@@ -80,13 +66,12 @@ def fit(
     gradient_noise: float | None = None,
     seed: int = 0,
     starts: int = 5,
-) -> Surrogate:
+) -> GaussianProcess | Polynomial | RadialBasis:
     """Fit a surrogate to samples of one output, with gradients if there are any.
 
     X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X, which processes
     and polynomials take. `lower`, `upper` (d,) scale the inputs; left out, they are the
-    range of X. `transform` 'log' fits ln Y. `kernel`, `gradient_noise` and `starts` are
-    those of the processes; 'auto' tries both kernels.
+    range of X. `kernel`, `gradient_noise`, `seed` and `starts` are those of the processes.
 
     `noise` is the standard deviation of Y in output units, one for all or one to each
     sample (n,); 0 interpolates, None estimates it where the kind can. `gradient_noise`
@@ -100,54 +85,60 @@ def fit(
     samples = checked(X, Y, lower, upper, dY, noise)
     if (gradient_noise or 0.0) < 0.0 or starts < 1:
         raise SurrogateFitError("noise must not be negative and there must be a start")
-    return fit_samples(
-        samples,
-        named(Kind, kind, "kind"),
-        named(Transform, transform, "transform"),
-        named(Kernel, kernel, "kernel"),
-        gradient_noise,
-        seed,
-        starts,
-    )
-
-
-def fit_samples(
-    samples: Samples,
-    kind: Kind,
-    transform: Transform = Transform.IDENTITY,
-    kernel: Kernel = Kernel.MATERN52,
-    gradient_noise: float | None = None,
-    seed: int = 0,
-    starts: int = 5,
-) -> Surrogate:
-    """As `fit`, of samples that are checked already."""
-    if transform is Transform.LOG:
-        inside = logarithms(samples)
-        # The slope noise of ln y differs from sample to sample; its typical size is kept.
-        slope = None if gradient_noise is None else gradient_noise / float(np.median(samples.Y))
-        plain = Transform.IDENTITY
-        return exponential(fit_samples(inside, kind, plain, kernel, slope, seed, starts), samples)
-    match kind:
+    match _named(Kind, kind, "kind"):
         case Kind.GAUSSIAN_PROCESS:
-            return fit_process(samples, kernel, gradient_noise, seed, starts)
-        case Kind.SPARSE_PROCESS:
-            return fit_sparse(samples, kernel, seed=seed, starts=starts)
+            family = _named(Kernel, kernel, "kernel")
+            return fit_process(samples, family, gradient_noise, seed, starts)
         case Kind.POLYNOMIAL:
             return fit_polynomial(samples)
         case Kind.RADIAL_BASIS:
             return fit_radial_basis(samples)
-        case Kind.NETWORK:
-            return fit_network(samples, seed=seed)
-        case Kind.AUTO:
-            from surrogates.selection import choose  # which itself fits the candidates
-
-            best = choose(samples, seed=seed).best
-            return fit_samples(
-                samples, best.kind, transform, best.kernel, gradient_noise, seed, starts
-            )
 
 
-def named(family: type[E], name: E | str, what: str) -> E:
+def fit_outputs(
+    X: ArrayLike,
+    Y: ArrayLike,
+    dY: ArrayLike | None = None,
+    *,
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
+    kernel: Kernel | str = Kernel.MATERN52,
+    noise: Sequence[Noise] | float | None = None,
+    seed: int = 0,
+    starts: int = 5,
+) -> tuple[GaussianProcess, ...]:
+    """Fit one process to each column of Y (n, k), with dY (n, k, d) if it is given.
+
+    The outputs are taken as independent. Noises are one for all or a sequence of one to each
+    output (which may be (n,) in turn); everything else is as in `fit`, and so are the errors.
+    """
+    values = np.asarray(Y, dtype=float)
+    slopes = None if dY is None else np.asarray(dY, dtype=float)
+    if values.ndim != 2:
+        raise SurrogateFitError(f"expected Y (n, k), got {values.shape}")
+    k = values.shape[1]
+    if slopes is not None and (slopes.ndim != 3 or slopes.shape[1] != k):
+        raise SurrogateFitError(f"expected dY (n, {k}, d), got {slopes.shape}")
+    noises = noise if isinstance(noise, Sequence) else [noise] * k
+    if len(noises) != k:
+        raise SurrogateFitError(f"expected {k} noises, got {len(noises)}")
+    return tuple(
+        fit(
+            X,
+            values[:, i],
+            None if slopes is None else slopes[:, i],
+            lower=lower,
+            upper=upper,
+            kernel=kernel,
+            noise=noises[i],
+            seed=seed,
+            starts=starts,
+        )
+        for i in range(k)
+    )
+
+
+def _named(family: type[E], name: E | str, what: str) -> E:
     """Return the member of a family of names, or raise SurrogateFitError with the names."""
     try:
         return family(name)

@@ -8,6 +8,11 @@ in the part of the kernel that is of finite rank and known in closed form,
 Matérn 5/2, e = 1: T = 1 - 5/6 s + 25/24 s², R = O(s^(5/2)), s the scaled squared distance;
 RBF, e = exp(-‖x̃‖²/2): T = Σ_{k<=q} u^k / k!, R = O(u^(q+1)), u = x̃·ỹ, x̃ = (x - middle) / lengths.
 
+Kept after a study (docs/surrogates.md): without it, of 128 IPOPT solves on smooth functions 54
+(Matérn) and 102 (RBF) end at the "acceptable" level and up to 9 more find no feasible point; length
+scales up to 10 boxes mend Matérn alone; a jitter of 1e-10 mends both, but moves J of the case
+studies by up to 4e-9, and the error at the optimum from 8e-9 to 3e-5.
+
 So Σ_i α_i T(x, X_i) is one polynomial, whose coefficients are summed once in extended precision,
 and what is left to sum at every look is small. The same arithmetic serves arrays and symbols.
 
@@ -22,10 +27,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from surrogates.designs import sobol
+from surrogates.covariance import ROOT5, Hyperparameters, Kernel
 from surrogates.interface import Array
-from surrogates.kernels import ROOT5, Hyperparameters, Kernel
 from surrogates.polynomial import products, total_degree
+from surrogates.sampling_plan import sobol
 
 # Cancellation that is left as it is, and what the degree of T is chosen for.
 HARMLESS, AIM = 1e-10, 1e-12

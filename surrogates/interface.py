@@ -1,23 +1,34 @@
 """What every surrogate of this package offers, and nothing more.
 
-A new member is a frozen dataclass with the attributes below, one
+A new kind is a frozen dataclass with the attributes below, one
 `casadi_export.expression` registration, one entry in `serialise.KINDS` and one in
 `fitting`; no other module has to know about it.
 """
 
-from typing import TYPE_CHECKING, Literal, Protocol, overload
+from dataclasses import dataclass
+from typing import Literal, Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-if TYPE_CHECKING:
-    from surrogates.validation import Errors
 
 Array = NDArray[np.float64]
 
 
 class SurrogateFitError(ValueError):
     """The samples given cannot be fitted: wrong shapes, non-finite, singular."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Prediction errors on samples left out: rms and max in output units, Q² ≤ 1.
+
+    Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. For
+    samples that do not vary it is 1 if they are predicted exactly and 0 otherwise.
+    """
+
+    rms: float
+    max: float
+    q2: float
 
 
 class Surrogate(Protocol):
@@ -40,7 +51,7 @@ class Surrogate(Protocol):
         """Residuals (n,) of the samples, each predicted without it, in output units."""
 
     @property
-    def loo(self) -> "Errors":
+    def loo(self) -> Errors:
         """The errors that `left_out` amounts to."""
 
     @overload

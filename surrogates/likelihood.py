@@ -8,8 +8,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 
-from surrogates.interface import Array, SurrogateFitError
-from surrogates.kernels import (
+from surrogates.covariance import (
     NO_NOISE,
     Hyperparameters,
     Kernel,
@@ -18,6 +17,7 @@ from surrogates.kernels import (
     radial,
     separations,
 )
+from surrogates.interface import Array, SurrogateFitError
 
 # Scaled units. Samples of a unit box do not tell shorter length scales apart, nor longer
 # ones from that of an input without influence (a bound of 100 costs a tenth in error on

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from surrogates.bands import calibrated, centred
+from surrogates.calibration import calibrated, centred
+from surrogates.covariance import Hyperparameters, Kernel
 from surrogates.gaussian_process import GaussianProcess, conditioned
 from surrogates.interface import Array, SurrogateFitError
-from surrogates.kernels import Hyperparameters, Kernel
 from surrogates.likelihood import (
     LENGTH_BOUNDS,
     NOISE_BOUNDS,
@@ -57,7 +57,7 @@ def fit_process(
     if samples.observations > EXACT_LIMIT:
         raise SurrogateFitError(
             f"{samples.observations} observations are more than the {EXACT_LIMIT} an exact "
-            "Gaussian process holds: use kind='sparse_process' or 'auto', or fewer samples"
+            "Gaussian process holds: use kind='polynomial', or fewer samples"
         )
     parameters = estimate(samples, kernel, gradient_noise, seed, starts)
     process = conditioned(parameters, samples, kernel, uneven_noise(samples))

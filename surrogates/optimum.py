@@ -5,35 +5,17 @@
 with s the surrogates' means, x̂ in the unit box and x_f the points where the truth had no value.
 """
 
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import FrameType
-from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from surrogates.acquisition import AVOID
 from surrogates.casadi_export import to_casadi
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Array
+from surrogates.ipopt import end_points
 from surrogates.truth import Truth
-
-OPTIONS: dict[str, Any] = {
-    "print_time": False,
-    "ipopt.print_level": 0,
-    "ipopt.sb": "yes",
-    "ipopt.tol": 1e-9,
-    "ipopt.constr_viol_tol": 1e-9,
-    "ipopt.acceptable_tol": 1e-7,
-    "ipopt.max_iter": 300,
-    "ipopt.bound_relax_factor": 0.0,
-    "ipopt.honor_original_bounds": "yes",
-    "show_eval_warnings": False,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,39 +37,9 @@ def predicted_optimum(
     y = to_casadi(list(surrogates), std=False)(x)
     free = [AVOID**2 - ca.sumsqr(z - point) for point in (failed - lower) / width]
     g = ca.vertcat(truth.constraints(x, y), *free)
-    problem = {"x": z, "f": truth.objective(x, y), "g": g}
-    solver = ca.nlpsol("predicted", "ipopt", problem, OPTIONS)
-    best: Optimum | None = None
-    converged = 0
-    for start in starts:
-        with _interrupts_kept():
-            unit = np.clip((start - lower) / width, 0.0, 1.0)
-            found = solver(x0=unit, lbx=0.0, ubx=1.0, lbg=-np.inf, ubg=0.0)
-        if not solver.stats()["success"]:
-            continue
-        converged += 1
-        objective = float(found["f"])
-        if best is None or objective < best.objective:
-            unit = np.clip(np.array(found["x"]).ravel(), 0.0, 1.0)
-            best = Optimum(lower + width * unit, objective, converged)
-    return None if best is None else Optimum(best.x, best.objective, converged)
-
-
-@contextmanager
-def _interrupts_kept() -> Iterator[None]:
-    """Hold Ctrl-C, which CasADi's solvers swallow, and raise KeyboardInterrupt at the end."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    pressed: list[int] = []
-
-    def keep(number: int, frame: FrameType | None) -> None:
-        pressed.append(number)
-
-    before = signal.signal(signal.SIGINT, keep)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if pressed:
-        raise KeyboardInterrupt
+    program = {"x": z, "f": truth.objective(x, y), "g": g}
+    ends = [end for end in end_points(program, (starts - lower) / width) if end.converged]
+    if not ends:
+        return None
+    best = min(ends, key=lambda end: end.objective)
+    return Optimum(lower + width * best.z, best.objective, len(ends))

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import qr, solve_triangular
 
-from surrogates.interface import Array, SurrogateFitError, box, freeze, points_in
+from surrogates.interface import Array, Errors, SurrogateFitError, box, freeze, points_in
 from surrogates.samples import Samples
-from surrogates.validation import Errors, errors
+from surrogates.validation import errors
 
 MAX_DEGREE = 12
 MAX_TERMS = 500

@@ -11,8 +11,8 @@ section 3.3.2; Jones, Schonlau & Welch, J. Global Optim. 13 (1998), eq. 4 to 6.
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
 
+from surrogates.covariance import Hyperparameters, Kernel, radial, separations
 from surrogates.interface import Array
-from surrogates.kernels import Hyperparameters, Kernel, radial, separations
 from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS, symmetric_inverse
 
 # On the diagonal of C, so that no trial point is lost to rounding.

@@ -17,11 +17,19 @@ from typing import Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from surrogates.interface import Array, SurrogateFitError, box, freeze, no_deviation, points_in
-from surrogates.kernels import separations
+from surrogates.covariance import separations
+from surrogates.interface import (
+    Array,
+    Errors,
+    SurrogateFitError,
+    box,
+    freeze,
+    no_deviation,
+    points_in,
+)
 from surrogates.polynomial import total_degree
 from surrogates.samples import Samples
-from surrogates.validation import Errors, errors
+from surrogates.validation import errors
 
 # Samples that enter the choice of kernel and smoothing, which cost O(n³) each, and
 # samples that a dense system holds.
@@ -146,7 +154,7 @@ def fit_radial_basis(
     if n > DENSE_LIMIT:
         raise SurrogateFitError(
             f"{n} samples are more than the {DENSE_LIMIT} radial basis functions hold: "
-            "use kind='sparse_process' or 'auto', or fewer samples"
+            "use kind='polynomial', or fewer samples"
         )
     choices = _choices(samples, basis, epsilon, smoothing)
     if len(choices) > 1:

@@ -14,11 +14,11 @@ from time import perf_counter, sleep
 import numpy as np
 
 from surrogates.acquisition import NEAR, choose, distances, objective_and_violation
-from surrogates.claims import Claims
-from surrogates.designs import sobol
 from surrogates.interface import Array
+from surrogates.iteration import Iteration, converged, iterate
 from surrogates.journal import Journal
-from surrogates.judgement import Judgement, done, judge
+from surrogates.pending_points import PendingPoints
+from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth, TruthError
 from surrogates.versions import Versions
 
@@ -58,7 +58,7 @@ class Outcome:
 class Plan:
     """A batch (q, d) to evaluate, none to wait for other jobs; or the reason to end."""
 
-    judgement: Judgement | None
+    iteration: Iteration | None
     batch: Array
     reason: str
 
@@ -69,18 +69,18 @@ def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) 
     Raises TruthError, TruthInterrupted and KeyboardInterrupt; all may be resumed.
     """
     journal, versions = Journal(folder / JOURNAL), Versions(folder)
-    claims = Claims(folder, len(truth.lower))
+    pending = PendingPoints(folder, len(truth.lower))
     begun = [entry["spent"] for entry in journal.entries() if entry.get("event") == "start"]
     base = begun[0] if begun else truth.spent
     journal.append(event="start", spent=truth.spent, pid=os.getpid(), **vars(settings))
     rounds = passes = 0
     while True:
-        began, claim = perf_counter(), None
-        with claims.deciding():
-            plan = decide(truth, claims.others(), versions, settings, base)
+        began, reservation = perf_counter(), None
+        with pending.deciding():
+            plan = decide(truth, pending.others(), versions, settings, base)
             if plan.reason:
                 before = truth.spent
-                status, version = _finish(truth, plan.judgement, versions)
+                status, version = _finish(truth, plan.iteration, versions)
                 passes += 1
                 if truth.spent > before and passes < PASSES and plan.reason == CONVERGED:
                     continue  # the verification found samples: fit those too
@@ -88,14 +88,14 @@ def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) 
                 journal.append(event="end", **vars(outcome))
                 return outcome
             if len(plan.batch):
-                claim = claims.claim(plan.batch)
-        if claim is None:
+                reservation = pending.reserve(plan.batch)
+        if reservation is None:
             sleep(WAIT)  # the points that count are in flight elsewhere
             continue
-        with claim:
+        with reservation:
             found = truth.evaluate(plan.batch)
         rounds += 1
-        _log(journal, rounds, truth, plan.judgement, found, perf_counter() - began, quiet)
+        _log(journal, rounds, truth, plan.iteration, found, perf_counter() - began, quiet)
 
 
 def decide(truth: Truth, pending: Array, versions: Versions, settings: Settings, base: int) -> Plan:
@@ -122,23 +122,23 @@ def decide(truth: Truth, pending: Array, versions: Versions, settings: Settings,
     none = np.empty((0, len(truth.lower)))
     if len(observed.X) < len(truth.lower) + 2:
         return Plan(None, none, "too few points where the truth has a value")
-    judgement = judge(truth, observed, failed, versions, settings.seed)
-    if done(judgement):
-        return Plan(judgement, none, CONVERGED)
+    iteration = iterate(truth, observed, failed, versions, settings.seed)
+    if converged(iteration):
+        return Plan(iteration, none, CONVERGED)
     if exhausted:
-        return Plan(judgement, none, "budget")
-    batch = next_batch(judgement, pending, room, settings) if room else none
+        return Plan(iteration, none, "budget")
+    batch = next_batch(iteration, pending, room, settings) if room else none
     stuck = not len(batch) and not len(pending)
-    return Plan(judgement, batch, "nothing is left to ask" if stuck else "")
+    return Plan(iteration, batch, "nothing is left to ask" if stuck else "")
 
 
 def _finish(
-    truth: Truth, judgement: Judgement | None, versions: Versions
+    truth: Truth, iteration: Iteration | None, versions: Versions
 ) -> tuple[str, str | None]:
-    if judgement is None:
+    if iteration is None:
         return truth.finish(None, (), None), None
-    name = judgement.version.version
-    status = truth.finish(judgement.x, judgement.belief.surrogates, name)
+    name = iteration.version.version
+    status = truth.finish(iteration.x, iteration.posterior.surrogates, name)
     versions.publish()
     return status, name
 
@@ -172,22 +172,22 @@ def first_design(truth: Truth, seen: Observations, observed: Observations, seed:
     return np.empty((0, d))
 
 
-def next_batch(judgement: Judgement, pending: Array, room: int, settings: Settings) -> Array:
+def next_batch(iteration: Iteration, pending: Array, room: int, settings: Settings) -> Array:
     """The predicted optimum, what promises most, and the share to explore."""
-    belief = judgement.belief
+    posterior = iteration.posterior
     for x in pending:
-        belief = belief.believing(x)
-    first = None if judgement.optimum is None else judgement.optimum.x
+        posterior = posterior.with_prediction_at(x)
+    first = None if iteration.optimum is None else iteration.optimum.x
     explore = min(round(settings.explore * room), room)
-    seed = settings.seed + len(belief.observed.X)
-    return choose(belief, first, room, explore, judgement.near, seed)
+    seed = settings.seed + len(posterior.observed.X)
+    return choose(posterior, first, room, explore, iteration.near, seed)
 
 
 def _log(
     journal: Journal,
     number: int,
     truth: Truth,
-    judgement: Judgement | None,
+    iteration: Iteration | None,
     found: Observations,
     seconds: float,
     quiet: bool,
@@ -195,22 +195,22 @@ def _log(
     J = objective_and_violation(truth, found.X, found.Y)[0]
     entry = {"event": "round", "round": number, "spent": truth.spent, "batch": found.X, "true": J}
     words = f"round {number}: first design, {len(found.X)} points"
-    if judgement is not None:
-        version, optimum = judgement.version, judgement.optimum
+    if iteration is not None:
+        version, optimum = iteration.version, iteration.optimum
         entry |= {
             "samples": version.samples,
             "version": version.version,
             "errors": version.errors,
             "predicted": None if optimum is None else optimum.objective,
-            "error": judgement.error,
-            "step": judgement.step,
-            "improvement": judgement.gain,
+            "error": iteration.error,
+            "step": iteration.step,
+            "improvement": iteration.gain,
         }
         predicted = "none" if optimum is None else f"{optimum.objective:.6g}"
         words = (
             f"round {number}: {version.samples} samples, predicted J {predicted}, "
-            f"best true {judgement.true:.6g}, error {judgement.error:.1e}, "
-            f"improvement {judgement.gain:.1e}"
+            f"best true {iteration.true:.6g}, error {iteration.error:.1e}, "
+            f"improvement {iteration.gain:.1e}"
         )
     journal.append(**entry, seconds=seconds)
     if not quiet:

@@ -18,25 +18,18 @@ from typing import Any
 
 import numpy as np
 
+from surrogates.files import write_whole
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate
-from surrogates.maximum import Maximum
-from surrogates.network import Network
 from surrogates.polynomial import Polynomial
 from surrogates.radial_basis import RadialBasis
-from surrogates.sparse_process import SparseProcess
-from surrogates.transform import Exponential
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")
 KINDS: dict[str, type[Any]] = {
     "gaussian_process": GaussianProcess,
-    "sparse_process": SparseProcess,
     "polynomial": Polynomial,
     "radial_basis": RadialBasis,
-    "network": Network,
-    "exponential": Exponential,
-    "maximum": Maximum,
 }
 
 
@@ -67,17 +60,7 @@ def save(
         },
         allow_nan=False,
     )
-    target = Path(path)
-    # In the same folder, since a rename is atomic only within one file system.
-    draft = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        with draft.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(draft, target)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_whole(Path(path), text)
 
 
 def load(path: str | os.PathLike[str]) -> tuple[tuple[Surrogate, ...], dict[str, Any]]:
@@ -117,14 +100,10 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def _encode(value: Any) -> Any:
-    if type(value) in KINDS.values():
-        return _record(value)
     if is_dataclass(value):
         return _fields(value)
     if isinstance(value, np.ndarray):
         return value.tolist()
-    if isinstance(value, tuple):
-        return [_encode(item) for item in value]
     return value.value if isinstance(value, Enum) else value
 
 
@@ -134,8 +113,6 @@ def _member(record: Any) -> Any:
 
 
 def _decode(cls: Any, value: Any) -> Any:
-    if cls is Surrogate:
-        return _member(value)
     if is_dataclass(cls):
         hints = typing.get_type_hints(cls)
         names = {f.name for f in fields(cls)}
@@ -147,8 +124,6 @@ def _decode(cls: Any, value: Any) -> Any:
         if not names - optional <= set(value) <= names:
             raise ValueError(f"fields differ by {sorted(names ^ set(value))}")
         return typing.cast(Any, cls)(**{k: _decode(hints[k], value[k]) for k in sorted(value)})
-    if typing.get_origin(cls) is tuple:
-        return tuple(_decode(typing.get_args(cls)[0], item) for item in value)
     if typing.get_origin(cls) is np.ndarray:
         array = np.array(value, dtype=float)
         if not np.isfinite(array).all():  # null and 1e999 come in as nan and inf

@@ -1,5 +1,7 @@
 """The truth that a surrogate stands in for: what `retrain` asks of it, and how it is found.
 
+"Truth model" is the term of surrogate-based optimisation (Dakota, for one) for the expensive one.
+
 A run folder names its truth in `truth.json`, {"truth": NAME, ...}, where NAME is an entry point
 of the group "surrogates.truth" of an installed package. A folder may come from anybody, so it
 never names a file or an import path.

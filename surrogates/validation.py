@@ -1,26 +1,12 @@
 """How wrong a surrogate is on samples it has not seen."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from surrogates.interface import Array, Surrogate
+from surrogates.interface import Array, Errors, Surrogate
 from surrogates.samples import Samples
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Prediction errors on samples left out: rms and max in output units, Q² ≤ 1.
-
-    Q² = 1 - Σ (y - ŷ)² / Σ (y - ȳ)²: 1 is exact, 0 no better than the mean. For
-    samples that do not vary it is 1 if they are predicted exactly and 0 otherwise.
-    """
-
-    rms: float
-    max: float
-    q2: float
 
 
 def errors(residuals: ArrayLike, Y: ArrayLike) -> Errors:
@@ -49,52 +35,16 @@ def folds_of(n: int, folds: int, seed: int) -> Iterator[tuple[NDArray[np.intp], 
         yield held, np.setdiff1d(np.arange(n), held)
 
 
-def cross_validate(
-    fitter: Callable[..., Surrogate],
-    X: ArrayLike,
-    Y: ArrayLike,
-    folds: int = 10,
-    seed: int = 0,
-    dY: ArrayLike | None = None,
-) -> Errors:
-    """Return the errors of k-fold cross-validation, refitting on every fold's rest.
-
-    `fitter(X, Y)`, or `fitter(X, Y, dY=dY)` if gradients are given, returns the
-    surrogate of the samples X (n, d), Y (n,), dY (n, d); use `functools.partial` to
-    bind bounds and options. Hyperparameters are fitted anew, which the closed-form
-    leave-one-out does not do: this is the slower and the more honest figure.
-
-    Raises:
-        ValueError: folds outside 2 ... n.
-    """
-    points, values = np.asarray(X, dtype=float), np.asarray(Y, dtype=float)
-    slopes = None if dY is None else np.asarray(dY, dtype=float)
-    residuals: Array = np.empty(len(points))
-    for held, rest in folds_of(len(points), folds, seed):
-        more = {} if slopes is None else {"dY": slopes[rest]}
-        fitted = fitter(points[rest], values[rest], **more)
-        residuals[held] = values[held] - fitted.predict(points[held])
-    return errors(residuals, values)
-
-
 def held_out(
     fitter: Callable[[Samples], Surrogate], samples: Samples, folds: int, seed: int
-) -> tuple[Array, Array | None]:
-    """Return residuals (n,) of k-fold cross-validation and, if it has them, deviations (n,).
-
-    The noise of a sample, where it is known, is part of its deviation.
+) -> Array:
+    """Return the residuals (n,) of k-fold cross-validation, refitting on every fold's rest.
 
     Raises:
         ValueError: folds outside 2 ... n.
     """
-    residuals, deviations = np.empty(samples.Y.size), np.full(samples.Y.size, np.nan)
+    residuals = np.empty(samples.Y.size)
     for held, rest in folds_of(samples.Y.size, folds, seed):
-        fitted, X = fitter(samples.rows(rest)), samples.X[held]
-        if fitted.has_std:
-            mean, std = fitted.predict(X, return_std=True)
-            noise = 0.0 if samples.noise is None else samples.noise[held]
-            deviations[held] = np.hypot(std, noise)
-        else:
-            mean = fitted.predict(X)
-        residuals[held] = samples.Y[held] - mean
-    return residuals, None if np.isnan(deviations).any() else deviations
+        fitted = fitter(samples.rows(rest))
+        residuals[held] = samples.Y[held] - fitted.predict(samples.X[held])
+    return residuals

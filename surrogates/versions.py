@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from surrogates.files import write_whole
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.serialise import SurrogateFileError, load, save
 
@@ -100,15 +101,9 @@ class Versions:
         names = self.names()
         records = [asdict(self.load(name)[1]) for name in names]
         text = json.dumps({"versions": records}, indent=2, allow_nan=False) + "\n"
-        _replace(self.folder / INDEX, text.encode())
+        write_whole(self.folder / INDEX, text)
         if names:
             newest = (self.folder / f"{names[-1]}.json").read_bytes()
             target = self.run / NEWEST
             if not target.exists() or target.read_bytes() != newest:
-                _replace(target, newest)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    draft.write_bytes(content)
-    os.replace(draft, path)
+                write_whole(target, newest)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # A shell's background job, or a CI runner, may have Ctrl-C ignored, and children inherit that.
 # The tests of interrupts are about how commands behave where it is not.
@@ -16,6 +17,20 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+# What every property test has in common; a test only says how many examples it wants. "same" draws
+# the same examples each time; "study" (HYPOTHESIS_PROFILE=study) draws anew, for
+# `make test-processors`. No wall clock anywhere: the machine may be busy.
+for profile, repeat in (("same", True), ("study", False)):
+    settings.register_profile(
+        profile,
+        derandomize=repeat,
+        deadline=None,
+        database=None,
+        print_blob=not repeat,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
 @pytest.fixture(scope="session")

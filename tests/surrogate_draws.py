@@ -14,7 +14,7 @@ from surrogates import (
 
 KERNELS = pytest.mark.parametrize("kernel", list(Kernel))
 BOX = {"lower": [-2.0, -2.0], "upper": [2.0, 2.0]}
-few = partial(settings, max_examples=10, derandomize=True, deadline=None)
+few = partial(settings, max_examples=10)
 seeds = st.integers(0, 10**6)
 
 

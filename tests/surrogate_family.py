@@ -11,11 +11,8 @@ from surrogates import (
     condition,
     design,
     fit,
-    fit_network,
     fit_radial_basis,
-    fit_sparse,
 )
-from surrogates.transform import exponential, logarithms
 
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
 SPAN = HIGH - LOW
@@ -41,13 +38,6 @@ def process(kernel: str, gradients: bool) -> Surrogate:
     return condition(p, X, Y, **BOX, kernel=kernel, dY=DY if gradients else None)
 
 
-def logarithmic() -> Surrogate:
-    samples = checked(X, Y, **BOX, dY=DY)
-    logs = logarithms(samples)
-    p = Hyperparameters(np.array([0.7, 0.5, 0.6]), 2.0, 1e-5, 1e-4)
-    return exponential(condition(p, X, logs.Y, **BOX, dY=logs.dY), samples)
-
-
 MAKERS = {
     "matern52": lambda: process("matern52", False),
     "rbf": lambda: process("rbf", False),
@@ -59,10 +49,6 @@ MAKERS = {
     "quintic": lambda: fit_radial_basis(checked(X, Y, **BOX), "quintic", smoothing=1e-6),
     "multiquadric": lambda: fit_radial_basis(checked(X, Y, **BOX), "multiquadric", 2.0),
     "gaussian": lambda: fit_radial_basis(checked(X, Y, **BOX), "gaussian", 2.0),
-    "network": lambda: fit_network(checked(X, Y, **BOX), (8, 6), seed=3),
-    "sparse": lambda: fit_sparse(checked(X, Y, **BOX, noise=0.01), inducing=30, starts=1),
-    "log(process)": lambda: logarithmic(),
-    "log(radial)": lambda: fit(X, Y, **BOX, kind="radial_basis", transform="log"),
 }
 MADE: dict[str, Surrogate] = {}
 MEMBERS = pytest.mark.parametrize("name", list(MAKERS))

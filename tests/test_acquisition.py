@@ -11,13 +11,13 @@ from surrogates import fit, sobol
 from surrogates.acquisition import (
     AVOID,
     NEAR,
-    Belief,
+    Posterior,
     choose,
     distances,
     expected_improvement,
     maximiser,
     objective_and_violation,
-    spread,
+    scaled_deviation,
 )
 from surrogates.interface import Array
 from surrogates.optimum import predicted_optimum
@@ -45,7 +45,7 @@ class Valley:
         return Observations(X, Y, np.stack([da, db], axis=2) / (UPPER - LOWER))
 
 
-def belief(n: int = 10, gradients: bool = False, seed: int = 0) -> Belief:
+def posterior(n: int = 10, gradients: bool = False, seed: int = 0) -> Posterior:
     truth: Any = Valley()
     seen = truth.ask(sobol(LOWER, UPPER, n, seed))
     if not gradients:
@@ -61,11 +61,11 @@ def belief(n: int = 10, gradients: bool = False, seed: int = 0) -> Belief:
         )
         for i in range(2)
     )
-    return Belief(truth, surrogates, seen, np.empty((0, 2)))
+    return Posterior(truth, surrogates, seen, np.empty((0, 2)))
 
 
 def test_expected_improvement_is_that_of_simulated_outcomes() -> None:
-    found = belief(5)
+    found = posterior(5)
     X = sobol(LOWER, UPPER, 16, seed=5)
     best = 1.5
     rng = np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_expected_improvement_is_that_of_simulated_outcomes() -> None:
 
 
 def test_constraints_without_deviation_are_met_or_not() -> None:
-    found = belief()
+    found = posterior()
     truth: Any = Valley()
     x, y = truth.x, truth.y
     truth.constraints = ca.Function("g", [x, y], [x[0] - 1.0])
@@ -96,7 +96,7 @@ def test_constraints_without_deviation_are_met_or_not() -> None:
 
 
 def test_the_incumbent_is_the_best_that_is_allowed() -> None:
-    found = belief(32)
+    found = posterior(32)
     J, violation = found.values()
     at = found.incumbent()
     assert at is not None
@@ -107,9 +107,9 @@ def test_the_incumbent_is_the_best_that_is_allowed() -> None:
 
 @pytest.mark.parametrize("gradients", [False, True])
 def test_what_is_believed_is_known_and_moves_little(gradients: bool) -> None:
-    found = belief(gradients=gradients)
+    found = posterior(gradients=gradients)
     x = np.array([0.3, 11.3])
-    after = found.believing(x)
+    after = found.with_prediction_at(x)
     X = sobol(LOWER, UPPER, 32, seed=3)
     for old, new in zip(found.surrogates, after.surrogates, strict=True):
         mean, std = old.predict(X, return_std=True)
@@ -117,13 +117,13 @@ def test_what_is_believed_is_known_and_moves_little(gradients: bool) -> None:
         # not nothing: the processes scale outputs by the samples, of which there is one more
         least = 1e-5 * np.ptp(found.observed.Y)
         assert change <= 0.3 * std.max() + least, "a process that is told its own mean"
-    assert spread(after, x[None])[0] < 1e-2 * spread(found, x[None])[0] + 1e-6
+    assert scaled_deviation(after, x[None])[0] < 1e-2 * scaled_deviation(found, x[None])[0] + 1e-6
     assert distances(found.truth, x[None], after.observed.X)[0] == 0.0
 
 
 @pytest.mark.parametrize("gradients", [False, True])
 def test_a_batch_is_of_new_points_apart_from_each_other(gradients: bool) -> None:
-    found = belief(gradients=gradients)
+    found = posterior(gradients=gradients)
     first = np.array([1.0, 10.5])
     batch = choose(found, first, 4, 1, (first,), seed=2)
     assert batch.shape == (4, 2)
@@ -136,7 +136,7 @@ def test_a_batch_is_of_new_points_apart_from_each_other(gradients: bool) -> None
 
 
 def test_what_is_known_or_failed_is_left_out() -> None:
-    found = belief()
+    found = posterior()
     known = found.observed.X[3] + 0.5 * NEAR
     batch = choose(found, known, 2, 0, (known,), seed=0)
     assert (distances(found.truth, batch, known[None]) > NEAR).all()
@@ -146,22 +146,22 @@ def test_what_is_known_or_failed_is_left_out() -> None:
     again, less = maximiser(failed, False, (), 0)
     assert distances(found.truth, again[None], x[None])[0] >= AVOID
     assert 0.0 < less < merit
-    np.testing.assert_array_equal(found.hope(found.observed.X), 1.0)
-    hopes = failed.hope(np.vstack([found.observed.X, x]))
+    np.testing.assert_array_equal(found.chance_of_value(found.observed.X), 1.0)
+    hopes = failed.chance_of_value(np.vstack([found.observed.X, x]))
     np.testing.assert_array_equal(hopes, [1.0] * len(found.observed.X) + [0.0])
 
 
 def test_exploring_asks_where_least_is_known() -> None:
-    found = belief(8)
+    found = posterior(8)
     x, merit = maximiser(found, True, (), 0)
-    everywhere = spread(found, sobol(LOWER, UPPER, 1024, seed=9))
+    everywhere = scaled_deviation(found, sobol(LOWER, UPPER, 1024, seed=9))
     assert merit >= everywhere.max() * 0.98
     (alone,) = choose(found, None, 1, 1, (), seed=0)
     np.testing.assert_array_equal(alone, x)
 
 
 def test_the_predicted_optimum_is_that_of_the_surrogates() -> None:
-    found = belief(30, gradients=True)
+    found = posterior(30, gradients=True)
     truth = found.truth
     optimum = predicted_optimum(
         truth, found.surrogates, sobol(LOWER, UPPER, 8, 0), np.empty((0, 2))
@@ -180,7 +180,7 @@ def test_the_predicted_optimum_is_that_of_the_surrogates() -> None:
 
 
 def test_no_optimum_where_nothing_is_allowed() -> None:
-    found = belief()
+    found = posterior()
     truth: Any = Valley()
     truth.constraints = ca.Function("g", [truth.x, truth.y], [1.0 + 0.0 * truth.y[0]])
     starts = sobol(LOWER, UPPER, 2, 0)

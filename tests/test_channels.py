@@ -54,7 +54,7 @@ def blocks(seed: int, sizes: tuple[int, ...]) -> ModalPlant:
     )  # fmt: skip
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), sizes=st.sampled_from([(1, 1), (2, 1), (1, 1, 1, 1), (2, 2)]))
 def test_hidden_blocks_are_found(seed: int, sizes: tuple[int, ...]) -> None:
     plant = blocks(seed, sizes)

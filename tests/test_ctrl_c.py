@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogates.ctrl_c import ctrl_c_noticed, was_ctrl_c
+from surrogates.interrupts import ctrl_c_noticed, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.
@@ -20,11 +20,13 @@ raise ImportError("Ctrl-C was not dealt with at once")
 """
 
 
-@pytest.mark.parametrize("module", ["ccd_casadi.solve", "ccd_casadi.inner", "surrogates.retrain"])
-def test_ctrl_c_during_imports_is_one_line(tmp_path: Path, module: str) -> None:
+@pytest.mark.parametrize(
+    "command", ["ccd_casadi.solve x", "ccd_casadi.inner x --theta m=1", "surrogates.retrain x"]
+)
+def test_ctrl_c_during_imports_is_one_line(tmp_path: Path, command: str) -> None:
     (tmp_path / "casadi.py").write_text(SLOW_IMPORT)
     done = subprocess.run(
-        [sys.executable, "-m", module, "x"],
+        [sys.executable, "-m", *command.split()],
         cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False, timeout=60,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),

@@ -11,8 +11,10 @@ from helpers import (
 )
 from kernel_draws import WEIGHTS
 
-from ccd_casadi.kernels import design, riccati
+from ccd_casadi.kernels import design, gamma, riccati
 from ccd_casadi.kernels.generalized_plant import generalized_plant
+from ccd_casadi.kernels.synthesis import ENOUGH
+from ccd_casadi.kernels.synthesis import synthesise as kernel
 from ccd_casadi.synthesis.synthesis import synthesise
 
 
@@ -140,3 +142,52 @@ def test_the_error_of_the_step_to_the_root_is_within_its_estimate(seed: int) -> 
         f, slope, _, frame = riccati.riccati_level(H0, gp[1], gp[3], gp[5], t, riccati.NOISE)
         step, estimate = riccati.root_nearby(gp[1], gp[3], gp[5], frame, f / (slope * t * t))
         assert abs(t / (1.0 + step * t) - top) < top * estimate * top
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 15, 27])
+def test_rounding_moves_gamma_as_far_as_is_told(seed: int) -> None:
+    """The spread of the root over random changes of H, against what `rounding_error` foretells."""
+    case = flexible_case(seed)
+    plant, w = case.plant, case.weights.scaled(case.plant.omega_0)
+    _, B1, B2, C1, _, d1, d2 = gp = generalized_plant(plant.A, plant.B, plant.C, w)
+    H0 = riccati.lqr_hamiltonian(gp[0], B2, C1, d2, 3, 3)
+    level = synthesise(plant, case.weights, omega_low=OMEGA_LOW).figures.gamma_opt
+    t = level**2 - d1**2
+
+    def root(H: np.ndarray) -> tuple[float, float]:
+        f, slope, ok, frame = riccati.riccati_level(H, B1, C1, d1, t, riccati.NOISE)
+        assert ok
+        step = riccati.root_nearby(B1, C1, d1, frame, f / (slope * t * t))[0]
+        return np.sqrt(t / (1.0 + step * t) + d1**2), gamma.rounding_error(frame, t, d1)
+
+    told, rng = root(H0)[1], np.random.default_rng(seed)
+    size = 1e-7 * gamma.BACKWARD / told  # γ_opt is to move by 1e-7 of itself
+    moved = []
+    for _ in range(60):
+        change = rng.standard_normal(H0.shape)
+        change *= size * np.linalg.norm(H0) / np.linalg.norm(change)
+        moved.append(root(H0 + change)[0] / level - 1.0)
+    assert np.std(moved) == pytest.approx(told * size / gamma.BACKWARD, rel=0.4)
+
+
+@pytest.mark.parametrize("seed", [81, 45])
+def test_gamma_that_rounding_would_spoil_is_found_in_balanced_coordinates(seed: int) -> None:
+    """Where its own coordinates leave too much, what is handed out is better, and says so."""
+    plant = flexible_case(seed).plant
+    w = PAPER.at(0.1 * plant.omega_0, 10.0**-0.5 * plant.omega_0).scaled(plant.omega_0)
+    gp = generalized_plant(plant.A, plant.B, plant.C, w)
+    H0 = riccati.lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], 3, 3)
+    data = (plant.A, plant.B, plant.C, w, plant.grid, plant.gain, 1.02)
+    row = kernel(*data, 0.0, False)[0]
+    bound, tolerance = row[design.Figure.GAMMA_LOWER_BOUND], 1e-11
+    own = gamma.optimal_gamma(H0, gp[1], gp[3], gp[5], bound, 0.0, tolerance, riccati.NOISE)
+    assert own[3]
+    assert own[4] > ENOUGH
+    assert row[design.Figure.GAMMA_ERROR] < 0.1 * own[4]
+    assert row[design.Figure.GAMMA_OPT] == pytest.approx(own[0], rel=own[4])
+    for guess in (0.98, 1.01, 1.03):  # other levels on the way, other rounding
+        again = kernel(*data, guess * own[0], False)[0]
+        told = row[design.Figure.GAMMA_ERROR] + again[design.Figure.GAMMA_ERROR]
+        assert again[design.Figure.GAMMA_OPT] == pytest.approx(
+            row[design.Figure.GAMMA_OPT], rel=told
+        )

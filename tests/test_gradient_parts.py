@@ -1,5 +1,7 @@
 """Pull-backs and the bound's gradient against adjoints and differences, at one frequency."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
@@ -9,19 +11,19 @@ from hypothesis import strategies as st
 from ccd_casadi.kernels import bound_peak, pullback
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, lower_bound_squared, plant_gain
-from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
+from ccd_casadi.kernels.generalized_plant import (
+    first_order_weights,
+    generalized_plant,
+    squared_weights,
+)
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.weights import Weights
 
-
-def plain(kernel):  # type: ignore[no-untyped-def]
-    """The kernel as Python: compiled for a test alone it would take ten seconds."""
-    return getattr(kernel, "py_func", kernel)
-
-
-to_plant, bound_gradient = plain(pullback.to_plant), plain(pullback.bound_gradient)
-bound_slope = plain(bound_peak._bound_slope)
+to_plant, bound_gradient = pullback.to_plant, pullback.bound_gradient
+bound_slope = bound_peak._bound_slope
+# what is compiled takes floating-point numbers only
+plain_weights = getattr(squared_weights, "py_func", squared_weights)
 seeds = st.integers(0, 10**6)
 sizes = st.integers(1, 3)
 
@@ -60,6 +62,22 @@ def test_the_pull_back_is_the_adjoint_of_building_the_plant(seed: int, m: int, p
     assert there == pytest.approx(back, abs=1e-12 * size)
 
 
+@few(max_examples=40)
+@given(seeds, st.floats(-6.0, 6.0))
+def test_the_slopes_of_the_squared_weights(seed: int, at: float) -> None:
+    """To all digits, far from the break frequencies too: against differences of exact fractions."""
+    rng, omega = np.random.default_rng(seed), 10.0**at
+    # M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T
+    w = np.array([2.0, 1e-4, 1.0, 1e4, 1.0, 0.9, 1e-2, 1.0]) * np.exp(rng.uniform(-1.0, 1.0, 8))
+    found, h = pullback.squared_weight_slopes(w, omega), Fraction(1, 10**40)
+    exact = [Fraction(value) for value in w]
+    for k in range(8):
+        moved = exact.copy()
+        moved[k] += h
+        high, low = (sum(plain_weights(of, Fraction(omega))) for of in (moved, exact))
+        assert found[k] == pytest.approx(float((high - low) / h), rel=1e-13, abs=0.0)
+
+
 @few(max_examples=25)
 @given(seeds, sizes, st.floats(-1.0, 1.0))
 def test_the_gradient_of_the_bound_at_one_frequency(seed: int, p: int, at: float) -> None:
@@ -73,7 +91,7 @@ def test_the_gradient_of_the_bound_at_one_frequency(seed: int, p: int, at: float
         moved, x = w.copy(), 0.0 if k >= 0 else h
         if k >= 0:
             moved[k] *= np.exp(h)
-        gain = plant_gain(A + x * dA, B + x * dB, C + x * dC, omega)
+        gain = plant_gain(A + x * dA, B + x * dB, C + x * dC, np.array([omega]))[0]
         return float(np.sqrt(lower_bound_squared(moved, gain, omega)))
 
     A_, B_, C_, w_ = bound_gradient(A, B, C, w, omega)
@@ -93,7 +111,8 @@ def test_the_slope_of_the_bound_over_frequency(seed: int, p: int, at: float) -> 
 
     def squared(h: float) -> float:
         x = omega * np.exp(h)
-        return float(lower_bound_squared(w, plant_gain(plant.A, plant.B, plant.C, x), x))
+        gain = plant_gain(plant.A, plant.B, plant.C, np.array([x]))[0]
+        return float(lower_bound_squared(w, gain, x))
 
     slope = bound_slope(plant.A, plant.B, plant.C, w, omega) * omega
     assert slope == pytest.approx(difference(squared, 1e-5), rel=1e-6, abs=1e-7 * squared(0.0))

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from busy import prompt
 from hard_plants import HARD
 
 from ccd_casadi.support.deadline import Runner
@@ -20,7 +21,7 @@ from ccd_casadi.synthesis.norms import gains
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")
-LIMIT = 10.0  # seconds a plant, the back ends' imports not counted
+LIMIT = prompt(10.0)  # seconds a plant, the back ends' imports not counted
 BACKOFF = 1.02
 
 

@@ -16,11 +16,14 @@ whole = module.design_with_gradients
 
 
 def lose(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
-    """A share of all designs, chosen by their weights, without derivatives."""
+    """A share of all designs, chosen by their weights, without derivatives.
+
+    Stripes in the weights, wide against rounding; the optimum is at 0.79, outside the first 0.2.
+    """
 
     def losing(A: Any, B: Any, C: Any, w: Any, *more: Any) -> Any:
         row, Ak, Bk, Ck, gradient, fixed, gaps = whole(A, B, C, w, *more)
-        if (w[2] * w[7] * A.sum() * 1e6) % 1.0 < share:
+        if (30.0 * np.log(w[2]) + 17.0 * np.log(w[7])) % 1.0 < share:
             gradient, fixed = np.full_like(gradient, np.nan), np.full_like(fixed, np.nan)
         return row, Ak, Bk, Ck, gradient, fixed, gaps
 

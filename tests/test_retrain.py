@@ -12,8 +12,8 @@ from camel import Camel, entries, true_cost
 
 from surrogates import SurrogateFileError, load, sobol
 from surrogates.acquisition import NEAR
-from surrogates.claims import Claims
 from surrogates.journal import Journal
+from surrogates.pending_points import PendingPoints
 from surrogates.retraining import Outcome, Settings, retrain, thinned
 from surrogates.truth import Observations, TruthError
 from surrogates.versions import Versions
@@ -124,7 +124,7 @@ def test_near_duplicates_are_fitted_once(tmp_path: Path) -> None:
     np.testing.assert_array_equal(turned.X, observed.X)
 
 
-# ---- versions, claims, the journal ---------------------------------------------------------------
+# ---- versions, pending points, the journal -------------------------------------------------------
 
 
 def test_every_surrogate_is_kept_with_its_error_and_parent(
@@ -180,31 +180,31 @@ CLAIM = """
 import sys, time
 import numpy as np
 from pathlib import Path
-from surrogates.claims import Claims
-claims = Claims(Path(sys.argv[1]), 2)
-with claims.deciding():
-    claim = claims.claim(np.array([[0.1, 0.2]]))
-print("claimed", flush=True)
+from surrogates.pending_points import PendingPoints
+pending = PendingPoints(Path(sys.argv[1]), 2)
+with pending.deciding():
+    reservation = pending.reserve(np.array([[0.1, 0.2]]))
+print("reserved", flush=True)
 time.sleep(60)
 """
 
 
 def test_points_in_flight_elsewhere_are_known_until_their_job_dies(tmp_path: Path) -> None:
-    claims = Claims(tmp_path, 2)
+    pending = PendingPoints(tmp_path, 2)
     other = subprocess.Popen(
         [sys.executable, "-c", CLAIM, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     assert other.stdout is not None
-    assert other.stdout.readline() == "claimed\n"
-    with claims.deciding():
-        np.testing.assert_array_equal(claims.others(), [[0.1, 0.2]])
-        with claims.claim(np.array([[0.5, 0.5]])):
-            assert len(list(claims.folder.glob("*.json"))) == 2
+    assert other.stdout.readline() == "reserved\n"
+    with pending.deciding():
+        np.testing.assert_array_equal(pending.others(), [[0.1, 0.2]])
+        with pending.reserve(np.array([[0.5, 0.5]])):
+            assert len(list(pending.folder.glob("*.json"))) == 2
     other.kill()
     other.communicate()
-    with claims.deciding():
-        assert len(claims.others()) == 0
-    assert list(claims.folder.glob("*.json")) == []
+    with pending.deciding():
+        assert len(pending.others()) == 0
+    assert list(pending.folder.glob("*.json")) == []
 
 
 def test_a_spoilt_log_line_spoils_no_other(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from busy import prompt
 from camel import entries
 
 import surrogates.truth as truth_module
@@ -199,11 +200,12 @@ def test_ctrl_c_ends_it_soon_and_it_resumes(tmp_path: Path) -> None:
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGINT)
     began = time.monotonic()
-    output, errors = process.communicate(timeout=30)
+    output, errors = process.communicate(timeout=60)
+    took = time.monotonic() - began
     if process.returncode == 0:
         pytest.skip("it had finished")
     assert (process.returncode, output) == (130, "")
-    assert time.monotonic() - began < 2.0
+    assert took < prompt()
     assert len(errors.splitlines()) == 1
     assert "resumes" in errors
     assert not (folder / "result.json").exists()

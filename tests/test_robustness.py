@@ -16,13 +16,13 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace, scale_plant
+from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
 from ccd_casadi.robust.perturbed import (
     damping_line,
     shift_line,
     single_modes,
     system_of,
-    tolerances,
     worst_in_box,
 )
 from ccd_casadi.robust.signals import closed_loop, gains, noise
@@ -244,7 +244,7 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
         (["--axis", "2"], "--axis: is 2; the plant has outputs 1 to 1"),
         (["--damping", "1.5", "2"], "--damping: is 1.5 2"),
         (["--tolerance", "-1"], "--tolerance"),
-        (["--shift", "60"], "not below 50 %"),
+        (["--shift", "60"], "no number above 0 and below 50"),
         (["--stroke", "0"], "no number above 0"),
         (["--samples", "0"], "no whole number"),
     ],

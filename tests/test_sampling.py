@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from busy import prompt
 from helpers import HZ, INNER, problem
 
 from ccd_casadi.inner_problem.problem import PlantSource
@@ -382,9 +383,9 @@ def test_ctrl_c_is_resumable(undisturbed: Path, tmp_path: Path, formulation: str
     wait_for_rows(process, folder / "samples.sqlite", 20)
     os.kill(process.pid, signal.SIGINT)
     began = time.monotonic()
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=60)
+    assert time.monotonic() - began < prompt()
     assert (process.returncode, output) == (130, "")
-    assert time.monotonic() - began < 2.0
     assert len(errors.splitlines()) == 1, errors
     assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")
     assert not (folder / "result.json").exists()

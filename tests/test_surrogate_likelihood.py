@@ -19,7 +19,7 @@ from surrogates import (
     loo_errors,
     profile_likelihood,
 )
-from surrogates.kernels import covariance, observed_covariance, radial
+from surrogates.covariance import covariance, observed_covariance, radial
 from surrogates.likelihood import log_likelihood
 
 

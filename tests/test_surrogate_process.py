@@ -11,21 +11,23 @@ from scipy.optimize import rosen, rosen_der
 from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
 
 from surrogates import (
+    GaussianProcess,
     Hyperparameters,
     Kernel,
+    Samples,
     SurrogateFitError,
     checked,
     condition,
-    cross_validate,
     design,
-    diagnose,
     fit,
     fit_outputs,
     loo_errors,
     profile_likelihood,
+    quality_of,
 )
-from surrogates.bands import calibrated
-from surrogates.kernels import observed_covariance
+from surrogates.calibration import calibrated
+from surrogates.covariance import observed_covariance
+from surrogates.validation import held_out
 
 
 @KERNELS
@@ -197,16 +199,17 @@ def test_cross_validation_refits_on_every_fold() -> None:
     Y, dY = smooth(X)
     sizes = []
 
-    def fitter(X, Y, dY=None):
-        sizes.append(len(X))
-        return condition(drawn(0)[1], X, Y, **BOX, dY=dY)
+    def fitter(part: Samples) -> GaussianProcess:
+        sizes.append(len(part.X))
+        return condition(drawn(0)[1], part.X, part.Y, **BOX, dY=part.dY)
 
-    plain = cross_validate(fitter, X, Y, folds=5, seed=1)
+    plain = held_out(fitter, checked(X, Y, **BOX), folds=5, seed=1)
     assert sorted(sizes) == [9, 9, 10, 10, 10]
-    assert plain == cross_validate(fitter, X, Y, folds=5, seed=1)
-    assert cross_validate(fitter, X, Y, folds=5, seed=1, dY=dY).rms < plain.rms
+    np.testing.assert_array_equal(plain, held_out(fitter, checked(X, Y, **BOX), folds=5, seed=1))
+    with_gradients = held_out(fitter, checked(X, Y, **BOX, dY=dY), folds=5, seed=1)
+    assert np.linalg.norm(with_gradients) < np.linalg.norm(plain)
     with pytest.raises(ValueError, match="folds"):
-        cross_validate(fitter, X, Y, folds=13)
+        held_out(fitter, checked(X, Y, **BOX), folds=13, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -223,9 +226,10 @@ def test_roughness_is_recognised(n: int, step: float, kink: float, verdict: str)
     X = design("sobol", **BOX, n=n, seed=3)
     across = X @ [1.0, -0.7] - 0.1
     Y = smooth(X)[0] + step * (across > 0) + kink * np.abs(across)
-    found = diagnose(fit(X, Y, **BOX))
+    process = fit(X, Y, **BOX)
+    found = quality_of(process, X[0])
     assert found.roughness == verdict
-    assert (found.coverage > 0.97) == (verdict == "smooth")
+    assert (process.band == 1.0) == (verdict == "smooth")  # else its own deviation is too narrow
     worst = np.argsort(np.abs(found.standardised))[-3:]
     if verdict != "smooth":  # the samples that do not fit are those at the edge
         assert (np.abs(across[worst]) < 0.6).all()

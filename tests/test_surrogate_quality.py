@@ -45,7 +45,7 @@ def test_a_kinked_bandwidth_recommends_lifted() -> None:
     assert q.roughness is not Roughness.SMOOTH
     assert "--formulation lifted" in recommendation([q])
     several = [q, replace(q, name="sensitivity_peak", unit="%")]
-    assert "fit_maximum" in recommendation(several)
+    assert "kinked where they are equal" in recommendation(several)
 
 
 def test_a_design_beyond_the_samples_is_flagged() -> None:

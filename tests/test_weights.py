@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ccd_casadi.kernels.generalized_plant import (
     first_order_weights,
     generalized_plant,
-    weight_magnitudes,
+    squared_weights,
 )
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace
@@ -44,7 +44,7 @@ def test_realisations_are_the_transfer_functions(w: Weights, omega_0: float) -> 
         # d + cb/(s + a) loses what cancels between d and cb/a
         bound = 1e-14 * (abs(d) + abs(c * b) / np.hypot(OMEGA, a))
         assert (np.abs(found - scale * expected[i]) <= bound).all()
-    found = np.array([weight_magnitudes(w.scaled(omega_0), omega) for omega in OMEGA]).T
+    found = np.sqrt([squared_weights(w.scaled(omega_0), omega) for omega in OMEGA]).T
     np.testing.assert_allclose(found / [[1.0], [w.M_K], [1.0]], np.abs(expected), rtol=1e-13)
 
 

@@ -78,7 +78,11 @@ _KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 
 
 def load_case(path: str | Path) -> Case:
-    """Read and check a case file. Raises CaseError on the first mistake."""
+    """Read and check a case file. Raises CaseError on the first mistake.
+
+    >>> load_case("runs/two_mass.toml").theta[0]
+    Parameter(name='m1', lower=55.0, upper=70.0, start=67.56, unit='kg')
+    """
     path = Path(path)
 
     def fail(words: str) -> CaseError:
@@ -111,8 +115,15 @@ def load_case(path: str | Path) -> Case:
     return parse_case(data, path)
 
 
-def parse_case(data: Mapping[str, Any], path: Path) -> Case:
-    """Check the tables of a case file. Raises CaseError on the first mistake."""
+def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
+    """The tables of a case file, as TOML reads them, checked; files in them are relative to `path`.
+
+    Raises CaseError on the first mistake.
+
+    >>> parse_case({"plant": {"model": "two_mas"}, "theta": {}})
+    Traceback (most recent call last):
+    ccd_casadi.cases.case.CaseError: case: objective: is missing; add a table [objective]
+    """
 
     def fail(key: str, words: str) -> CaseError:
         return CaseError(one_line(f"{path}: {key}: {words}"))
@@ -318,6 +329,10 @@ def problem_of(case: Case) -> CoDesignProblem:
 
     The plant is made once here, and one of the user's own is looked at over its box. Raises
     CaseError where it is none.
+
+    >>> problem = problem_of(load_case("runs/two_mass.toml"))
+    >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
+    (('m1', 'm2'), -0.995, 6.283)
     """
     inner, w = case.inner, case.weights
     file = function = None

@@ -1,4 +1,8 @@
-"""The resolved case, defaults included, back as TOML."""
+"""The resolved case, defaults included, back as TOML.
+
+By hand: tomli-w lets marks through that turn the direction of a terminal's text, and cases come
+from strangers.
+"""
 
 import re
 from collections.abc import Mapping

@@ -30,7 +30,11 @@ STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 
 @dataclass(frozen=True)
 class Direct:
-    """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem."""
+    """Options of the direct formulation: IPOPT's `starts`; `tolerance` is of the inner problem.
+
+    >>> Direct(starts=2).starts
+    2
+    """
 
     starts: int = 4
     tolerance: float = 1e-3

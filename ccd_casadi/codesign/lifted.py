@@ -41,6 +41,9 @@ class Lifted:
     `points` designs of (θ, ω_S, ω_T) are sampled; 0 takes 6 (n_θ + 2). A quadratic in n variables
     has (n + 1)(n + 2)/2 coefficients and a sample with gradients gives n + 1 numbers: 6 n samples
     are twelve times what it needs at n = 4, six times at n = 8. The rest as for `Nested`.
+
+    >>> Lifted(points=24, tolerance=1e-4).starts
+    16
     """
 
     points: int = 0

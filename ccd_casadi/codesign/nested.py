@@ -35,6 +35,9 @@ class Nested:
     a round; prediction and truth agree within `tolerance` (relative) or after `max_refinements`
     rounds at the latest. `kernel`: "matern52", "rbf", or "auto", which predicts left-out samples
     best.
+
+    >>> Nested(plan="sobol", points=24).starts
+    16
     """
 
     plan: str = "grid"

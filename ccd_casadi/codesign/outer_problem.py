@@ -17,8 +17,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
 from ccd_casadi.plants.plant import Plant, constraint_values
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.interrupts import interrupts_kept
 from surrogates import design
+from surrogates.ipopt import end_points
 
 
 @dataclass(frozen=True)
@@ -131,18 +131,7 @@ def solve_program(
     z = ca.MX.sym("z", program.x.shape[0])
     inside = program.lower + width * z
     f, g = ca.substitute([program.f, program.g], [program.x], [inside])
-    options: dict[str, Any] = {
-        "print_time": False,
-        "ipopt.print_level": 0,
-        "ipopt.sb": "yes",
-        "ipopt.tol": tolerance,
-        "ipopt.constr_viol_tol": 1e-9,
-        "ipopt.acceptable_tol": 1e-7,
-        "ipopt.max_iter": 300,
-        "ipopt.bound_relax_factor": 0.0,
-        "ipopt.honor_original_bounds": "yes",
-        "show_eval_warnings": False,
-    }
+    options: dict[str, Any] = {"ipopt.tol": tolerance}
     if not program.exact_hessian:
         options["ipopt.hessian_approximation"] = "limited-memory"
         # The true quantities carry rounding: there is no use in chasing the last digits.
@@ -159,26 +148,22 @@ def solve_program(
             "ipopt.warm_start_slack_bound_frac": 1e-10,
             "ipopt.warm_start_mult_bound_push": 1e-10,
         }
-    problem: dict[str, Any] = {"x": z, "f": f, "g": g}
-    solver = ca.nlpsol("outer", "ipopt", problem, options)
-    g_lower = -np.inf if program.g_lower is None else program.g_lower
-    found: list[LocalOptimum] = []
-    for start in np.atleast_2d(starts):
-        z0 = np.clip((start - program.lower) / width, 0.0, 1.0)
-        with interrupts_kept():
-            result = solver(x0=z0, lbx=0.0, ubx=1.0, lbg=g_lower, ubg=0.0)
-        stats = solver.stats()
-        point = np.clip(np.array(result["x"]).ravel(), 0.0, 1.0)
-        found.append(
-            LocalOptimum(
-                x=program.lower + width * point,
-                objective=float(result["f"]),
-                multipliers_g=np.array(result["lam_g"]).ravel(),
-                multipliers_x=np.array(result["lam_x"]).ravel() / width,
-                status=str(stats["return_status"]),
-                converged=bool(stats["success"]),
-            )
+    found = [
+        LocalOptimum(
+            x=program.lower + width * end.z,
+            objective=end.objective,
+            multipliers_g=end.multipliers_g,
+            multipliers_x=end.multipliers_z / width,
+            status=end.status,
+            converged=end.converged,
         )
+        for end in end_points(
+            {"x": z, "f": f, "g": g},
+            (np.atleast_2d(starts) - program.lower) / width,
+            options,
+            -np.inf if program.g_lower is None else program.g_lower,
+        )
+    ]
     converged = [item for item in found if item.converged]
     if not converged:
         raise OuterFailure(f"IPOPT converged from none of {len(found)} starts: {found[0].status}")

@@ -3,7 +3,6 @@
 import importlib.metadata
 import json
 import math
-import os
 import platform
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +18,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
+from surrogates.files import write_whole
 
 PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
 
@@ -159,9 +159,7 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
 
 
 def clean(value: Any) -> Any:

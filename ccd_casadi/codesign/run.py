@@ -1,6 +1,5 @@
 """One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -26,15 +26,15 @@ from ccd_casadi.codesign.result import (
     write_json,
 )
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.surrogate_quality import Quality, quality_dict, surrogate_quality
+from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from surrogates import design, save
+from surrogates import Quality, design, save
+from surrogates.files import write_whole
 
-FORMULATIONS = ("nested", "lifted", "direct")
 Formulation = Nested | Lifted | Direct
 
 
@@ -195,9 +195,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(resolved(case, solution))
-    draft = folder / "case.toml.part"  # a kill must not leave half a case to resume from
-    draft.write_text(text, encoding="utf-8")
-    os.replace(draft, folder / "case.toml")
+    write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:

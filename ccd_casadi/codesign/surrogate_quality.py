@@ -1,28 +1,13 @@
-"""How far the last surrogates of a run can be trusted, judged by their own samples.
-
-Left out one by one and fold by fold, with the hyperparameters kept (estimated anew they would
-cost more than the whole solve, and differ by little); bands against residuals; kinks and jumps;
-and whether the design lies where the samples are.
-"""
+"""What the surrogates of a run say about themselves (`surrogates.quality`), and what follows."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
-
-import numpy as np
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from surrogates import Errors, GaussianProcess, Roughness, errors, extrapolation, loo_errors
-from surrogates.diagnostics import roughness, smoothness_likelihoods
-from surrogates.gaussian_process import TWO_SIDED_95, conditioned
-from surrogates.samples import Samples
-from surrogates.validation import held_out
+from surrogates import GaussianProcess, Quality, quality_of
 
-FOLDS = 10
-LEAST_FOR_ROUGHNESS = 20
-# Q² above which the samples are followed whatever their roughness.
-EXCELLENT = 1.0 - 1e-6
 # Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
 # fitted is a logarithm.
 OUTPUTS = (
@@ -32,40 +17,21 @@ OUTPUTS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Quality:
-    """One output, its errors in `unit` (those of the peak and the low end of S in %).
-
-    true, predicted (n,): each sample in Hz or as a gain, and its prediction without it;
-    standardised (n,): the difference over the deviation of the band; coverage: share inside
-    nominal 95 % bands. extrapolates: what is amiss at the design, nothing where samples
-    support it.
-    """
-
-    name: str
-    unit: str
-    true: Array
-    predicted: Array
-    standardised: Array
-    loo: Errors
-    kfold: Errors
-    coverage: float
-    roughness: Roughness
-    extrapolates: tuple[str, ...]
-
-    @property
-    def smooth_enough(self) -> bool:
-        """Whether one smooth surrogate suits the samples."""
-        return self.roughness is Roughness.SMOOTH or self.kfold.q2 >= EXCELLENT
-
-
 def surrogate_quality(
     processes: Sequence[GaussianProcess], x: Array, seed: int = 0
 ) -> tuple[Quality, ...]:
     """Judge the processes of ω_b, or of ω_b, ln‖S‖∞ and ln|S(jω_low)|, at the design x."""
     return tuple(
-        _quality(process, *output, x[: process.lower.size], seed)
-        for process, output in zip(processes, OUTPUTS, strict=False)
+        quality_of(
+            process,
+            x[: process.lower.size],
+            name=name,
+            unit=unit,
+            factor=factor,
+            logarithm=logarithm,
+            seed=seed,
+        )
+        for process, (name, unit, factor, logarithm) in zip(processes, OUTPUTS, strict=False)
     )
 
 
@@ -84,8 +50,8 @@ def recommendation(qualities: Sequence[Quality]) -> str:
                 "Solve with --formulation lifted, whose outputs are smooth where the best "
                 "bandwidth is not."
                 if len(qualities) == 1
-                else "The larger of two local peaks is kinked where they are equal; a surrogate "
-                "of each (surrogates.fit_maximum) would not be."
+                else "The larger of two local peaks is kinked where they are equal; the rounds "
+                "refit by the design, where one of them is the larger."
             )
         )
     beyond = [q.name.replace("_", " ") for q in qualities if q.extrapolates]
@@ -116,43 +82,3 @@ def quality_dict(qualities: Sequence[Quality]) -> dict[str, Any]:
         },
         "recommendation": recommendation(qualities),
     }
-
-
-def _quality(
-    process: GaussianProcess, name: str, unit: str, factor: float, log: bool, x: Array, seed: int
-) -> Quality:
-    samples = _samples(process)
-    residuals, deviations = loo_errors(process)
-    n = len(process.X)
-    folded, _ = held_out(
-        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
-        samples,
-        min(FOLDS, n),
-        seed,
-    )
-    kind = Roughness.SMOOTH
-    if n >= LEAST_FOR_ROUGHNESS:
-        kind = roughness(smoothness_likelihoods(process.X, process.targets[:n], 0.0, seed))
-    standardised = residuals / (process.band * deviations)
-    return Quality(
-        name=name,
-        unit=unit,
-        true=np.exp(samples.Y) if log else factor * samples.Y,
-        predicted=np.exp(samples.Y - residuals) if log else factor * (samples.Y - residuals),
-        standardised=standardised,
-        loo=errors(factor * residuals, factor * samples.Y),
-        kfold=errors(factor * folded, factor * samples.Y),
-        coverage=float(np.mean(np.abs(standardised) <= TWO_SIDED_95)),
-        roughness=kind,
-        extrapolates=extrapolation(process, samples.X, x).reasons,
-    )
-
-
-def _samples(process: GaussianProcess) -> Samples:
-    """The samples that a process holds, in input and output units."""
-    n, d = process.X.shape
-    width = process.upper - process.lower
-    targets = process.output_scale * process.targets.reshape(-1, n)
-    slopes = None if len(targets) == 1 else targets[1 : 1 + d].T / width
-    X = process.lower + process.X * width
-    return Samples(process.lower, process.upper, X, process.output_mean + targets[0], slopes)

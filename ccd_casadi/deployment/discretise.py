@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from itertools import pairwise
 
 import numpy as np
@@ -15,20 +14,12 @@ from ccd_casadi.deployment.sampled import (
     sampled_plant,
     sensitivity_loop,
 )
+from ccd_casadi.deployment.timing import Discretisation as Discretisation
 from ccd_casadi.plants.scaling import StateSpace
 
 SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
 CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed
 NICE = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.4, 8.0, 10.0)
-
-
-class Discretisation(StrEnum):
-    """How K(s) becomes K(z)."""
-
-    TUSTIN = "tustin"
-    PREWARPED = "prewarped"  # Tustin, exact at the frequency of S's peak
-    STEP = "zoh"  # step-invariant
-    RAMP = "foh"  # ramp-invariant: exact for an error that is straight between samples
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from ccd_casadi.deployment.channels import Channel, assemble, split
 from ccd_casadi.deployment.discretise import (
     FASTEST,
     Conversion,
-    Discretisation,
     Target,
     discretise,
     loop_at,
@@ -36,6 +35,8 @@ from ccd_casadi.deployment.sampled import (
     together,
 )
 from ccd_casadi.deployment.simulation import MeasuredSensitivity, measure_set
+from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.deployment.timing import Timing as Timing
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import StateSpace
@@ -53,25 +54,6 @@ STRICT = 1e-6  # relative: S_max kept as the design itself keeps it
 SAMPLED_PEAK, SAMPLED_BANDWIDTH = 1.05, 0.03
 LEAST_RATE = 4.0  # samples in a period of ω_b
 ADDED = 5  # plants between those of the case's set that may be added to it for the rate
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How the controller runs: a rate (None: the one that is needed), a delay, a method.
-
-    The delay, from reading y to the new u at the actuator, is `delay` in s, or where that is
-    None `delay_samples` periods. No method: the one that needs the lowest rate.
-    """
-
-    rate_hz: float | None = None
-    delay: float | None = None
-    delay_samples: float = 1.0
-    method: Discretisation | None = None
-    lead: bool | None = None
-
-    def delay_at(self, rate_hz: float) -> float:
-        """The delay in s at a sampling rate."""
-        return self.delay if self.delay is not None else self.delay_samples / rate_hz
 
 
 @dataclass(frozen=True)

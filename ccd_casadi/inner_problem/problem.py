@@ -28,7 +28,7 @@ from ccd_casadi.support.user_code import limited, require_user_code
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
-NUMERICS = 5  # raised whenever a change of ours moves the numbers that a sample holds
+NUMERICS = 6  # raised whenever a change of ours moves the numbers that a sample holds
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,15 @@ class RobustSet:
 
 @dataclass(frozen=True)
 class CoDesignProblem:
-    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout."""
+    """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout.
+
+    Made by `problem_of`; `dataclasses.replace` makes variants of it:
+
+    >>> import ccd_casadi as ccd
+    >>> from dataclasses import replace
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> heavier = replace(problem, lower=(60.0, 60.0), start=(65.0, 65.0))
+    """
 
     source: PlantSource
     names: tuple[str, ...]
@@ -232,7 +240,15 @@ def _own_function(source: PlantSource) -> ModelFunction:
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:
-    """The scaled plant at θ, with its family where the problem is a robust one."""
+    """The scaled plant M_K G(jω₀ω) at θ, with its family where the problem is a robust one.
+
+    Raises PlantError where the model is no plant at θ.
+
+    >>> import ccd_casadi as ccd
+    >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
+    (209.2, (4, 4))
+    """
     system = mechanics(plant_of(problem), theta)
 
     def scaled(*perturbation: Perturbation) -> ScaledPlant:
@@ -261,7 +277,18 @@ def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
 
 
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
-    """The true inner problem at θ, by the problem's method; the best over its design plants."""
+    """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
+
+        max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper)
+
+    The best over the design plants of a robust problem that leaves its own open. An infeasible θ
+    is a result without `optimum` that says what falls short.
+
+    >>> import ccd_casadi as ccd
+    >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> round(best.bandwidth / ccd.HZ, 2), best.active
+    (58.23, ('S_max', 'omega_T lower'))
+    """
     return best_choice(problem, theta)[1]
 
 
@@ -287,6 +314,12 @@ def true_design(
     """One certified synthesis with its total derivatives at (θ, ω_S, ω_T); rad/s.
 
     Raises ValueError where the problem leaves open what plant the controller is made on.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)
+    >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
+    (True, [-0.21, -0.138])
     """
     if len(design_choices(problem)) > 1:
         raise ValueError("a synthesis needs one design plant: take one of design_choices(problem)")

@@ -16,6 +16,8 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from ccd_casadi.synthesis.weights import Weights
+from surrogates import Kernel
+from surrogates.covariance import covariance
 
 INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
 FINE = 81  # points a side on which the interpolant is searched
@@ -89,35 +91,18 @@ def _slopes(design: Sensitivities, width: Array) -> Array:
 
 
 def _interpolate(X: Array, Y: Array, dY: Array, at: Array) -> Array:
-    """Gaussian radial-basis interpolant of values and gradients; columns of Y at the points."""
-    x, z = X / LENGTHS, at / LENGTHS
-    n, d = x.shape
-    k, dk, ddk = _kernel(x, x)
-    K = np.empty((n * (d + 1), n * (d + 1)))
-    K[:n, :n] = k
-    for i in range(d):
-        K[:n, n * (i + 1) : n * (i + 2)] = -dk[i]
-        K[n * (i + 1) : n * (i + 2), :n] = dk[i]
-        for j in range(d):
-            K[n * (i + 1) : n * (i + 2), n * (j + 1) : n * (j + 2)] = -ddk[i][j]
+    """Gaussian radial-basis interpolant of values and gradients; columns of Y at the points.
+
+    Its lengths are given, and one factor serves all outputs, so that the covariance alone is
+    taken from `surrogates`.
+    """
+    x, one = X / LENGTHS, np.ones(X.shape[1])
+    K = covariance(Kernel.RBF, x, x, one, gradients_of_a=True, gradients_of_b=True)
     K[np.diag_indices_from(K)] += 1e-8
     mean = Y.mean(axis=0)
-    data = np.vstack([Y - mean] + [dY[:, :, i] * LENGTHS[i] for i in range(d)])
+    data = np.vstack([Y - mean] + [dY[:, :, i] * LENGTHS[i] for i in range(X.shape[1])])
     weights = cho_solve(cho_factor(K), data)
-    k, dk, _ = _kernel(z, x)
-    return mean + np.hstack([k] + [-dk[i] for i in range(d)]) @ weights
-
-
-def _kernel(a: Array, b: Array) -> tuple[Array, list[Array], list[list[Array]]]:
-    """exp(-|a-b|²/2), its gradients and Hessians to a."""
-    diff = [a[:, i, None] - b[None, :, i] for i in range(a.shape[1])]
-    k = np.exp(-0.5 * sum(item**2 for item in diff))
-    first = [-item * k for item in diff]
-    second = [
-        [(di * dj - (1.0 if i == j else 0.0)) * k for j, dj in enumerate(diff)]
-        for i, di in enumerate(diff)
-    ]
-    return k, first, second
+    return mean + covariance(Kernel.RBF, at / LENGTHS, x, one, gradients_of_b=True) @ weights
 
 
 def _next_point(

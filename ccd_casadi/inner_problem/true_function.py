@@ -18,7 +18,18 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 
 
 class TrueQuantities(VectorCallback):
-    """A casadi.Callback; keep a reference to it as long as anything built on it is in use."""
+    """(θ, ln ω_S, ln ω_T) -> ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt, with exact Jacobian.
+
+    A casadi.Callback: keep a reference to it as long as anything built on it is in use. A design
+    that is not certified is NaN, on which IPOPT shortens its step.
+
+    >>> import ccd_casadi as ccd
+    >>> import numpy as np
+    >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case("runs/two_mass.toml")))
+    >>> x = [60.0, 60.0, *np.log([800.0 * ccd.HZ, 40.0 * ccd.HZ])]
+    >>> round(float(quantities(x)[0]) / ccd.HZ, 2)
+    55.66
+    """
 
     def __init__(
         self,

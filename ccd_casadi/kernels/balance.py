@@ -4,16 +4,16 @@ A diagonal change of states x = T x̂ is symplectic on (x, λ): H becomes diag(T
 and X becomes T X T, so γ_opt and the controller as a transfer function stay what they are. With
 τ_i powers of two nothing is rounded (P. Benner, Symplectic balancing of Hamiltonian matrices,
 SIAM J. Sci. Comput. 22, 2001; here the diagonal part only, by the sweeps of Osborne).
+
+Plain NumPy: only a design that fails comes here.
 """
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.riccati import NOISE, projected
 
 
-@compiled
 def balancing(H):
     """τ (N,), powers of two that make the sum of a 2N x 2N Hamiltonian's entries smallest.
 
@@ -50,7 +50,6 @@ def balancing(H):
     return τ
 
 
-@compiled
 def in_coordinates(gp, τ):
     """The generalized plant with states x̂ = x/τ."""
     A, B1, B2, C1, C2, d1, d2 = gp
@@ -58,7 +57,6 @@ def in_coordinates(gp, τ):
     return A * (τ / rows), B1 / rows, B2 / rows, C1 * τ, C2 * τ, d1, d2
 
 
-@compiled
 def rounding_noise(H0):
     """What rounding alone makes of a projection that is zero: X(γ = ∞) is positive semidefinite.
 

@@ -6,23 +6,18 @@ damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the 
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.generalized_plant import squared_weights
 
 
-@compiled
 def _bound_slope(A, B, C, w, ω):
     """dγ_jω²(ω)/dω of γ_jω² = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|², dσ = Re(u* dG v)."""
     n, p = A.shape[0], C.shape[0]
-    M = (1j * ω) * np.eye(n) - A
-    right = np.linalg.solve(M, B.astype(np.complex128))
-    complex_C = C.astype(np.complex128)
-    U, s, Vh = np.linalg.svd(complex_C @ right)
-    dG = -1j * (complex_C @ np.linalg.solve(M, right))
-    u = np.ascontiguousarray(U[:, p - 1])
-    v = np.ascontiguousarray(Vh[p - 1, :].conj())
+    M = 1j * ω * np.eye(n) - A
+    right = np.linalg.solve(M, B)
+    U, s, Vh = np.linalg.svd(C @ right)
+    dG = -1j * (C @ np.linalg.solve(M, right))
     σ = s[p - 1]
-    dσ = np.vdot(u, dG @ v).real
+    dσ = np.vdot(U[:, p - 1], dG @ Vh[p - 1].conj()).real
     M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
     W1, W2, W3 = squared_weights(w, ω)
     # |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c |W|²)/(c ω² + d)
@@ -34,7 +29,6 @@ def _bound_slope(A, B, C, w, ω):
     return (R / (W1 + R)) ** 2 * d1 + (W1 / (W1 + R)) ** 2 * dR
 
 
-@compiled
 def bound_peak(A, B, C, w, start):
     """The maximiser next to `start`; `start` itself where the slope has no root within 1 %."""
     a, fa = start, _bound_slope(A, B, C, w, start)

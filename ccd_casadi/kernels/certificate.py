@@ -13,7 +13,7 @@ from ccd_casadi.kernels.frequency import response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
 from ccd_casadi.kernels.refine import narrow, next_trial
 from ccd_casadi.kernels.sensitivity import axis_frequencies
-from ccd_casadi.kernels.small import add_gram, invert, largest_eigenvalue, multiply
+from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
 
 REFINEMENTS = 40  # trials a peak; some six are used
 
@@ -31,7 +31,7 @@ def _stack(g, k, Dk, w, ω):
             T += g[0, i] * u
         T2, D2 = T.real**2 + T.imag**2, (1.0 + T.real) ** 2 + T.imag**2
         return np.sqrt((W1 + W2 * u2 + W3 * T2) / D2)
-    k = k + Dk
+    k = add_real(k, Dk)
     L = multiply(g, k)
     M = L.copy()
     for i in range(p):
@@ -99,7 +99,14 @@ def level_test(G, K, Dk, w, loop, level):
     they bound decides. False as well where LAPACK fails or the feedthrough exceeds the level.
     """
     Az, Bz, Cz, Dz = loop
-    if np.linalg.norm(Dz) >= level and np.linalg.svd(Dz)[1][0] >= level:
+    p = Dz.shape[1]
+    gram, size = np.zeros((p, p), np.complex128), 0.0
+    for k in range(Dz.shape[0]):
+        for i in range(p):
+            size += Dz[k, i] ** 2
+            for j in range(p):
+                gram[i, j] += Dz[k, i] * Dz[k, j]
+    if size >= level**2 and largest_eigenvalue(gram) >= level**2:
         return False
     candidates, info = axis_frequencies(Az, Bz, Cz, Dz, level)
     if info != 0:

@@ -8,6 +8,7 @@ taken from the synthesis; a controller of any other form keeps its full order.
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import add, place
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.generalized_plant import first_order_weights
 
@@ -19,16 +20,16 @@ def loop_matrices(A, B, C, Ak, Bk, Ck, Dk):
     """State space of S = (I + GK)⁻¹, r to e, states [x; x_K]; D = I."""
     n, N = A.shape[0], Ak.shape[0]
     p = C.shape[0]
-    As = np.empty((n + N, n + N))
-    As[:n, :n] = A - B @ Dk @ C
-    As[:n, n:] = B @ Ck
-    As[n:, :n] = -Bk @ C
-    As[n:, n:] = Ak
-    Bs = np.empty((n + N, p))
-    Bs[:n, :] = B @ Dk
-    Bs[n:, :] = Bk
-    Cs = np.zeros((p, n + N))
-    Cs[:, :n] = -C
+    As, Bs, Cs = np.empty((n + N, n + N)), np.empty((n + N, p)), np.zeros((p, n + N))
+    BD = B @ Dk
+    place(As, 0, 0, 1.0, A)
+    add(As, 0, 0, -1.0, BD @ C)
+    place(As, 0, n, 1.0, B @ Ck)
+    place(As, n, 0, -1.0, Bk @ C)
+    place(As, n, n, 1.0, Ak)
+    place(Bs, 0, 0, 1.0, BD)
+    place(Bs, n, 0, 1.0, Bk)
+    place(Cs, 0, 0, -1.0, C)
     return As, Bs, Cs
 
 
@@ -43,22 +44,23 @@ def weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w):
     Az, Bz = np.zeros((total, total)), np.zeros((total, p))
     Cz, Dz = np.zeros((2 * p + m, total)), np.zeros((2 * p + m, p))
     DC = Dk @ C
-    Az[:n, :n] = A - B @ DC
-    Az[:n, n:i1] = B @ Ck
-    Az[n:i1, :n] = -Bk @ C
-    Az[n:i1, n:i1] = Ak
-    Bz[:n, :] = B @ Dk
-    Bz[n:i1, :] = Bk
-    Az[i1:i2, :n] = -f[0, 1] * C
-    Az[i2:i3, :n] = -f[1, 1] * DC
-    Az[i2:i3, n:i1] = f[1, 1] * Ck
-    Bz[i2:i3, :] = f[1, 1] * Dk
-    Az[i3:, :n] = f[2, 1] * C
-    Cz[:p, :n] = -f[0, 3] * C
-    Cz[p : p + m, :n] = -f[1, 3] * DC
-    Cz[p : p + m, n:i1] = f[1, 3] * Ck
-    Dz[p : p + m, :] = f[1, 3] * Dk
-    Cz[p + m :, :n] = f[2, 3] * C
+    place(Az, 0, 0, 1.0, A)
+    add(Az, 0, 0, -1.0, B @ DC)
+    place(Az, 0, n, 1.0, B @ Ck)
+    place(Az, n, 0, -1.0, Bk @ C)
+    place(Az, n, n, 1.0, Ak)
+    place(Bz, 0, 0, 1.0, B @ Dk)
+    place(Bz, n, 0, 1.0, Bk)
+    place(Az, i1, 0, -f[0, 1], C)
+    place(Az, i2, 0, -f[1, 1], DC)
+    place(Az, i2, n, f[1, 1], Ck)
+    place(Bz, i2, 0, f[1, 1], Dk)
+    place(Az, i3, 0, f[2, 1], C)
+    place(Cz, 0, 0, -f[0, 3], C)
+    place(Cz, p, 0, -f[1, 3], DC)
+    place(Cz, p, n, f[1, 3], Ck)
+    place(Dz, p, 0, f[1, 3], Dk)
+    place(Cz, p + m, 0, f[2, 3], C)
     for i in range(p):
         Az[i1 + i, i1 + i] = -f[0, 0]
         Bz[i1 + i, i] = f[0, 1]

@@ -1,5 +1,32 @@
 """The one decorator of the kernels: compiled, cached on disk, 1/0 = inf as in NumPy."""
 
-from numba import njit
+import os
+from importlib import import_module
+from typing import Any
 
-compiled = njit(cache=True, error_model="numpy")
+from numba import njit
+from numba.core import event
+
+# without an entry for C callbacks, which nobody calls: a tenth less to compile
+compiled = njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+PACKAGE = __name__.rpartition(".")[0]
+
+
+class _FirstCompilation(event.Listener):
+    """Where a kernel is not on disk: all of them are compiled at once, with words."""
+
+    def __init__(self) -> None:
+        self.seen = "CCD_CASADI_COMPILES" in os.environ  # by itself, one after the other
+
+    def on_start(self, event: Any) -> None:
+        module = event.data["dispatcher"].py_func.__module__
+        if not self.seen and module.startswith(PACKAGE + "."):
+            self.seen = True
+            # which itself imports the kernels
+            import_module(f"{PACKAGE}.compilation").ensure_compiled()
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _FirstCompilation())

@@ -4,6 +4,7 @@ from math import exp, isnan, log, nan
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import all_finite, ascending, place
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop
 from ccd_casadi.kernels.compiled import compiled
@@ -38,14 +39,14 @@ def certificate_grid(wr, wi):
             half = min(abs(wr[i]), 0.5 * wi[i])
             grid[k], grid[k + 1], grid[k + 2] = wi[i] - half, wi[i], wi[i] + half
             k += 3
-    return np.sort(grid[:k])
+    return ascending(grid, k)
 
 
 @compiled
 def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
     """Certify a controller against `gamma` and fill in its closed-loop figures."""
     row[Figure.GAMMA] = gamma
-    if not (np.all(np.isfinite(Ak)) and np.all(np.isfinite(Bk)) and np.all(np.isfinite(Ck))):
+    if not (all_finite(Ak) and all_finite(Bk) and all_finite(Ck)):
         row[Figure.CODE] = Code.NOT_FINITE.value
         return
     As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
@@ -71,7 +72,7 @@ def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
     if smaller:
         # x = x̂ as seen from r, so the controller's own states carry S as well
         As, Bs, Cs = loop[0], loop[1], np.zeros((C.shape[0], N))
-        Cs[:, :n] = -C
+        place(Cs, 0, 0, -1.0, C)
     row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
     value, at, confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
     row[Figure.PEAK], row[Figure.PEAK_FREQUENCY] = value, at

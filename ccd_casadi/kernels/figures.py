@@ -35,4 +35,5 @@ class Figure(IntEnum):
     NORM = 11
     NORM_FREQUENCY = 12
     BALANCED = 13  # 1 where the synthesis needed balanced coordinates
-    COUNT = 14
+    GAMMA_ERROR = 14  # relative, what rounding and search may leave in γ_opt; infinite: unknown
+    COUNT = 15

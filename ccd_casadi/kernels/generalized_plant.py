@@ -8,6 +8,7 @@ frequencies over the plant's ω₀, M_K absorbed in the unit of force.
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import place
 from ccd_casadi.kernels.compiled import compiled
 
 
@@ -44,13 +45,13 @@ def generalized_plant(A, B, C, w):
     i1, i2, i3 = n, n + p, n + p + m
     Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p)), np.zeros((N, m))
     C1, C2 = np.zeros((2 * p + m, N)), np.zeros((p, N))
-    Ag[:n, :n] = A
-    B2[:n, :] = B
-    C2[:, :n] = -C
-    C1[:p, :n] = -f[0, 3] * C
-    C1[p + m :, :n] = f[2, 3] * C
-    Ag[i1:i2, :n] = -f[0, 1] * C
-    Ag[i3:, :n] = f[2, 1] * C
+    place(Ag, 0, 0, 1.0, A)
+    place(B2, 0, 0, 1.0, B)
+    place(C2, 0, 0, -1.0, C)
+    place(C1, 0, 0, -f[0, 3], C)
+    place(C1, p + m, 0, f[2, 3], C)
+    place(Ag, i1, 0, -f[0, 1], C)
+    place(Ag, i3, 0, f[2, 1], C)
     for i in range(p):
         Ag[i1 + i, i1 + i] = -f[0, 0]
         B1[i1 + i, i] = f[0, 1]
@@ -73,10 +74,3 @@ def squared_weights(w, ω):
         c_K**2 * (ω**2 + ω_K**2) / (ω**2 + (c_K * ω_K) ** 2),
         (ω**2 + (ω_T / A_l) ** 2) / ((A_u * ω) ** 2 + ω_T**2),
     )
-
-
-@compiled
-def weight_magnitudes(w, ω):
-    """|W1(jω)|, |W2(jω)|, |W3(jω)|."""
-    W1, W2, W3 = squared_weights(w, ω)
-    return np.sqrt(W1), np.sqrt(W2), np.sqrt(W3)

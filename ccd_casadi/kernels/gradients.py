@@ -1,22 +1,31 @@
-"""Total derivatives of a design's figures, the controller moving with the plant.
+"""Total derivatives of the figures of closed loops, the controller moving with its design plant.
 
 Each figure is a scalar of S = (I + GK)⁻¹ with K = C_K(s - A_K)⁻¹B_K, A_K = A + B2 F - B1 C2,
 F = -(B2ᵀX + D12ᵀC1)/d2² and X the stabilising solution of
 
     AᵀX + XA + C1ᵀC1 + t VᵀV - d2² FᵀF = 0,   V = (B1ᵀX + Sᵀ)/t,   t = γ² - d1².
 
-With X̄ the gradient to X, one adjoint Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with
-A_c = A + B1 V + B2 F gives the gradient to every matrix at once, however many parameters there
-are. γ_opt, where X is infinite, has the same equation in the basis [U1; U2] of the stable
-subspace: only f = λ_min(X⁻¹) and its null vector q appear, T11 Λ + Λ T11ᵀ + qqᵀ = 0.
+With K = K(P_d, w) from the design plant P_d and the loop closed on P,
+
+    dσ_max(S) = -Re a (dG K + G dK) b,
+
+dG is a matter of P alone; P is P_d in a nominal design, a plant off the model in a robust one,
+in one unit of time and force. dK goes back through the Riccati equation of P_d: with X̄ the
+gradient to X, one adjoint Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F
+gives the gradient to every matrix at once, however many parameters there are. γ_opt, where X is
+infinite, has the same equation in the basis [U1; U2] of the stable subspace: only
+f = λ_min(X⁻¹) and its null vector q appear, T11 Λ + Λ T11ᵀ + qqᵀ = 0.
+
+Plain NumPy: a point is differentiated once, and compiled this took a third of the set-up.
 """
 
+from collections.abc import Sequence
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_peak
-from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.design import design
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
@@ -25,145 +34,177 @@ from ccd_casadi.kernels.generalized_plant import first_order_weights, generalize
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 from ccd_casadi.kernels.pullback import bound_gradient, gain_to_weights, to_plant, to_weights
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
+from ccd_casadi.support.arrays import Array
 
 
-@compiled
-def _row(v, M):
-    """v M for a complex row and a real matrix."""
-    return np.ascontiguousarray(v.real) @ M + 1j * (np.ascontiguousarray(v.imag) @ M)
+class Loop(NamedTuple):
+    """A plant with its derivatives to θ, and the frequency at which σ_max(S) is differentiated."""
+
+    A: Array
+    B: Array
+    C: Array
+    dA: Array
+    dB: Array
+    dC: Array
+    omega: float
 
 
-@compiled
-def _column(M, v):
-    """M v for a real matrix and a complex column."""
-    return M @ np.ascontiguousarray(v.real) + 1j * (M @ np.ascontiguousarray(v.imag))
+class DesignPlant(NamedTuple):
+    """The plant that a controller is made for, its derivatives to θ, scaled weights, γ/γ_opt."""
+
+    A: Array
+    B: Array
+    C: Array
+    dA: Array
+    dB: Array
+    dC: Array
+    w: Array
+    backoff: float
 
 
-@compiled
+def _transposed(M):
+    return np.swapaxes(M, -1, -2)
+
+
 def _riccati_terms(T11, U1, U2, L, gp, t):
     """Gradients of tr(Λ E) to A, B2, C1 and γ², E the Riccati's differential in the basis of U.
 
     E is the stationary value of 2 pᵀẋ + zᵀz - γ² wᵀw over u and the disturbance w, so that only
     what stands in ẋ and z counts. The gradients to A and C1 are p xᵀ and z xᵀ summed over Λ; with
-    each comes the sum with ẋ for x.
+    each comes the sum with ẋ for x. Λ (k, N, N): every result has k in front.
     """
     _, B1, B2, C1, _, d1, d2 = gp
     p, m = B1.shape[1], B2.shape[1]
-    V = (np.ascontiguousarray(B1.T) @ U2 + d1 * (C1[:p] @ U1)) / t
-    F = -(np.ascontiguousarray(B2.T) @ U2 + d2 * (C1[p : p + m] @ U1)) / d2**2
+    V = (B1.T @ U2 + d1 * (C1[:p] @ U1)) / t
+    F = -(B2.T @ U2 + d2 * (C1[p : p + m] @ U1)) / d2**2
     Z = C1 @ U1
     Z[:p] += d1 * V
     Z[p : p + m] += d2 * F
-    states, rates = np.ascontiguousarray(U1.T), np.ascontiguousarray((U1 @ T11).T)
+    states, rates = U1.T, (U1 @ T11).T
     costate, output = 2.0 * (U2 @ L), 2.0 * (Z @ L)
-    A_, A_rate, B2_ = costate @ states, costate @ rates, costate @ np.ascontiguousarray(F.T)
-    return A_, A_rate, B2_, output @ states, output @ rates, -np.sum(V * (V @ L))
+    A_, A_rate, B2_ = costate @ states, costate @ rates, costate @ F.T
+    return A_, A_rate, B2_, output @ states, output @ rates, -(V * (V @ L)).sum((1, 2))
 
 
-@compiled
 def gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency):
-    """Gradients of γ_opt to A, B, C and w; and ok."""
+    """Gradients of γ_opt to A, B, C and w; and whether the Hamiltonian splits at γ_opt."""
+    if limited:
+        return *bound_gradient(A, B, C, w, bound_frequency), True
     _, B1, _, C1, _, d1, _ = gp
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
-    if limited:
-        A_, B_, C_, w_ = bound_gradient(A, B, C, w, bound_frequency)
-        return A_, B_, C_, w_, True
     t = gamma_opt**2 - d1**2
     _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t, NOISE)
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
-    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lq, gp, t)
-    A_, B_, C_ = to_plant(Ar, B2r, C1r, np.zeros((p, B1.shape[0])), f, C, m)
+    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lq[None], gp, t)
+    A_, B_, C_ = to_plant(Ar, B2r, C1r, np.zeros((1, p, B1.shape[0])), f, C, m)
     w_ = to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
     # γ moves so that f stays zero
-    scale = -1.0 / (level * 2.0 * gamma_opt)
-    return scale * A_, scale * B_, scale * C_, scale * w_, ok
+    scale = -1.0 / (level[0] * 2.0 * gamma_opt)
+    return scale * A_[0], scale * B_[0], scale * C_[0], scale * w_[0], ok
 
 
-@compiled
 def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
-    """Vectors of dσ = -Re(a(dG K + G dK)b) at ω, and dσ/dω, σ, the relative gap to σ_2."""
-    n, N, p = A.shape[0], Ak.shape[0], C.shape[0]
-    M = (1j * ω) * np.eye(n) - A
-    Mk = (1j * ω) * np.eye(N) - Ak
-    GB = np.linalg.solve(M, B.astype(np.complex128))
-    CG = np.ascontiguousarray(
-        np.linalg.solve(np.ascontiguousarray(M.T), C.T.astype(np.complex128)).T
-    )
-    KB = np.linalg.solve(Mk, Bk.astype(np.complex128))
-    CK = np.ascontiguousarray(
-        np.linalg.solve(np.ascontiguousarray(Mk.T), Ck.T.astype(np.complex128)).T
-    )
-    G = C.astype(np.complex128) @ GB
-    K = Ck.astype(np.complex128) @ KB
+    """Vectors of dσ = -Re(aᵀ(dG K + G dK)b) at ω, and dσ/dω, σ, the relative gap to σ_2.
+
+    A, B, C (k, ...) and ω (k,) are one a loop; vectors are columns, (k, n, 1).
+    """
+    jω = 1j * ω[:, None, None]
+    M, Mk = jω * np.eye(A.shape[-1]) - A, jω * np.eye(len(Ak)) - Ak
+    GB, KB = np.linalg.solve(M, B), np.linalg.solve(Mk, Bk)
+    G, K = C @ GB, Ck @ KB
+    p = C.shape[1]
     S = np.linalg.inv(np.eye(p) + G @ K)
     U, s, Vh = np.linalg.svd(S)
-    u = np.ascontiguousarray(U[:, 0].conj())
-    v = np.ascontiguousarray(Vh[0, :].conj())
-    gap = 1.0 if p == 1 else (s[0] - s[1]) / s[0]
-    a, b = u @ S, S @ v
-    Kb, aG = K @ b, a @ G
-    lG, rG = a @ CG, GB @ Kb
-    lK, rK = aG @ CK, KB @ b
+    gap = np.ones(len(s)) if p == 1 else (s[:, 0] - s[:, 1]) / s[:, 0]
+    a, b = _transposed(S) @ U[:, :, :1].conj(), S @ _transposed(Vh[:, :1]).conj()
+    Kb, aG = K @ b, _transposed(G) @ a
+    lG, rG = np.linalg.solve(_transposed(M), _transposed(C) @ a), GB @ Kb
+    lK, rK = np.linalg.solve(_transposed(Mk), Ck.T @ aG), KB @ b
     # dG/dω = -j C M⁻² B, dK/dω likewise
-    slope = -(-1j * (np.sum(lG * rG) + np.sum(lK * rK))).real
-    return a, Kb, aG, lG, rG, lK, rK, slope, s[0], gap
+    slope = (1j * ((lG * rG).sum((1, 2)) + (lK * rK).sum((1, 2)))).real
+    return a, Kb, aG, lG, rG, lK, rK, slope, s[:, 0], gap
 
 
-@compiled
-def figure_gradients(A, B, C, w, gp, H0, f, backoff, gamma_opt, limited, bound_frequency, points):
-    """Gradients of σ_max(S(jω)) at each ω of `points`, then of γ_opt, to A, B, C and w.
+def loop_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
+    """Gradients (k, n_θ + 8) of σ_max(S(jω)) of each loop, to θ and to w, with what belongs to it.
 
-    Returns A_ (k+1, n, n), B_, C_, w_ (k+1, 8), the slopes dσ/dω (k), σ (k), the relative
-    gaps (σ1 - σ2)/σ1 (k), the same gradients with K held fixed (the paper's, to A, B, C only),
-    and ok. Fixed-K gradients do not depend on w.
+    `gamma_slope` (n_θ + 8) is the gradient of γ_opt. Returns besides, one a loop, the gradient
+    to θ with K held, the slopes dσ/dω, σ, the relative gaps (σ1 - σ2)/σ1; and whether the
+    Hamiltonian splits.
     """
+    A, B, C, dA, dB, dC, w, backoff = design_plant
+    n, m, p, count = A.shape[0], B.shape[1], C.shape[0], dA.shape[0]
     Ag, B1, B2, C1, C2, d1, d2 = gp
-    n, m, p = A.shape[0], B.shape[1], C.shape[0]
-    k = points.size
-    A_, B_, C_ = np.zeros((k + 1, n, n)), np.zeros((k + 1, n, m)), np.zeros((k + 1, p, n))
-    w_ = np.zeros((k + 1, 8))
-    fixed_A, fixed_B, fixed_C = np.zeros((k, n, n)), np.zeros((k, n, m)), np.zeros((k, p, n))
-    slopes, gains, gaps = np.zeros(k), np.zeros(k), np.zeros(k)
-    ga, gb, gc, gw, ok = gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency)
-    A_[k], B_[k], C_[k], w_[k] = ga, gb, gc, gw
     gamma = backoff * gamma_opt
     t = gamma**2 - d1**2
-    T11, U1, U2, _, split = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
-    ok = ok and split
+    T11, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
+    if not ok:
+        none = np.full((len(loops), count + 8), nan)
+        return none, none[:, 8:], none[:, 0], none[:, 0], none[:, 0], False
     inverse = np.linalg.inv(U1)
     X = U2 @ inverse
     X = 0.5 * (X + X.T)
     F = -(B2.T @ X + d2 * C1[p : p + m]) / d2**2
-    Ak = Ag + B2 @ F - B1 @ C2
-    K_states = slice(n + p, n + p + m)  # of W2
-    for i in range(k):
-        a, Kb, aG, lG, rG, lK, rK, slopes[i], gains[i], gaps[i] = _gain_cotangents(
-            A, B, C, Ak, B1, F, points[i]
-        )
-        fixed_A[i] = -np.outer(lG, rG).real
-        fixed_B[i] = -np.outer(lG, Kb).real
-        fixed_C[i] = -np.outer(a, rG).real
-        h = aG + _row(lK, B2)
-        XrK = _column(X, rK)
-        F_ = -np.outer(h, rK).real
-        X_ = -(B2 @ F_) / d2**2
-        X_ = 0.5 * (X_ + X_.T)
-        Lh = lyapunov_triangular(T11, -(inverse @ X_) @ inverse.T, False)
-        Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
-        rate = 1j * points[i] * rK
-        Ar -= np.outer(lK, rK).real
-        Ar_rate -= np.outer(lK, rate).real
-        B2r += (np.outer(XrK, h) / d2**2 - np.outer(lK, _column(F, rK))).real
-        C2r = np.outer(_row(lK, B1), rK).real
-        pa, pb, pc = to_plant(Ar, B2r, C1r, C2r, f, C, m)
-        pw = to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
-        pw += gain_to_weights(h, rK[K_states], XrK[K_states], rate[K_states], f, w)
-        through = 2.0 * gamma * backoff * level
-        A_[i] = fixed_A[i] + pa + through * ga
-        B_[i] = fixed_B[i] + pb + through * gb
-        C_[i] = fixed_C[i] + pc + through * gc
-        w_[i] = pw + through * gw
-    return A_, B_, C_, w_, slopes, gains, gaps, fixed_A, fixed_B, fixed_C, ok
+    plants = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
+    ω = np.array([loop.omega for loop in loops])
+    a, Kb, aG, lG, rG, lK, rK, slopes, gains, gaps = _gain_cotangents(
+        *plants, Ag + B2 @ F - B1 @ C2, B1, F, ω
+    )
+    direct = -_outer(lG, rG), -_outer(lG, Kb), -_outer(a, rG)
+    h = aG + B2.T @ lK
+    XrK = X @ rK
+    X_ = B2 @ _outer(h, rK) / d2**2
+    X_ = 0.5 * (X_ + _transposed(X_))
+    right = -(inverse @ X_) @ inverse.T
+    Lh = np.array([lyapunov_triangular(T11, part, False) for part in right])
+    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
+    rate = 1j * ω[:, None, None] * rK
+    Ar -= _outer(lK, rK)
+    Ar_rate -= _outer(lK, rate)
+    B2r += _outer(XrK, h) / d2**2 - _outer(lK, F @ rK)
+    C2r = _outer(B1.T @ lK, rK)
+    through = to_plant(Ar, B2r, C1r, C2r, f, C, m)
+    held = _contract(direct, [(loop.dA, loop.dB, loop.dC) for loop in loops])
+    out = (2.0 * gamma * backoff * level)[:, None] * gamma_slope
+    out[:, :count] += held + _contract(through, [(dA, dB, dC)])
+    out[:, count:] += to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
+    of_W2 = slice(n + p, n + p + m)  # its states
+    out[:, count:] += gain_to_weights(h, rK[:, of_W2], XrK[:, of_W2], rate[:, of_W2], f, w)
+    return out, held, slopes, gains, gaps, True
+
+
+def _outer(x, y):
+    """Re x yᵀ of columns."""
+    return (x * _transposed(y)).real
+
+
+def _contract(cotangents, changes):
+    """Σ_ij cotangent[k, i, j] change[θ, i, j] over A, B and C, (k, θ); changes one a k, or one."""
+    rows = np.concatenate([part.reshape(len(part), -1) for part in cotangents], axis=1)
+    flat = [
+        np.concatenate([d.reshape(len(d), c[0].size) for c, d in zip(cotangents, of, strict=True)],
+                       axis=1)
+        for of in changes
+    ]  # fmt: skip
+    if len(flat) == 1:
+        return rows @ flat[0].T
+    return np.array([change @ row for row, change in zip(rows, flat, strict=True)])
+
+
+def figure_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
+    """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
+
+    The first (4, n_θ + 8), to θ and to the weights; `loops` are where ω_b, the peak and ω_low
+    are taken. The fixed-K gradient (n_θ) is the paper's. With them whether the Hamiltonian
+    splits; everything is NaN where it does not.
+    """
+    found, held, slopes, gains, gaps, ok = loop_gradients(
+        design_plant, gp, H0, f, gamma_opt, gamma_slope, loops
+    )
+    # ω_b by the implicit function theorem; the peak's own frequency drops out (envelope)
+    scale = np.array([-slopes[0], gains[1], gains[2]])
+    out = np.vstack([found / scale[:, None], gamma_slope if ok else np.full_like(gamma_slope, nan)])
+    return out, -held[0] / slopes[0], gaps, ok
 
 
 def design_with_gradients(
@@ -178,37 +219,51 @@ def design_with_gradients(
     """
     row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels)
     count = dA.shape[0]
-    out, fixed, gaps = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
+    none = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
     if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
-        return row, Ak, Bk, Ck, out, fixed, gaps
+        return row, Ak, Bk, Ck, *none
+    limited = bool(row[Figure.LIMITED_BY_BOUND] > 0.5)
+    points = row[Figure.BANDWIDTH], row[Figure.PEAK_FREQUENCY], omega_low
+    plant = DesignPlant(A, B, C, dA, dB, dC, w, backoff)
+    loops = [Loop(A, B, C, dA, dB, dC, float(point)) for point in points]
+    with np.errstate(all="ignore"):  # an undefined number is seen in the result
+        at = 0.0
+        if limited:
+            at = bound_peak(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1])
+        gamma_opt, found = float(row[Figure.GAMMA_OPT]), none
+        parts = _parts(A, B, C, w)
+        *slopes, w_, ok = gamma_gradient(A, B, C, w, *parts, gamma_opt, limited, at)
+        if ok:
+            to_theta = _contract([part[None] for part in slopes], [(dA, dB, dC)])[0]
+            gamma_slope = np.concatenate([to_theta, w_])
+            *found, ok = figure_gradients(plant, *parts, gamma_opt, gamma_slope, loops)
+    if not ok and channels:  # rounding put the blocks' γ_opt below the whole plant's: from that
+        return design_with_gradients(A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC)
+    return row, Ak, Bk, Ck, *(found if ok else none)
+
+
+def off_design_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
+                         loops: Sequence[Loop]) -> tuple[Array, Array, Array]:  # fmt: skip
+    """What `figure_gradients` gives but the last, with loops closed on other plants.
+
+    `row` is the synthesis on the design plant, `gamma_slope` the gradient of its γ_opt. NaN
+    where there are no three loops, or the synthesis has no gradients.
+    """
+    count = design_plant.dA.shape[0]
+    none = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
+    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or len(loops) != 3:
+        return none
+    with np.errstate(all="ignore"):
+        gp, H0, f = _parts(design_plant.A, design_plant.B, design_plant.C, design_plant.w)
+        gamma_opt = float(row[Figure.GAMMA_OPT])
+        out, fixed, gaps, ok = figure_gradients(
+            design_plant, gp, H0, f, gamma_opt, gamma_slope, loops
+        )
+    return (out, fixed, gaps) if ok else none
+
+
+def _parts(A, B, C, w):
+    """The generalized plant, its Hamiltonian at γ = ∞ and the weights' state space."""
     gp = generalized_plant(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    limited = bool(row[Figure.LIMITED_BY_BOUND] > 0.5)
-    at = 0.0
-    if limited:
-        at = bound_peak(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1])
-    points = np.array([row[Figure.BANDWIDTH], row[Figure.PEAK_FREQUENCY], omega_low])
-    A_, B_, C_, w_, slopes, gains, gaps, fA, fB, fC, ok = figure_gradients(
-        A, B, C, w, gp, H0, first_order_weights(w), backoff, row[Figure.GAMMA_OPT], limited, at,
-        points,
-    )  # fmt: skip
-    if not ok:
-        if channels:  # rounding put the blocks' γ_opt below the whole plant's: begin from that
-            return design_with_gradients(
-                A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC
-            )
-        return row, Ak, Bk, Ck, out, fixed, gaps
-    out[:, :count] = _contract(A_, dA) + _contract(B_, dB) + _contract(C_, dC)
-    out[:, count:] = w_
-    held = _contract(fA[:1], dA) + _contract(fB[:1], dB) + _contract(fC[:1], dC)
-    # ω_b by the implicit function theorem; the peak's own frequency drops out (envelope)
-    fixed[:] = -held[0] / slopes[0]
-    out[0] /= -slopes[0]
-    out[1] /= gains[1]
-    out[2] /= gains[2]
-    return row, Ak, Bk, Ck, out, fixed, gaps
-
-
-def _contract(cotangent, change):
-    """Σ_ij cotangent[k, i, j] change[θ, i, j], an array (k, θ)."""
-    return cotangent.reshape(len(cotangent), -1) @ change.reshape(len(change), -1).T
+    return gp, H0, first_order_weights(w)

@@ -2,106 +2,105 @@
 
 import numpy as np
 
-from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.generalized_plant import weight_magnitudes
+from ccd_casadi.kernels.generalized_plant import squared_weights
 
 
-@compiled
 def to_plant(A_, B2_, C1_, C2_, f, C, m):
-    """Pull gradients of the generalized plant back to A, B and C."""
+    """Pull gradients of the generalized plant back to A, B and C; axes in front stay."""
     p, n = C.shape
     i1, i2, i3 = n, n + p, n + p + m
-    C_ = -C2_[:, :n].copy()
-    C_ -= f[0, 3] * C1_[:p, :n]
-    C_ += f[2, 3] * C1_[p + m :, :n]
-    C_ -= f[0, 1] * A_[i1:i2, :n]
-    C_ += f[2, 1] * A_[i3:, :n]
-    return A_[:n, :n].copy(), B2_[:n, :].copy(), C_
+    C_ = (
+        f[2, 3] * C1_[..., p + m :, :n] - f[0, 3] * C1_[..., :p, :n]
+        + f[2, 1] * A_[..., i3:, :n] - f[0, 1] * A_[..., i1:i2, :n] - C2_[..., :n]
+    )  # fmt: skip
+    return A_[..., :n, :n], B2_[..., :n, :], C_
 
 
-@compiled
-def _trace(M, row, column, count):
-    """The trace of a block of M."""
-    total = 0.0
-    for i in range(count):
-        total += M[row + i, column + i]
-    return total
+def _traces(M, first, n, p, m):
+    """Traces of the blocks of W1, W2 and W3, which begin at (first, n), along the last axis."""
+    diagonal = M[..., first:, n:].diagonal(0, -2, -1)
+    return np.add.reduceat(diagonal, (0, p, p + m), axis=-1).T
 
 
-@compiled
 def to_weights(A_, A_rate, C1_, C1_rate, f, w, n, p, m):
     """Pull gradients p xᵀ, p ẋᵀ, z xᵀ, z ẋᵀ of costate and output back to the weight vector.
 
-    In ẋ = -a x + b v, z = c x + d v a filter with W(0) = 1 and W(∞) = d = 10⁴ has gradients to
-    a, b, c and d of up to 10⁸ times their sum, which rounding then leaves nothing of. In units of
-    x where b = a the same is ẋ = a (v - x), z = W(0) x + W(∞)(v - x), and v - x is ẋ/a, which
-    the stable subspace gives without a difference.
+    Each (k, ...), the result (k, 8). In ẋ = -a x + b v, z = c x + d v a filter with W(0) = 1 and
+    W(∞) = d = 10⁴ has gradients to a, b, c and d of up to 10⁸ times their sum, which rounding then
+    leaves nothing of. In units of x where b = a the same is ẋ = a (v - x),
+    z = W(0) x + W(∞)(v - x), and v - x is ẋ/a, which the stable subspace gives without a
+    difference.
     """
-    i1, i2, i3 = n, n + p, n + p + m
-    rate_S, rate_K = _trace(A_rate, i1, i1, p), _trace(A_rate, i2, i2, m)
-    rate_T = _trace(A_rate, i3, i3, p)
-    direct_S = f[0, 3] / f[0, 1] * _trace(C1_rate, 0, i1, p)
-    direct_K = f[1, 3] / f[1, 1] * _trace(C1_rate, p, i2, m)
-    direct_T = f[2, 3] / f[2, 1] * _trace(C1_rate, p + m, i3, p)
+    rate_S, rate_K, rate_T = _traces(A_rate, n, n, p, m)
+    direct_S, direct_K, direct_T = f[:, 3:] / f[:, 1:2] * _traces(C1_rate, 0, n, p, m)
+    static_S, _, static_T = _traces(C1_, 0, n, p, m)
     # A_S moves the pole and W1(0) at once, and far above the pole these two would cancel
-    leak = -f[0, 0] * (_trace(A_, i1, i1, p) + f[0, 3] / f[0, 1] * _trace(C1_, 0, i1, p))
-    static_T = f[2, 0] / (w[5] * f[2, 1]) * _trace(C1_, p + m, i3, p)
+    leak = -f[0, 0] * (_traces(A_, n, n, p, m)[0] + f[0, 3] / f[0, 1] * static_S)
+    static_T = f[2, 0] / (w[5] * f[2, 1]) * static_T
     logarithmic = np.array(
         [
             -direct_S, leak, rate_S, rate_K + direct_K,
             rate_K, -static_T, -rate_T - direct_T, rate_T,
         ]
     )  # fmt: skip
-    return logarithmic / w
+    return logarithmic.T / w
 
 
-@compiled
 def gain_to_weights(h, x, costate, rate, f, w):
-    """Gradient of -Re(h dF x) to the weight vector through d2² F = -B2ᵀX - D12ᵀC1, X held.
+    """Gradient (k, 8) of -Re(hᵀ dF x) to the weights through d2² F = -B2ᵀX - D12ᵀC1, X held.
 
-    h is a row, x the states of W2, `costate` their entries of X times the whole state, `rate`
-    ẋ. As in `to_weights`, c x + d F stands as W(0) x + W(∞) ẋ/a.
+    Columns (k, m, 1): x the states of W2, `costate` their entries of X times the whole state,
+    `rate` ẋ. As in `to_weights`, c x + d F stands as W(0) x + W(∞) ẋ/a.
     """
     a, b, d = f[1, 0], f[1, 1], f[1, 3]
-    through_pole = np.sum(h * costate).real * b / d**2
-    through_direct = np.sum(h * (2.0 * rate + a / d * x)).real / b
-    w_ = np.zeros(8)
-    w_[3] = (through_pole + through_direct) / w[3]
-    w_[4] = through_pole / w[4]
+    through_pole = (h * costate).sum((1, 2)).real * b / d**2
+    through_direct = (h * (2.0 * rate + a / d * x)).sum((1, 2)).real / b
+    w_ = np.zeros((len(h), 8))
+    w_[:, 3] = (through_pole + through_direct) / w[3]
+    w_[:, 4] = through_pole / w[4]
     return w_
 
 
-@compiled
+def squared_weight_slopes(w, ω):
+    """d|W|²/dw_k (8,): each entry of w belongs to one of W1, W2 and W3.
+
+    Differences of nearly equal numbers are multiplied out: 1 - A_S²|W1|² and the like are ω²
+    times something that does not cancel.
+    """
+    M_S, A_S, ω_S, c_K, ω_K, A_l, A_u, ω_T = w
+    W1, W2, W3 = squared_weights(w, ω)
+    b1, b2, b3 = ω**2 + (ω_S * A_S) ** 2, ω**2 + (c_K * ω_K) ** 2, (A_u * ω) ** 2 + ω_T**2
+    return np.array(
+        [
+            -2.0 * ω**2 / (M_S**3 * b1),
+            -2.0 * W1 * ω_S**2 * A_S / b1,
+            2.0 * ω_S * (1.0 - (A_S / M_S) ** 2) * (ω / b1) ** 2,
+            2.0 * W2 * ω**2 / (c_K * b2),
+            2.0 * c_K**2 * (1.0 - c_K**2) * ω_K * (ω / b2) ** 2,
+            -2.0 * ω_T**2 / (A_l**3 * b3),
+            -2.0 * W3 * A_u * ω**2 / b3,
+            2.0 * ω_T * ((A_u / A_l) ** 2 - 1.0) * (ω / b3) ** 2,
+        ]
+    )
+
+
 def bound_gradient(A, B, C, w, ω):
     """Gradient of γ_jω at its maximising ω (envelope of the closed form)."""
     n, p = A.shape[0], C.shape[0]
-    M = (1j * ω) * np.eye(n) - A
-    right = np.linalg.solve(M, B.astype(np.complex128))
-    left = np.linalg.solve(np.ascontiguousarray(M.T), C.T.astype(np.complex128)).T
-    U, s, Vh = np.linalg.svd(C.astype(np.complex128) @ right)
-    u = np.ascontiguousarray(U[:, p - 1].conj())
-    v = np.ascontiguousarray(Vh[p - 1, :].conj())
-    σ = s[p - 1]
-    W1, W2, W3 = weight_magnitudes(w, ω)
-    R = (W2 / σ) ** 2 + W3**2
-    total = W1**2 + R
-    gamma = np.sqrt(W1**2 * R / total)
+    M = 1j * ω * np.eye(n) - A
+    right, left = np.linalg.solve(M, B), np.linalg.solve(M.T, C.T).T
+    U, s, Vh = np.linalg.svd(C @ right)
+    u, v, σ = U[:, p - 1].conj(), Vh[p - 1].conj(), s[p - 1]
+    W1, W2, W3 = squared_weights(w, ω)
+    R = W2 / σ**2 + W3
+    total = W1 + R
+    gamma = np.sqrt(W1 * R / total)
     to_W1 = (R / total) ** 2 / (2.0 * gamma)  # dγ/d|W1|²
-    to_R = (W1**2 / total) ** 2 / (2.0 * gamma)
-    factor = to_R * (-2.0 * W2**2 / σ**3)
+    to_R = (W1 / total) ** 2 / (2.0 * gamma)
+    factor = to_R * (-2.0 * W2 / σ**3)
     ul, rv = u @ left, right @ v
     A_ = factor * np.outer(ul, rv).real
     B_ = factor * np.outer(ul, v).real
     C_ = factor * np.outer(u, rv).real
-    w_ = np.empty(8)
-    for k in range(8):
-        h = 1e-6 * w[k]
-        up, down = w.copy(), w.copy()
-        up[k] += h
-        down[k] -= h
-        a, b = weight_magnitudes(up, ω), weight_magnitudes(down, ω)
-        w_[k] = (
-            to_W1 * (a[0] ** 2 - b[0] ** 2)
-            + to_R * ((a[1] ** 2 - b[1] ** 2) / σ**2 + a[2] ** 2 - b[2] ** 2)
-        ) / (2.0 * h)
-    return A_, B_, C_, w_
+    to_squares = np.repeat([to_W1, to_R / σ**2, to_R], [3, 2, 3])
+    return A_, B_, C_, to_squares * squared_weight_slopes(w, ω)

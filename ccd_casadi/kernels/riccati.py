@@ -11,6 +11,15 @@ semidefinite (γ > γ_X). f is concave and increasing in t.
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import (
+    add,
+    frobenius,
+    place,
+    place_transposed,
+    scaled,
+    symmetric_part,
+    transposed,
+)
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 
@@ -21,14 +30,16 @@ NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level
 def lqr_hamiltonian(A, B2, C1, d2, p, m):
     """H0 = [[Ã, -B2 B2ᵀ/d2²], [-Q̃, -Ãᵀ]], the Hamiltonian at γ = ∞ (2N x 2N)."""
     N = A.shape[0]
-    S2 = d2 * C1[p : p + m]
-    B2t, S2t = np.ascontiguousarray(B2.T), np.ascontiguousarray(S2.T)
-    At = A - B2 @ S2 / d2**2
+    S2 = np.empty((m, N))
+    place(S2, 0, 0, d2, C1[p : p + m])
+    BS, BB, SS, CC = B2 @ S2, B2 @ transposed(B2), transposed(S2) @ S2, transposed(C1) @ C1
     H = np.empty((2 * N, 2 * N))
-    H[:N, :N] = At
-    H[N:, N:] = -At.T
-    H[:N, N:] = -(B2 @ B2t) / d2**2
-    H[N:, :N] = S2t @ S2 / d2**2 - np.ascontiguousarray(C1.T) @ C1
+    for i in range(N):
+        for j in range(N):
+            H[i, j] = A[i, j] - BS[i, j] / d2**2
+            H[N + j, N + i] = -H[i, j]
+            H[i, N + j] = -BB[i, j] / d2**2
+            H[N + i, j] = SS[i, j] / d2**2 - CC[i, j]
     return H
 
 
@@ -55,7 +66,7 @@ def level_hamiltonian(H0, B1, C1, d1, t):
 def projected(U1, U2):
     """Singular vectors P, Q and values c of U1, and s_i = p_iᵀ U2 q_i: λ(X) = s/c at a root."""
     P, c, Qt = np.linalg.svd(U1)
-    Q = np.ascontiguousarray(Qt.T)
+    Q = transposed(Qt)
     M = U2 @ Q
     s = np.zeros(c.size)
     for i in range(c.size):
@@ -86,8 +97,9 @@ def riccati_level(H0, B1, C1, d1, t, noise):
         if abs(s[i]) > noise and c[i] / s[i] < f:
             f, s_best, index = c[i] / s[i], s[i], i
     q, left = Q[:, index].copy(), P[:, index].copy()
-    V = d1 * (C1[:p] @ U1) + np.ascontiguousarray(B1.T) @ U2
-    Z = lyapunov_triangular(T11, -(V.T @ V), True)
+    V = transposed(B1) @ U2
+    add(V, 0, 0, d1, C1[:p] @ U1)
+    Z = lyapunov_triangular(T11, scaled(-1.0, transposed(V) @ V), True)
     slope = np.dot(q, Z @ q) / (s_best * t) ** 2
     return f, slope, True, (H, T11, U1, U2, V, Z, q, left, c[index])
 
@@ -99,13 +111,14 @@ def _singularity(U1, U2, Z, q, p):
     NaN where it is singular in a second direction too, or not finite.
     """
     N = U1.shape[0]
-    M, right = np.zeros((N + 1, N + 1)), np.zeros(N + 1)
-    M[:N, :N] = U1 - U2 @ Z
+    M, right = np.zeros((N + 1, N + 1)), np.zeros((N + 1, 1))
+    place(M, 0, 0, 1.0, U1)
+    add(M, 0, 0, -1.0, U2 @ Z)
     for i in range(N):
         M[i, N], M[N, i] = p[i], q[i]
-    right[N] = 1.0
+    right[N, 0] = 1.0
     try:
-        return np.linalg.solve(M, right)[N]
+        return np.linalg.solve(M, right)[N, 0]
     except Exception:  # numba names no others
         return np.nan
 
@@ -124,24 +137,36 @@ def root_nearby(B1, C1, d1, frame, δ):
     """
     H, T11, U1, U2, V, Z1, q, p, c = frame
     N, outputs = B1.shape
-    W = np.ascontiguousarray(B1.T) @ U1 - d1 * (C1[:outputs] @ U2)
-    G = np.ascontiguousarray(U1.T) @ (H[:N, N:].copy() @ U1 - H[:N, :N].copy() @ U2)
-    G += np.ascontiguousarray(U2.T) @ (H[N:, N:].copy() @ U1 - H[N:, :N].copy() @ U2)
-    VW = np.ascontiguousarray(V.T) @ W
+    W = transposed(B1) @ U1
+    add(W, 0, 0, -d1, C1[:outputs] @ U2)
+    # G = [U1; U2]ᵀ H [-U2; U1]
+    left, right = np.empty((N, 2 * N)), np.empty((2 * N, N))
+    place_transposed(left, 0, 0, 1.0, U1)
+    place_transposed(left, 0, N, 1.0, U2)
+    place(right, 0, 0, -1.0, U2)
+    place(right, N, 0, 1.0, U1)
+    G, VW = left @ (H @ right), transposed(V) @ W
     WZ, GZ = W @ Z1, G @ Z1
-    M = VW @ Z1 + 0.5 * (Z1 @ GZ)
-    Z2 = lyapunov_triangular(T11, -(M + M.T), True)
-    M = VW @ Z2 + 0.5 * (WZ.T @ WZ) + Z2 @ GZ
-    Z3 = lyapunov_triangular(T11, -(M + M.T), True)
+    M = VW @ Z1
+    add(M, 0, 0, 0.5, Z1 @ GZ)
+    Z2 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
+    M = VW @ Z2
+    add(M, 0, 0, 0.5, transposed(WZ) @ WZ)
+    add(M, 0, 0, 1.0, Z2 @ GZ)
+    Z3 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
     δ0, g0 = 0.0, -c
     for _ in range(8):
-        g = _singularity(U1, U2, δ * (Z1 + δ * (Z2 + δ * Z3)), q, p)
+        Z = np.zeros((N, N))
+        add(Z, 0, 0, δ, Z1)
+        add(Z, 0, 0, δ**2, Z2)
+        add(Z, 0, 0, δ**3, Z3)
+        g = _singularity(U1, U2, Z, q, p)
         if g == g0 or δ == δ0:
             break
         δ0, g0, δ = δ, g, δ - g * (δ - δ0) / (g - g0)
         if abs(δ - δ0) <= 1e-8 * abs(δ):  # the step after it would be 1e-8 times as small
             break
-    n1, n2, n3 = np.linalg.norm(Z1), np.linalg.norm(Z2), np.linalg.norm(Z3)
+    n1, n2, n3 = frobenius(Z1), frobenius(Z2), frobenius(Z3)
     first = abs(np.dot(q, Z1 @ q))
     ratio = abs(δ) * max(n3 / n2, n2 / n1)
     return δ, abs(δ) ** 3 * n3 / first * ratio if ratio < 0.5 else np.inf

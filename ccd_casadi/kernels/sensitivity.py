@@ -8,11 +8,12 @@ Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
 
 import numpy as np
 
+from ccd_casadi.kernels.blocks import add, ascending, place, place_transposed, transposed
 from ccd_casadi.kernels.closed_loop import loop_matrices as loop_matrices
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
-from ccd_casadi.kernels.small import add_gram, invert, largest_eigenvalue, multiply
+from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 
@@ -25,17 +26,24 @@ def axis_frequencies(A, B, C, D, level):
     one a wrong answer.
     """
     n, m = B.shape
-    Dt = np.ascontiguousarray(D.T)
-    R = level**2 * np.eye(m) - Dt @ D
-    Ri = 1.0 / R if m == 1 else np.ascontiguousarray(np.linalg.inv(R))
-    BR, DC = B @ Ri, Dt @ C
-    RDC = Ri @ DC
-    F = A + B @ RDC
-    H = np.empty((2 * n, 2 * n))
-    H[:n, :n] = F
-    H[:n, n:] = BR @ B.T
-    H[n:, :n] = -(C.T @ C) - DC.T @ RDC
-    H[n:, n:] = -F.T
+    Dt = transposed(D)
+    R = np.zeros((m, m))
+    for i in range(m):
+        R[i, i] = level**2
+    add(R, 0, 0, -1.0, Dt @ D)
+    DC = Dt @ C
+    if m == 1:
+        R[0, 0] = 1.0 / R[0, 0]
+    else:
+        R = np.ascontiguousarray(np.linalg.inv(R))
+    RDC = R @ DC
+    F, H = A.copy(), np.empty((2 * n, 2 * n))
+    add(F, 0, 0, 1.0, B @ RDC)
+    place(H, 0, 0, 1.0, F)
+    place(H, 0, n, 1.0, (B @ R) @ transposed(B))
+    place(H, n, 0, -1.0, transposed(C) @ C)
+    add(H, n, 0, -1.0, transposed(DC) @ RDC)
+    place_transposed(H, n, n, -1.0, F)
     wr, wi, info = eigenvalues(H)
     found = np.empty(2 * n)
     count = 0
@@ -43,7 +51,7 @@ def axis_frequencies(A, B, C, D, level):
         if wi[i] > 0.0 and abs(wr[i]) <= 1e-3 * np.hypot(wr[i], wi[i]):
             found[count] = wi[i]
             count += 1
-    return np.sort(found[:count]), info
+    return ascending(found, count), info
 
 
 @compiled
@@ -55,8 +63,7 @@ def _gain(g, k, Dk):
         for i in range(k.shape[0]):
             T += g[0, i] * (k[i, 0] + Dk[i, 0])
         return 1.0 / abs(T)
-    k = k + Dk
-    L = multiply(g, k)
+    L = multiply(g, add_real(k, Dk))
     for i in range(p):
         L[i, i] += 1.0
     Z = np.zeros((p, p), np.complex128)
@@ -85,20 +92,29 @@ def sensitivity_slope(G, K, Dk, ω):
     """σ_max(S(jω)) and dσ_max/dω = Re(u* (dS/dω) v), dS/dω = -S (G'K + GK') S."""
     g, dg = response_and_slope(G, ω)
     k, dk = response_and_slope(K, ω)
-    k = k + Dk
-    dL = dg @ k + g @ dk
-    L = g @ k
-    if L.shape[0] == 1:
+    k = add_real(k, Dk)
+    L, dgk, gdk = multiply(g, k), multiply(dg, k), multiply(g, dk)
+    p = L.shape[0]
+    if p == 1:
         S = 1.0 / (1.0 + L[0, 0])
-        gain = abs(S)
-        return gain, (-(S * S) * dL[0, 0] * np.conj(S)).real / gain
-    for i in range(L.shape[0]):
+        gain, dL = abs(S), dgk[0, 0] + gdk[0, 0]
+        return gain, (-(S * S) * dL * np.conj(S)).real / gain
+    for i in range(p):
         L[i, i] += 1.0
-    S = np.linalg.inv(L)
+    S = invert(L)
     U, s, Vh = np.linalg.svd(S)
-    u = np.ascontiguousarray(U[:, 0])
-    v = np.ascontiguousarray(Vh[0, :].conj())
-    return s[0], -np.vdot(u, S @ (dL @ (S @ v))).real
+    Sv = np.zeros((p, 1), np.complex128)
+    for i in range(p):
+        for j in range(p):
+            Sv[i, 0] += S[i, j] * np.conj(Vh[0, j])
+    a, b = multiply(dgk, Sv), multiply(gdk, Sv)
+    for i in range(p):
+        a[i, 0] += b[i, 0]
+    a = multiply(S, a)
+    slope = 0.0
+    for i in range(p):
+        slope -= (np.conj(U[i, 0]) * a[i, 0]).real
+    return s[0], slope
 
 
 @compiled

@@ -19,6 +19,16 @@ def multiply(A, B):
 
 
 @compiled
+def add_real(Z, D):
+    """Z + D of a complex and a real matrix."""
+    out = Z.copy()
+    for i in range(Z.shape[0]):
+        for j in range(Z.shape[1]):
+            out[i, j] += D[i, j]
+    return out
+
+
+@compiled
 def add_gram(Z, A, factor):
     """Z ← Z + factor AᴴA."""
     rows, n = A.shape
@@ -42,7 +52,10 @@ def invert(A):
             if abs(M[i, k]) > abs(M[best, k]):
                 best = i
         if M[best, k] == 0.0:
-            return np.full((n, n), np.inf + 0.0j)
+            for i in range(n):
+                for j in range(n):
+                    X[i, j] = np.inf
+            return X
         if best != k:
             for j in range(n):
                 M[k, j], M[best, j] = M[best, j], M[k, j]

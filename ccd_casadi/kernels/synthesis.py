@@ -3,6 +3,7 @@
 import numpy as np
 
 from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
+from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
@@ -13,6 +14,7 @@ from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian
 
 _COUNT = int(Figure.COUNT)
 GAMMA_TOLERANCE = 1e-11
+ENOUGH = 1e-8  # relative error of γ_opt above which it is looked for in balanced coordinates too
 
 
 @compiled
@@ -24,13 +26,47 @@ def central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, gamma):
     N = Ag.shape[0]
     if not ok:
         return np.zeros((N, N)), B1, np.zeros((m, N)), False
-    X = np.linalg.solve(np.ascontiguousarray(U1.T), np.ascontiguousarray(U2.T))
-    X = 0.5 * (X + X.T)
-    F = -(np.ascontiguousarray(B2.T) @ X + d2 * C1[p : p + m]) / d2**2
-    return Ag + B2 @ F - B1 @ C2, B1, F, True
+    X = symmetric_part(np.linalg.solve(transposed(U1), transposed(U2)), 0.5)
+    F, Ak = transposed(B2) @ X, Ag.copy()
+    for i in range(m):
+        for j in range(N):
+            F[i, j] = -(F[i, j] + d2 * C1[p + i, j]) / d2**2
+    add(Ak, 0, 0, 1.0, B2 @ F)
+    add(Ak, 0, 0, -1.0, B1 @ C2)
+    return Ak, B1, F, True
 
 
 @compiled
+def _search_and_control(gp, H0, bound, backoff, guess, noise):
+    """γ_opt, never below `bound`, and the central controller at backoff·γ_opt: the row, K."""
+    row = np.full(_COUNT, np.nan)
+    Ag, B1, B2, C1, C2, d1, d2 = gp
+    gamma_opt, limited, forms, converged, error = optimal_gamma(
+        H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE, noise
+    )
+    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, bound
+    row[Figure.LIMITED_BY_BOUND], row[Figure.SCHUR_FORMS] = limited, forms
+    row[Figure.GAMMA_ERROR] = error
+    Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, backoff * gamma_opt)
+    row[Figure.CODE] = Code.CERTIFIED.value
+    if not ok:
+        row[Figure.CODE] = Code.RICCATI_FAILED.value
+    if not converged:
+        row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
+    return row, Ak, Bk, Ck
+
+
+@compiled
+def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
+    gp = generalized_plant(A, B, C, w)
+    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
+    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    return _search_and_control(gp, H0, bound, backoff, guess, NOISE)
+
+
+# What follows is plain NumPy: few designs come to it.
+
+
 def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
     """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
 
@@ -38,31 +74,48 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
     in balanced coordinates, with the noise of rounding measured; the controller is in the
     plant's own ones always.
     """
-    row = np.full(_COUNT, np.nan)
+    if balanced:
+        gp, H0, bound, τ = _balanced(A, B, C, w, grid, sigma)
+        with np.errstate(all="ignore"):  # an undefined number is seen in the result
+            noise, back = rounding_noise(H0), τ.reshape(-1, 1)
+            row, Ak, Bk, Ck = _search_and_control(gp, H0, bound, backoff, guess, noise)
+            return row, Ak * (back / τ), Bk * back, Ck / τ
+    found = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+    row = found[0]
+    closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
+    if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
+        return _with_a_better_optimum(found, A, B, C, w, grid, sigma, backoff)
+    return found
+
+
+def _balanced(A, B, C, w, grid, sigma):
+    """The generalized plant and H0 in balanced coordinates, the bound γ_jω, and τ."""
+    p, m = C.shape[0], B.shape[1]
     gp = generalized_plant(A, B, C, w)
-    m, p, N = B.shape[1], C.shape[0], gp[0].shape[0]
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
     bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
-    τ, noise = np.ones(N), NOISE
-    if balanced:
-        t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
+    t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
+    with np.errstate(all="ignore"):
         τ = balancing(level_hamiltonian(H0, gp[1], gp[3], gp[5], t))
         gp = in_coordinates(gp, τ)
-        H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
-        noise = rounding_noise(H0)
-    Ag, B1, B2, C1, C2, d1, d2 = gp
-    gamma_opt, limited, forms, converged = optimal_gamma(
-        H0, B1, C1, d1, bound, guess, GAMMA_TOLERANCE, noise
+    return gp, lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m), bound, τ
+
+
+def _with_a_better_optimum(found, A, B, C, w, grid, sigma, backoff):
+    """γ_opt in balanced coordinates, where it agrees with what was found, and K in the plant's."""
+    row, *_ = found
+    other, H0, bound, _ = _balanced(A, B, C, w, grid, sigma)
+    gamma_opt, error = float(row[Figure.GAMMA_OPT]), float(row[Figure.GAMMA_ERROR])
+    again, at_bound, more, closed, left = optimal_gamma(
+        H0, other[1], other[3], other[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE
     )
-    row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, bound
-    row[Figure.LIMITED_BY_BOUND], row[Figure.SCHUR_FORMS] = limited, forms
-    Ak, Bk, Ck, ok = central_controller(Ag, B1, B2, C1, C2, d1, d2, H0, backoff * gamma_opt)
-    row[Figure.CODE] = Code.CERTIFIED.value
-    if not ok:
-        row[Figure.CODE] = Code.RICCATI_FAILED.value
-    if not converged:
-        row[Figure.CODE] = Code.GAMMA_NOT_CONVERGED.value
-    if balanced:
-        back = τ.reshape(-1, 1)
-        return row, Ak * (back / τ), Bk * back, Ck / τ
+    row[Figure.SCHUR_FORMS] += more
+    # only what both agree on within their errors is the same optimum
+    if not (closed and not at_bound and left < error and abs(again - gamma_opt) <= error * again):
+        return found
+    row[Figure.GAMMA_OPT], row[Figure.GAMMA_ERROR] = again, left
+    gp = generalized_plant(A, B, C, w)
+    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
+    Ak, Bk, Ck, ok = central_controller(*gp, H0, backoff * again)
+    row[Figure.CODE] = float(Code.CERTIFIED if ok else Code.RICCATI_FAILED)
     return row, Ak, Bk, Ck

@@ -16,8 +16,10 @@ import numpy as np
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.process_pool import Pool
 
 ModelFunction = Callable[..., Mapping[str, Any]]
+Evaluate = Callable[[Sequence[float]], "Mechanics"]
 
 _REQUIRED = ("mass", "stiffness", "input", "output", "hardware_cost")
 # Matrices are dense and a synthesis takes time in the cube of this: more is a mistake, not a stage.
@@ -49,11 +51,13 @@ class Plant:
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same
-    plant modelled more closely, by name: a design is certified on them again, not optimised.
-    `values` is `evaluate` without derivatives where that is cheaper, `notes` what a reader of a
-    result at θ must know of the plant, `domain` the bounds of θ beyond which it is not known.
-    `doubt` says what is wrong with the derivatives at θ, empty where nothing is.
-    Without `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
+    plant modelled more closely, by name, without derivatives: a design is certified on them again,
+    not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
+    reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
+    known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
+    to be checked by the true one. `doubt` says what is wrong with the derivatives at θ, empty where
+    nothing is. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
+    for.
     """
 
     names: tuple[str, ...]
@@ -66,6 +70,7 @@ class Plant:
     exact_hessian: bool = True
     values: Callable[[Sequence[float]], Mechanics] | None = None
     notes: Callable[[Sequence[float]], tuple[str, ...]] = lambda theta: ()
+    nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
 
@@ -74,6 +79,11 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     """Trace `model` once with CasADi symbols and check what it returns.
 
     Raises PlantError with a remedy where a key is missing or unknown, or a shape is wrong.
+
+    >>> from ccd_casadi.plants.two_mass import two_mass
+    >>> plant = build_plant(two_mass, ["m1", "m2"], {"zeta": 0.01})
+    >>> mechanics(plant, (60.0, 50.0)).M.diagonal().tolist(), hardware_cost(plant, (60.0, 50.0))
+    ([60.0, 50.0], 110.0)
     """
     theta = ca.SX.sym("theta", len(names))
     try:

@@ -195,7 +195,7 @@ def _scaled_channels(
 def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
     """The frequency grid, and the least singular value of the plant on it."""
     grid = _frequency_grid(A, B, C)
-    return grid, np.array([plant_gain(A, B, C, omega) for omega in grid])
+    return grid, plant_gain(A, B, C, grid)
 
 
 def _frequency_grid(A: Array, B: Array, C: Array) -> Array:

@@ -1,6 +1,5 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +39,7 @@ from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop
+from surrogates.files import write_whole
 
 
 def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Path:
@@ -89,10 +89,8 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         found["sentences"][0],
     )
     path = folder / "report.html"
-    temporary = folder / "report.html.part"
     text = with_turntables(page(f"Comparison: {comparison.case.path.name}", sections, head))
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, text)
     return path
 
 

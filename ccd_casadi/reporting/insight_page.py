@@ -1,6 +1,5 @@
 """insight.html: the trade-off around a design, and what it answers to."""
 
-import os
 from pathlib import Path
 
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -28,14 +27,13 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
+from surrogates.files import write_whole
 
 
 def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostOptimal) -> Path:
     """Write insight.html, atomically."""
     path = folder / "insight.html"
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(insight_html(run, front, responses), encoding="utf-8")
-    os.replace(draft, path)
+    write_whole(path, insight_html(run, front, responses))
     return path
 
 

@@ -1,4 +1,7 @@
-"""One self-contained HTML page: text, tables and inline figures; no script, nothing external."""
+"""One self-contained HTML page: text, tables and inline figures; no script, nothing external.
+
+By hand, not by templates: six shapes of plain text, each escaped in the one function that makes it.
+"""
 
 import math
 from collections.abc import Iterable, Sequence

@@ -1,6 +1,5 @@
 """robustness.html: what the design survives, in figures with the numbers behind them."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +22,13 @@ from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ
+from surrogates.files import write_whole
 
 
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
     """Write robustness.html, atomically."""
     path = folder / "robustness.html"
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(robustness_html(run, found, seed), encoding="utf-8")
-    os.replace(draft, path)
+    write_whole(path, robustness_html(run, found, seed))
     return path
 
 
@@ -90,11 +88,14 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
             f"{100 * bound.stiffness:.3g} % (every frequency by {100 * bound.shift:.3g} %), "
             "each mode by itself; proven on a grid of frequencies."
         )
+    if found.overrun is not None:
+        words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
     words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
-    if run.period:
+    if run.sampled is not None:
+        step = f"{1e6 * run.sampled.period:.5g} µs"
         words.append(
-            f"A controller in discrete time, a step every {1e6 * run.period:.5g} µs, hold and "
+            f"A controller in discrete time, a step every {step}, hold and "
             "delay exact; noise, the structured singular value and moves are of continuous ones."
         )
     return words
@@ -235,6 +236,9 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
 
 def _structured(found: Study) -> list[Section]:
     bound = found.structured
+    if found.overrun is not None:
+        words = f"Not computed within {found.overrun:g} s. Give it longer with --limit."
+        return [Section("Structured singular value", paragraph(words))]
     if bound is None:
         return []
     caption = (

@@ -1,6 +1,5 @@
 """The run report: one self-contained `report.html` about a finished run."""
 
-import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -54,6 +53,7 @@ from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.synthesis.loop_responses import loop_data
+from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.run import Solution
@@ -69,10 +69,7 @@ STATUS = {
 def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    temporary = folder / "report.html.part"
-    text = report_html(folder, case, problem, solution)
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, report_html(folder, case, problem, solution))
     return path
 
 

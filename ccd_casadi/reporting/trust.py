@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.codesign.surrogate_quality import Quality
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLUE, GREY
+from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
 WORDS = {

@@ -4,10 +4,11 @@ With L_i = 1/S_ii - 1, the loop that channel i sees while the others are closed,
 margin is α = 1/max|S_ii - 1/2|: the loop is stable for every factor inside the disk through
 (2 - α)/(2 + α) and its inverse, that is for any gain in between or any phase up to 2 arctan(α/2).
 All loops at once: 1/α is the structured singular value of S - I/2 (diagonal, complex), bounded
-from above by SLICOT's AB13MD, so that α is a lower bound. (Seiler, Packard and Gahinet 2020.)
+from above (`mu_bound`), so that α is a lower bound. (Seiler, Packard and Gahinet 2020.)
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import control
@@ -15,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
-from ccd_casadi.robust.structured import diagonal_mu
+from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
+from ccd_casadi.synthesis.closed_loop import responses
 
 FINE = 60  # points between the neighbours of the least disk margin found
 
@@ -76,11 +77,14 @@ def margins(
         S = np.linalg.inv(np.eye(L.shape[1]) + L)
         for i in range(L.shape[1]):
             loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
-    g, k = (
-        to_control(named_plant(plant.plant_si())),
-        to_control(named_controller(controller)),
-    )
-    return Margins(tuple(loops), _together(g * k, hz), _together(k * g, hz))
+
+    def both(omega: Array) -> tuple[NDArray, NDArray]:
+        g, k, _ = responses(plant, controller, omega)
+        return g, k
+
+    outputs = _together(lambda omega: np.matmul(*both(omega)), G @ K, hz)
+    inputs = _together(lambda omega: np.matmul(*both(omega)[::-1]), K @ G, hz)
+    return Margins(tuple(loops), outputs, inputs)
 
 
 def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
@@ -90,7 +94,7 @@ def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
         S = np.linalg.inv(np.eye(L.shape[1]) + L)
         for i in range(L.shape[1]):
             loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
-        alpha = 1.0 / np.array([diagonal_mu(s - 0.5 * np.eye(len(s))) for s in S])
+        alpha = 1.0 / mu_bound(S - 0.5 * np.eye(S.shape[1]))
         worst = int(alpha.argmin())
         together.append(DiskMargin(float(alpha[worst]), float(hz[worst])))
     return Margins(tuple(loops), together[0], together[1])
@@ -112,12 +116,15 @@ def _loop(name: str, hz: Array, L: NDArray) -> LoopMargins:
     )
 
 
-def _together(loop: control.StateSpace, hz: Array) -> DiskMargin:
+def _together(loop: Callable[[Array], NDArray], L: NDArray, hz: Array) -> DiskMargin:
     """The least disk margin on the grid, then on a finer one around it."""
-    for _ in range(2):
-        alpha = np.asarray(control.disk_margins(loop, HZ * hz, returnall=True)[0], float)
+    for last in (False, True):
+        eye = np.eye(L.shape[1])
+        alpha = 1.0 / mu_bound(np.linalg.inv(eye + L) - 0.5 * eye)
         worst = int(alpha.argmin())
         found = DiskMargin(float(alpha[worst]), float(hz[worst]))
-        ends = hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)]
-        hz = np.geomspace(*ends, FINE)
+        if not last:
+            ends = hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)]
+            hz = np.geomspace(*ends, FINE)
+            L = loop(HZ * hz)
     return found

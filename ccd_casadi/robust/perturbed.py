@@ -1,4 +1,4 @@
-"""The controller on plants off the model: shifted resonances, other damping, other hardware."""
+"""The controller on plants off the model: shifted resonances and other damping."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,15 +12,12 @@ from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 
 BISECTIONS = 30
 SEARCH = 120  # measurements of a search for the worst plant
-CORNERS = 5  # parameters up to which all corners of the tolerances are tried
-STARTS = 2
 
 
 @dataclass(frozen=True)
@@ -51,20 +48,10 @@ class Line:
     within: tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Tolerances:
-    """Random hardware and the worst found within the tolerances; places are θ."""
-
-    tolerance: float
-    judged: tuple[Judged, ...]
-    failed: int
-    worst: Judged
-
-
 def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Judged:
     """The run's controller on a plant."""
-    if run.sampled_judge is not None:
-        good, omega, height, growth = run.sampled_judge(scale_plant(modal, run.problem.weights.M_K))
+    if run.sampled is not None:
+        good, omega, height, growth = run.sampled.judge(scale_plant(modal, run.problem.weights.M_K))
         return Judged(place, good, omega, height if good else np.inf, growth)
     figures: DesignFigures = measure(
         scale_plant(modal, run.problem.weights.M_K),
@@ -83,19 +70,36 @@ def system_of(run: FinishedRun) -> Mechanics:
     return mechanics(plant_of(run.problem), run.theta)
 
 
-def shift_line(run: FinishedRun, system: Mechanics, reach: float, count: int = 41) -> Line:
+def shift_line(
+    run: FinishedRun, system: Mechanics, reach: float, count: int = 41, quiet: bool = True
+) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
-    return _line(run, lambda s: _modal(run, system, Perturbation(shift=s)), -reach, reach, count)
+    with Progress(_plants(count), "resonance shifts", quiet=quiet) as progress:
+        return _line(
+            run, lambda s: _modal(run, system, Perturbation(shift=s)),
+            -reach, reach, count, progress,
+        )  # fmt: skip
 
 
 def damping_line(
-    run: FinishedRun, system: Mechanics, low: float, high: float, count: int = 41
+    run: FinishedRun,
+    system: Mechanics,
+    low: float,
+    high: float,
+    count: int = 41,
+    quiet: bool = True,
 ) -> Line:
     """Damping times d, low <= d <= high; evenly in its logarithm."""
-    return _line(
-        run, lambda x: _modal(run, system, Perturbation(damping=float(np.exp(x)))),
-        float(np.log(low)), float(np.log(high)), count, np.exp,
-    )  # fmt: skip
+    with Progress(_plants(count), "damping", quiet=quiet) as progress:
+        return _line(
+            run, lambda x: _modal(run, system, Perturbation(damping=float(np.exp(x)))),
+            float(np.log(low)), float(np.log(high)), count, progress, np.exp,
+        )  # fmt: skip
+
+
+def _plants(count: int) -> int:
+    """At most so many plants on a line: its places, the middle, and bisections of four ends."""
+    return count + 1 + 4 * BISECTIONS
 
 
 def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Judged, ...]:
@@ -116,7 +120,11 @@ def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Jud
 
 
 def worst_in_box(
-    run: FinishedRun, system: Mechanics, reach: float, damping: tuple[float, float]
+    run: FinishedRun,
+    system: Mechanics,
+    reach: float,
+    damping: tuple[float, float],
+    quiet: bool = True,
 ) -> Judged:
     """The worst (shift, damping factor) of the box: a grid, then a local search from its worst."""
     low, high = np.array([-reach, np.log(damping[0])]), np.array([reach, np.log(damping[1])])
@@ -127,47 +135,7 @@ def worst_in_box(
 
     grid = [np.array([s, d]) for s in np.linspace(low[0], high[0], 9)
             for d in np.linspace(low[1], high[1], 5)]  # fmt: skip
-    return _search(at, grid, low, high)
-
-
-def tolerances(
-    run: FinishedRun, tolerance: float, samples: int, seed: int, quiet: bool
-) -> Tolerances:
-    """Uniformly random θ within ± `tolerance` (relative) of the design's, and the worst θ found.
-
-    The controller stays. θ may leave its bounds by the tolerance. `failed` counts hardware of
-    which the model makes no plant.
-    """
-    theta = np.array(run.theta)
-    rng = np.random.default_rng(seed)
-    unit = rng.uniform(-1.0, 1.0, (samples, theta.size))
-    if theta.size <= CORNERS:
-        signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * theta.size)).reshape(theta.size, -1).T
-    else:
-        signs = np.empty((0, theta.size))
-    failed = 0
-
-    def at(x: Array) -> Judged | None:
-        values = tuple(float(v) for v in theta * (1.0 + tolerance * x))
-        try:
-            modal = modal_plant(mechanics(plant_of(run.problem), values), run.problem.suspension)
-        except PlantError:
-            return None
-        return judge(run, modal, values)
-
-    with Progress(samples, "hardware tolerances", quiet=quiet) as progress:
-        drawn = []
-        for x in unit:
-            drawn.append(at(x))
-            progress.advance()
-    failed = sum(item is None for item in drawn)
-    one = np.ones(theta.size)
-    order = np.argsort([-1.0 if item is None else -item.badness for item in drawn])
-    starts = [*signs, *unit[order[:STARTS]]]
-    worst = _search(at, starts, -one, one)
-    kept = tuple(item for item in drawn if item is not None)
-    worst = max((worst, *kept), key=lambda item: item.badness)
-    return Tolerances(tolerance, kept, failed, worst)
+    return search(at, grid, low, high, "shift and damping", quiet)
 
 
 def _modal(run: FinishedRun, system: Mechanics, perturbation: Perturbation) -> ModalPlant:
@@ -180,9 +148,11 @@ def _line(
     low: float,
     high: float,
     count: int,
+    progress: Progress,
     shown: Callable[[float], float] = float,
 ) -> Line:
     def at(x: float) -> Judged:
+        progress.advance()
         return judge(run, modal_at(x), (float(shown(x)),))
 
     S_max = run.problem.inner.S_max * (1.0 + 1e-6)
@@ -194,6 +164,7 @@ def _line(
         side = [(x, j) for x, j in zip(places, judged, strict=True) if sign * x >= 0.0]
         side.sort(key=lambda item: abs(item[0]))
         if not good(side[0][1]):
+            progress.advance(BISECTIONS)
             return float(shown(0.0))
         inside = side[0][0]
         for x, item in side[1:]:
@@ -204,6 +175,7 @@ def _line(
                     a, b = (middle, b) if good(at(middle)) else (a, middle)
                 return float(shown(a))
             inside = x
+        progress.advance(BISECTIONS)  # there was no end to be found
         return float(shown(inside))
 
     def ends(good: Callable[[Judged], bool]) -> tuple[float, float]:
@@ -212,23 +184,32 @@ def _line(
     return Line(tuple(judged), ends(lambda j: j.stable), ends(lambda j: j.peak <= S_max))
 
 
-def _search(
-    at: Callable[[Array], Judged | None], starts: list[Array], low: Array, high: Array
+def search(
+    at: Callable[[Array], Judged | None],
+    starts: list[Array],
+    low: Array,
+    high: Array,
+    label: str,
+    quiet: bool,
 ) -> Judged:
     """The worst of the starts, and of a bounded Nelder and Mead search from the worst of them."""
     found: list[tuple[Array, Judged]] = []
 
+    progress = Progress(len(starts) + SEARCH, label, quiet=quiet)
+
     def cost(x: Array) -> float:
         item = at(x)
+        progress.advance()
         if item is None:
             return 0.0
         found.append((np.array(x), item))
         return -item.badness
 
-    for start in starts:
-        cost(start)
-    begin = max(found, key=lambda item: item[1].badness)[0]
-    options = {"maxfev": SEARCH, "xatol": 1e-4, "fatol": 1e-6}
-    bounds = list(zip(low, high, strict=True))
-    minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=options)
+    with progress:
+        for start in starts:
+            cost(start)
+        begin = max(found, key=lambda item: item[1].badness)[0]
+        options = {"maxfev": SEARCH, "xatol": 1e-4, "fatol": 1e-6}
+        bounds = list(zip(low, high, strict=True))
+        minimize(cost, begin, method="Nelder-Mead", bounds=bounds, options=options)
     return max((item for _, item in found), key=lambda item: item.badness)

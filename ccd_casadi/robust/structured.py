@@ -1,4 +1,4 @@
-"""Structured singular value of uncertain modal stiffnesses K_i (1 + δ_i), by SLICOT's AB13MD.
+"""Structured singular value of uncertain modal stiffnesses K_i (1 + δ_i).
 
 In modal coordinates q̈ + D q̇ + K q = B u the errors close the loop w = δ z around
 
@@ -11,7 +11,8 @@ in every disk with its centre at ±jκr and radius r√(1 + κ²) as well, and w
     M' = (I - jκr M s)⁻¹ M r√(1 + κ²),   s_i = ±1,
 
 μ(M') < 1 for one κ is enough at each ω; the disks play the part of the G-scalings of mixed μ.
-AB13MD has real blocks too, but for some matrices it then does not end (slycot 0.7).
+μ is bounded by diagonal scalings (`mu_bound`). SLICOT's AB13MD bounds the same, no better, and for
+some of these matrices it takes seconds each or does not return at all (slycot 0.7).
 
 Every answer holds at the frequencies of a grid; between them nothing is proven.
 """
@@ -23,19 +24,20 @@ from numpy.typing import NDArray
 
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.robust.mu_bound import balanced_bound, mu_bound
 from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
 from ccd_casadi.synthesis.closed_loop import responses
 
 KAPPA = (0.0, 10.0, 3.0, 1.0)  # a larger one asks for a finer grid
-COMPLEX = 2
 SEEN = 1e-9  # share of the strongest residue under which a mode is in no loop
 LIGHT = 0.3  # damping ratio of the loop's poles around which the grid is dense
 FLANKS = np.linspace(-12.0, 12.0, 97)  # in their real parts
 SAME = 1e-6  # relative
 ROUNDS, FINE = 8, 8  # refinements around the worst frequency, and points a side
 BISECTIONS = 25
+GAIN = 1.25  # more than the best scaling gains on a balanced matrix (up to 1.08 was seen)
+AT_ONCE = 16  # matrices scaled at a time
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,14 @@ def structured_bound(
     allowed, worst = 1.0, float(new[0])  # |δ| = 1 leaves no stiffness
     for _ in range(1 + ROUNDS):
         K = responses(plant, controller, 2.0 * np.pi * new)[1]
-        M = [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
-        mu = np.array([diagonal_mu(m) for m in M])
+        M = np.array(
+            [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
+        )
+        mu = _bounds(M)
         known = np.vstack([known, np.column_stack([new, mu])])
-        for i in np.argsort(-mu):
-            if not _stands(M[i], allowed):
-                allowed, worst = _largest(M[i], 1.0 / mu[i], allowed), float(new[i])
+        found = _largest(M, 1.0 / mu.max(), allowed)
+        if found is not None:
+            allowed, worst = found[0], float(new[found[1]])
         known = known[np.argsort(known[:, 0])]
         at = int(np.searchsorted(known[:, 0], worst))
         ends = known[max(at - 2, 0), 0], known[min(at + 2, len(known) - 1), 0]
@@ -96,26 +100,56 @@ def _errors(modal: ModalPlant, kept: NDArray[np.intp], omega: float, K: NDArray)
     return -root[:, None] * np.linalg.inv(Z)[np.ix_(kept, kept)] * root
 
 
-def diagonal_mu(M: NDArray) -> float:
-    """Upper bound for complex scalars on the diagonal."""
-    ones = np.ones(len(M), dtype=int)
-    return float(require("slycot", "slicot").ab13md(M, ones, COMPLEX * ones)[0])
+def _bounds(M: NDArray) -> Array:
+    """Bounds of μ: of balanced matrices, and the least ones where that decides which is largest."""
+    mu = balanced_bound(M)
+    open_ = np.ones(len(M), dtype=bool)
+    while open_[mu.argmax()]:
+        top = np.flatnonzero(open_)
+        top = top[np.argsort(-mu[top])[:AT_ONCE]]
+        mu[top] = np.minimum(mu[top], mu_bound(M[top]))
+        open_[top] = False
+    return mu
 
 
-def _stands(M: NDArray, r: float) -> bool:
-    """Whether some disk around [-r, r] is free of singular points."""
-    side = np.where(np.diag(M).imag < 0.0, -1.0, 1.0)
+def _stand(M: NDArray, r: float) -> NDArray[np.bool_]:
+    """Whether some disk around [-r, r] is free of singular points, for matrices (k, n, n)."""
+    diagonal = np.einsum("kii->ki", M)
+    side = np.where(diagonal.imag < 0.0, -1.0, 1.0)[:, None, :]
+    standing = np.zeros(len(M), dtype=bool)
     for kappa in KAPPA:
-        turned = np.linalg.solve(np.eye(len(M)) - 1j * kappa * r * M * side, M)
-        if diagonal_mu(turned * (r * np.sqrt(1.0 + kappa**2))) < 1.0:
-            return True
-    return False
+        left = np.flatnonzero(~standing)
+        if left.size == 0:
+            break
+        turned = np.linalg.solve(
+            np.eye(M.shape[1]) - 1j * kappa * r * M[left] * side[left], M[left]
+        )
+        turned *= r * np.sqrt(1.0 + kappa**2)
+        # cheapest first: the two norms that bound σ_max, a balanced matrix, the best scaling
+        size = np.abs(turned)
+        bound = np.sqrt(size.sum(axis=1).max(axis=1) * size.sum(axis=2).max(axis=1))
+        open_ = bound >= 1.0
+        bound[open_] = balanced_bound(turned[open_])
+        open_ = (bound >= 1.0) & (bound < GAIN)
+        bound[open_] = mu_bound(turned[open_])
+        standing[left] = bound < 1.0
+    return standing
 
 
-def _largest(M: NDArray, low: float, high: float) -> float:
-    """The largest r that stands, to bisection, from one that does and one that does not."""
+def _largest(M: NDArray, low: float, high: float) -> tuple[float, int] | None:
+    """The largest r below `high` at which all matrices stand, as they do at `low`; which decides.
+
+    None where all of them stand at `high`. What stands at some r does so at any smaller one.
+    """
+    falls = np.flatnonzero(~_stand(M, high))
+    if falls.size == 0:
+        return None
     low = min(low, high)
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _stands(M, middle) else (low, middle)
-    return low
+        still = falls[~_stand(M[falls], middle)]
+        if still.size:
+            falls, high = still, middle
+        else:
+            low = middle
+    return low, int(falls[0])

@@ -1,6 +1,6 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,23 +8,25 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.robust.demands import Demands as Demands
+from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins, sampled_margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate
 from ccd_casadi.robust.perturbed import (
     Judged,
     Line,
-    Tolerances,
     damping_line,
     shift_line,
     single_modes,
     system_of,
-    tolerances,
     worst_in_box,
 )
-from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.robust.setpoint import Setpoint, setpoint
 from ccd_casadi.robust.signals import Noise, closed_loop, gains, noise
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.deadline import Overrun, Runner
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -32,29 +34,13 @@ from ccd_casadi.synthesis.statics import Statics, sampled_statics, statics
 
 
 @dataclass(frozen=True)
-class Demands:
-    """What to try: relative shift and tolerance, damping factors, densities, the move.
-
-    `sensor` in m/√Hz and `disturbance` in N/√Hz, one-sided; `window` in m; `axis` from 0.
-    """
-
-    shift: float = 0.05
-    damping: tuple[float, float] = (0.5, 2.0)
-    tolerance: float = 0.01
-    samples: int = 200
-    sensor: float = 1.0
-    disturbance: float = 1.0
-    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
-    window: float = 1e-6
-    axis: int = 0
-
-
-@dataclass(frozen=True)
 class Study:
     """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `free` whether the moves are those
     of the plant without its suspension, `moves` the move without and with feedforward.
 
-    Of a controller in discrete time there are no `noise`, no `structured` bound and no `moves`.
+    `structured` is None where no flexible mode is in the loop, and where the bound was not computed
+    within the `overrun` seconds that it was given. Of a controller in discrete time there are no
+    `noise`, no `structured` bound and no `moves`.
     """
 
     demands: Demands
@@ -72,6 +58,7 @@ class Study:
     setpoint: Setpoint
     free: bool
     moves: tuple[Move, ...]
+    overrun: float | None = None
 
     @property
     def survives(self) -> bool:
@@ -84,16 +71,47 @@ def robustness(
     run: FinishedRun, demands: Demands | None = None, seed: int = 0, quiet: bool = True
 ) -> Study:
     """Put a run's controller through all that is demanded; nothing is designed anew."""
+    return with_structured_bound(run, tried(run, demands, seed, quiet))
+
+
+def with_structured_bound(run: FinishedRun, found: Study, seconds: float | None = None) -> Study:
+    """The study with its bound of the structured singular value.
+
+    Given `seconds`, it is computed in a process of its own, which is ended after them.
+    """
+    if run.sampled is not None:
+        return found
+    modal = modal_plant(system_of(run), run.problem.suspension)
+    if seconds is None:
+        bound = structured_bound(run.plant, modal, run.controller, found.hz)
+        return replace(found, structured=bound, overrun=None)
+    with Runner() as runner:
+        try:
+            bound = runner.call(
+                seconds, structured_bound, run.plant, modal, run.controller, found.hz
+            )
+        except Overrun:
+            return replace(found, structured=None, overrun=seconds)
+    return replace(found, structured=bound, overrun=None)
+
+
+def tried(
+    run: FinishedRun,
+    demands: Demands | None = None,
+    seed: int = 0,
+    quiet: bool = True,
+    workers: Pool | None = None,
+) -> Study:
+    """Everything but the structured singular value; `workers` share what they can."""
     demands = demands or Demands()
     bandwidth_hz = run.figures.bandwidth / HZ
-    if run.period:
-        return _sampled(run, demands, seed, quiet)
+    if run.sampled is not None:
+        return _sampled(run, demands, seed, quiet, workers)
     loop = loop_data(
         run.plant, run.controller, run.weights, gamma=run.figures.gamma,
         bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
     )  # fmt: skip
     system, d = system_of(run), demands
-    modal = modal_plant(system, run.problem.suspension)
     profile = setpoint(d.limits)
     free, moves = _moves(run, profile, d)
     closed = closed_loop(run.plant.plant_si(), run.controller)
@@ -108,28 +126,28 @@ def robustness(
             run.controller,
             responses(run.plant, run.controller, np.array([run.figures.bandwidth]))[1][0],
         ),
-        shift=shift_line(run, system, d.shift),
-        damping=damping_line(run, system, *d.damping),
+        shift=shift_line(run, system, d.shift, quiet=quiet),
+        damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
-        structured=structured_bound(run.plant, modal, run.controller, loop.hz),
+        box=worst_in_box(run, system, d.shift, d.damping, quiet),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
+        structured=None,
         setpoint=profile,
         free=free,
         moves=moves,
     )
 
 
-def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool) -> Study:
+def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool | None) -> Study:
     """The part of the study that a controller in discrete time has, hold and delay exact."""
-    assert run.sampled_responses is not None
+    assert run.sampled is not None
     system = system_of(run)
-    nyquist = 0.5 / run.period
+    nyquist = 0.5 / run.sampled.period
     around = run.plant.grid * run.plant.omega_0 / HZ
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
-    G, K = run.sampled_responses(HZ * hz)
-    at = run.sampled_responses(np.array([run.figures.bandwidth]))[1][0]
+    G, K = run.sampled.responses(run.plant, HZ * hz)
+    at = run.sampled.responses(run.plant, np.array([run.figures.bandwidth]))[1][0]
     return Study(
         demands=d,
         hz=hz,
@@ -137,11 +155,11 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool) -> Study:
         margins=sampled_margins(hz, G, K),
         noise=None,
         statics=sampled_statics(run.plant.plant_si(), run.controller, at),
-        shift=shift_line(run, system, d.shift),
-        damping=damping_line(run, system, *d.damping),
+        shift=shift_line(run, system, d.shift, quiet=quiet),
+        damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
+        box=worst_in_box(run, system, d.shift, d.damping, quiet),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
         structured=None,
         setpoint=setpoint(d.limits),
         free=False,
@@ -196,7 +214,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         "static_stiffness": found.statics.stiffness,
         "static_compliance": found.statics.compliance,
         "static_share": found.statics.share,
-        "period": run.period or None,
+        "period": None if run.sampled is None else run.sampled.period,
         "noise": None
         if found.noise is None
         else {"sensor_density": d.sensor, "force_density": d.disturbance}
@@ -212,6 +230,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
             "no_plant": hard.failed,
+            "reduced_model_difference": hard.difference,
             "unstable": sum(not item.stable for item in hard.judged),
             "stable_above_S_max": sum(
                 item.stable and item.peak > run.problem.inner.S_max for item in hard.judged
@@ -234,6 +253,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "stiffness": bound.stiffness,
             "shift": bound.shift,
         },
+        "structured_not_computed_within_s": found.overrun,
         "move": {
             "limits": limits,
             "duration": found.setpoint.duration,

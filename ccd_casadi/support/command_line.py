@@ -4,16 +4,17 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
-from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
 
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError, one_line
 from ccd_casadi.support.process_pool import WorkerLost, usable_cores
 from ccd_casadi.support.user_code import permit_user_code
-from surrogates.ctrl_c import begun, ctrl_c_noticed, was_ctrl_c
+from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
+from surrogates.options import ExitCode as ExitCode
+from surrogates.options import Parser, whole
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"
@@ -21,27 +22,11 @@ _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
 
-class ExitCode(IntEnum):
-    """How a command ended."""
-
-    DONE = 0
-    BAD_INPUT = 2
-    INFEASIBLE = 3
-    NOT_VERIFIED = 4
-    INTERRUPTED = 130
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """One line, as for every other bad input, in place of the usage."""
-        self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
-
-
 def parser(
     command: str, description: str, *, case_required: bool = False
 ) -> argparse.ArgumentParser:
     """A parser with the positional CASE and --out, --workers, --seed, --quiet."""
-    result = _Parser(prog=f"python -m {command}", description=description)
+    result = Parser(prog=f"python -m {command}", description=description)
     if case_required:
         result.add_argument("case", metavar="CASE.toml", type=Path, help="the case file")
     else:
@@ -61,10 +46,10 @@ def _shared(result: argparse.ArgumentParser) -> None:
     """--out, --workers, --seed, --quiet and --no-user-code, which every command has."""
     result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
     result.add_argument(
-        "--workers", metavar="N", type=_positive, default=usable_cores(),
+        "--workers", metavar="N", type=whole(1), default=usable_cores(),
         help="worker processes (default: all cores)",
     )  # fmt: skip
-    result.add_argument("--seed", metavar="N", type=_natural, default=0, help="default: 0")
+    result.add_argument("--seed", metavar="N", type=whole(0), default=0, help="default: 0")
     result.add_argument("--quiet", action="store_true", help="no progress, no summary")
     result.add_argument(
         "--no-user-code", action="store_true",
@@ -80,7 +65,7 @@ def run_parser(
     about: str = "the folder of a finished solve",
 ) -> argparse.ArgumentParser:
     """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
-    result = _Parser(prog=f"python -m {command}", description=description)
+    result = Parser(prog=f"python -m {command}", description=description)
     result.add_argument("run", metavar=metavar, type=Path, help=about)
     _shared(result)
     return result
@@ -98,14 +83,23 @@ def run(
     main: Callable[[argparse.Namespace], ExitCode],
     arguments: argparse.ArgumentParser,
     argv: Sequence[str] | None = None,
+    *,
+    needs: Sequence[str] = (),
 ) -> int:
-    """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line."""
+    """Parse, run, and turn a user's mistakes and Ctrl-C into an exit code and one line.
+
+    The modules `needs` are what `main` imports that takes time: they are imported once the options
+    are known to be right, and while a Ctrl-C still finds nothing begun.
+    """
     code = ExitCode.INTERRUPTED
-    begun()
     try:
         options = arguments.parse_args(argv)
     except SystemExit as ended:  # after --help or a wrong option
+        begun()
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
+    for module in needs:
+        import_module(module)
+    begun()
     try:
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with (
@@ -175,19 +169,3 @@ def _folder(text: str) -> Path:
     if not os.access(place, os.W_OK | os.X_OK):
         raise argparse.ArgumentTypeError(f"{place} is not writable; choose another")
     return Path(text)
-
-
-def _positive(text: str) -> int:
-    return _whole(text, 1)
-
-
-def _natural(text: str) -> int:
-    return _whole(text, 0)
-
-
-def _whole(text: str, least: int) -> int:
-    # Nine digits are enough for anyone, and within what every random generator takes.
-    if not (text.isdecimal() and len(text) < 10 and int(text) >= least):
-        words = f"{text[:20]!r} is no whole number from {least} to 999999999; give one"
-        raise argparse.ArgumentTypeError(words)
-    return int(text)

@@ -1,6 +1,6 @@
 """The base of every error that a user can cause and mend, and its one line."""
 
-LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
+from surrogates.options import one_line as one_line  # of every command, here and there
 
 
 class UserError(ValueError):
@@ -9,14 +9,6 @@ class UserError(ValueError):
 
 class PlantError(UserError):
     """A model returned something that is no plant; the message says what and how to mend it."""
-
-
-def one_line(value: object) -> str:
-    """Any text on one line: what a terminal would obey is escaped, a long middle left out."""
-    words = " ".join(str(value).split())
-    if len(words) > LONGEST:
-        words = f"{words[: LONGEST - 200]} ... {words[-150:]}"
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
 
 
 def described(error: BaseException) -> str:

@@ -1,4 +1,8 @@
-"""A progress bar on stderr: done, rate, time left."""
+"""A progress bar on stderr: done, rate, time left.
+
+By hand: tqdm and rich rewrite one line on a terminal only to fill a log with it elsewhere; here a
+log gets a plain line every few seconds, and a stream that fails ends the printing alone.
+"""
 
 import os
 import sys

@@ -9,10 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.kernels.design import failed_row
-from ccd_casadi.kernels.gradients import design_with_gradients
+from ccd_casadi.kernels.gradients import (
+    DesignPlant,
+    Loop,
+    design_with_gradients,
+    off_design_gradients,
+)
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.off_design import Loop, off_design_gradients
 from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.synthesis.weights import Weights
 
@@ -80,7 +84,7 @@ def sensitivities(
                 )
             ]
             gradient, fixed, gaps = off_design_gradients(
-                *arguments[:4], gamma_backoff, *slopes, row, gradient[3],
+                DesignPlant(*arguments[:3], *slopes, w, gamma_backoff), row, gradient[3],
                 loops if figures.certified else [],
             )  # fmt: skip
     except np.linalg.LinAlgError:

@@ -91,6 +91,11 @@ def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
     """A plant in SI, force to displacement, ready for synthesis with weights of this M_K (N/m).
 
     Raises UserError where it is in discrete time, PlantError where it cannot be a plant.
+
+    >>> import control
+    >>> plant = plant_from_control(control.tf([1.0], [2.0, 40.0, 8e4]), M_K=1e5)
+    >>> round(float(plant.natural[0]), 6), plant.A.shape  # rad/s
+    (200.0, (2, 2))
     """
     space, period = from_control(system)
     if period:

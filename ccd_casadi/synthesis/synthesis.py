@@ -98,7 +98,15 @@ def synthesise(
 ) -> Design:
     """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none).
 
-    With a family it is made on the family's design plant, see `over_family`.
+    With a family it is made on the family's design plant, see `over_family`. A failure is an
+    outcome of its `figures`, no exception.
+
+    >>> import ccd_casadi as ccd
+    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> weights = problem.weights.at(800.0 * ccd.HZ, 40.0 * ccd.HZ)
+    >>> made = ccd.synthesise(ccd.scaled_plant(problem, (60.0, 60.0)), weights, omega_low=ccd.HZ)
+    >>> made.figures.outcome.value, round(made.figures.bandwidth / ccd.HZ, 2)
+    ('certified', 55.66)
     """
     w0 = plant.omega_0
     made_on = plant if plant.family is None else plant.family.design

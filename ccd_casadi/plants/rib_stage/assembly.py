@@ -23,21 +23,18 @@ COPIES = 4  # quarters in the stage
 
 @dataclass(frozen=True)
 class Pattern:
-    """Rows and columns of a CSR matrix, and for each entry of the boxes where it is summed."""
+    """Rows and columns of a CSR matrix, and which entries of the boxes its data are sums of."""
 
     indices: np.ndarray
     indptr: np.ndarray
-    box: np.ndarray  # (entries,) index into the concatenated matrices of the boxes
-    place: np.ndarray  # (entries,) index into data
-    code: np.ndarray  # (entries,) index into `weights`
-    weights: Array
+    sums: sparse.csr_matrix  # (data, entries of the concatenated matrices of the boxes)
 
     def fill(self, values: Array) -> sparse.csr_matrix:
         """The symmetric matrix with these box entries."""
-        terms = self.weights[self.code] * values[self.box]
-        data = np.bincount(self.place, terms, len(self.indices))
         size = len(self.indptr) - 1
-        return sparse.csr_matrix((data, self.indices, self.indptr), shape=(size, size))
+        return sparse.csr_matrix(
+            (self.sums @ values, self.indices, self.indptr), shape=(size, size)
+        )
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,7 @@ def _pattern(
 ) -> Pattern:
     """Stride 1: every pair of displacements; 3: pairs of one component, boxes being scalar."""
     starts = np.concatenate([[0], np.cumsum([(size // stride) ** 2 for size in sizes])])
-    keys, boxes, weights = [], [], []
+    rows, columns, boxes, weights = [], [], [], []
     for box, places, weight, copies in maps:
         for part in range(stride):
             # a mirror image swaps components within a node: part still names one of the box's
@@ -164,21 +161,39 @@ def _pattern(
             live = np.flatnonzero(index >= 0)
             n = len(index)
             i, j = np.repeat(live, len(live)), np.tile(live, len(live))
-            keys.append(index[i].astype(np.int64) * folded.size + index[j])
+            rows.append(index[i].astype(np.int32))
+            columns.append(index[j].astype(np.int32))
             boxes.append((starts[box] + i * n + j).astype(np.int32))
-            weights.append((copies * w[i] * w[j]).astype(np.float32))
-    unique, place = np.unique(np.concatenate(keys), return_inverse=True)
-    rounded, code = np.unique(np.concatenate(weights), return_inverse=True)
-    # products of ±1, ±√½ and 2, told apart in single precision: their squares are powers of 2
-    powers = np.round(2.0 * np.log2(np.abs(rounded))).astype(float)
-    exact = np.sign(rounded).astype(float) * np.sqrt(np.exp2(powers))
-    row, column = np.divmod(unique, folded.size)
-    indptr = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=folded.size))])
-    return Pattern(
-        column.astype(np.int32),
-        indptr.astype(np.int32),
-        np.concatenate(boxes),
-        place.astype(np.int32),
-        code.astype(np.uint8),
-        exact,
+            weights.append(_exact(copies * np.outer(w[live], w[live])).ravel())
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    order = _sorted_by(column, folded.size)
+    order = order[_sorted_by(row[order], folded.size)]
+    row, column = row[order], column[order]
+    first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0))
+    sums = sparse.csr_matrix(
+        (
+            np.concatenate(weights)[order],
+            np.concatenate(boxes)[order],
+            np.append(first, len(order)).astype(np.int32),
+        ),
+        shape=(len(first), int(starts[-1])),
     )
+    counts = np.bincount(row[first], minlength=folded.size)
+    indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    return Pattern(column[first], indptr, sums)
+
+
+def _sorted_by(key: np.ndarray, size: int) -> np.ndarray:
+    """The stable order of whole numbers below `size`, in linear time: a transposed CSR matrix."""
+    count = len(key)
+    bins = sparse.csr_matrix(
+        (np.ones(count, dtype=bool), key, np.arange(count + 1, dtype=np.int32)),
+        shape=(count, size),
+    )
+    return bins.tocsc().indices
+
+
+def _exact(products: Array) -> Array:
+    """Products of ±1, ±√½ and 2 without their rounding: their squares are powers of 2."""
+    powers = np.round(2.0 * np.log2(np.abs(products)))
+    return np.sign(products) * np.sqrt(np.exp2(powers))

@@ -65,14 +65,15 @@ class RibStage:
         """Where displacements are read."""
         return shape.corners(self.geometry) if self.sensors is None else self.sensors
 
-    def mechanics(self, theta: Sequence[float]) -> Mechanics:
+    def mechanics(self, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
         """M = I, D = 0, K = diag(ω²), B and C of 3 rigid and the flexible modes, and ∂/∂θ.
 
         Rows: z, tip, tilt, then flexible modes; M (n, n), B (n, m) in 1/√kg, C (p, n), SI.
         Derivatives are those of these matrices themselves: M stays I, K stays diagonal (but for
         entries between modes of equal frequency in a stage without symmetry). Cached; read-only.
+        Without derivatives, a quarter of the work, they are those to no parameter.
         """
-        return _mechanics(self, _checked(self, theta))
+        return _mechanics(self, _checked(self, theta), derivatives)
 
     def frequencies(self, theta: Sequence[float]) -> tuple[Mode, ...]:
         """The modes of the model in the order of its rows, three rigid ones first, Hz."""
@@ -140,12 +141,29 @@ def _rigid_function(geometry: Geometry, points: tuple[Point, ...]) -> ca.Functio
 
 
 @lru_cache(maxsize=256)
-def _mechanics(stage: RibStage, theta: tuple[float, ...]) -> Mechanics:
+def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> Mechanics:
     found, here = modes_at(stage, theta), np.array(theta)
-    points = tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
-    u, du, dK = _displacements(stage, found, here, points)
-    n, count = 3 + len(found.flexible), len(here)
-    lam = [(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible]
+    u, du, dK = _displacements(stage, found, here, points_of(stage), derivatives)
+    lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
+    return assembled(stage, lam, u, du, dK)
+
+
+def points_of(stage: RibStage) -> tuple[Point, ...]:
+    """Actuators and sensors, each point once."""
+    return tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
+
+
+def assembled(
+    stage: RibStage, lam: Array, u: Array, du: Array | None = None, dK: Array | None = None
+) -> Mechanics:
+    """The stage's matrices from λ of the flexible modes and u_z of all at the points (n, p).
+
+    The points are its actuators and sensors, each once; `du` (θ, n, p) and `dK` (θ, n, n) are the
+    slopes of u and of K, if there are any. Read-only.
+    """
+    n, points = len(u), points_of(stage)
+    du = np.zeros((0, *u.shape)) if du is None else du
+    dK = np.zeros((0, n, n)) if dK is None else dK
     act = [points.index(p) for p in stage.actuator_points]
     sens = [points.index(p) for p in stage.sensor_points]
     B, dB, C, dC = u[:, act], du[:, :, act], u[:, sens].T, du[:, :, sens].transpose(0, 2, 1)
@@ -154,7 +172,7 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...]) -> Mechanics:
         drive = orthonormal_directions(stage.actuator_points, rows).T
         read = orthonormal_directions(stage.sensor_points, rows)
         B, dB, C, dC = B @ drive, dB @ drive, read @ C, read @ dC
-    zero = np.zeros((count, n, n))
+    zero = np.zeros((len(du), n, n))
     result = Mechanics(
         M=np.eye(n),
         D=np.zeros((n, n)),
@@ -169,27 +187,40 @@ def _mechanics(stage: RibStage, theta: tuple[float, ...]) -> Mechanics:
     return result
 
 
+def rigid_part(stage: RibStage, theta: Array) -> Array:
+    """(3, points) u_z of z, tip and tilt."""
+    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)[0]
+
+
 def _displacements(
-    stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...]
+    stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...], derivatives: bool
 ) -> tuple[Array, Array, Array]:
-    """u_z of every mode at the points (n, p), its slopes (θ, n, p), and ∂K (θ, n, n)."""
-    disc, n, count = discretisation(stage), 3 + len(found.flexible), len(theta)
+    """u_z of every mode at the points (n, p), its slopes (θ, n, p), and ∂K (θ, n, n).
+
+    Without derivatives the last two have no entry along θ.
+    """
+    disc, n = discretisation(stage), 3 + len(found.flexible)
+    count = len(theta) if derivatives else 0
     u, du = np.zeros((n, len(points))), np.zeros((count, n, len(points)))
     dK = np.zeros((count, n, n))
-    u[:3], du[:, :3] = rigid_values(_rigid_function(stage.geometry, points), theta)
+    u[:3], slope = rigid_values(_rigid_function(stage.geometry, points), theta)
+    du[:, :3] = slope[:count]
     for index, item in enumerate(found.spectra):
         keep = found.kept(index)
         if not keep:
             continue
         made = [functionals(disc, image, theta, points) for image in item.group.images]
         F = np.hstack([values[:, 2] for values, _ in made])
+        own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
+        seen = [slice(k * len(points), (k + 1) * len(points)) for k in range(len(made))]
+        for row, mode in own:
+            u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
+        if not derivatives:
+            continue
         dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
         change = slopes(disc, stage.geometry, item, keep, F, dF)
-        own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
         for row, mode in own:
-            seen = slice(mode.image * len(points), (mode.image + 1) * len(points))
-            u[row] = F[:, seen].T @ item.vectors[:, mode.place]
-            du[:, row] = change.dU[:, seen, mode.place]
+            du[:, row] = change.dU[:, seen[mode.image], mode.place]
             for column, other in own:
                 if other.image == mode.image:
                     dK[:, row, column] = change.dK[:, mode.place, other.place]

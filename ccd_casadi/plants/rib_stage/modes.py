@@ -105,7 +105,7 @@ def functionals(
 def spectrum(
     disc: Discretisation, geometry: Geometry, theta: Array, group: Group, count: int
 ) -> Spectrum:
-    """The `count` lowest flexible modes of a group, signed by `_sign`."""
+    """The `count` lowest flexible modes of a group, signed by `sign_functional`."""
     assembler = disc.assembler
     stiff, body = assembler.box_matrices(theta, SHIFT)
     names = [SA.name if s is AS else s.name for s in group.solved]
@@ -117,9 +117,9 @@ def spectrum(
     pencil = build_pencil(
         [made[n][0] for n in names], [made[n][1] for n in names], SHIFT, G, masses
     )
-    rigid = orthonormal(pencil, _rigid_vectors(disc, group, theta))
+    rigid = orthonormal(pencil, rigid_vectors(disc, group, theta))
     values, vectors = flexible_modes(pencil, rigid, count)
-    vectors = vectors * np.where(_sign(disc, group, theta) @ vectors < 0.0, -1.0, 1.0)
+    vectors = vectors * np.where(sign_functional(disc, group, theta) @ vectors < 0.0, -1.0, 1.0)
     return Spectrum(group, theta, pencil, rigid, values, vectors)
 
 
@@ -209,7 +209,7 @@ def _point_masses(
     return G.reshape(n, -1), added, dG.reshape(len(theta), n, -1)
 
 
-def _rigid_vectors(disc: Discretisation, group: Group, theta: Array) -> Array:
+def rigid_vectors(disc: Discretisation, group: Group, theta: Array) -> Array:
     """The rigid-body motions within a group, (n, at most 6), not yet orthonormal."""
     mesh = disc.assembler.mesh
     x, y, z = mesh.coordinates(theta).T
@@ -237,7 +237,7 @@ def _rigid_vectors(disc: Discretisation, group: Group, theta: Array) -> Array:
     return np.hstack(live) if live else np.zeros((n, 0))
 
 
-def _sign(disc: Discretisation, group: Group, theta: Array) -> Array:
+def sign_functional(disc: Discretisation, group: Group, theta: Array) -> Array:
     """(n,) a functional made positive for every mode: u_z where its symmetry has an antinode.
 
     It moves smoothly with θ, so signs hold along a path of designs. In a whole model each

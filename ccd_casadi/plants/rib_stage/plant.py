@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import casadi as ca
 
-from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.plants.rib_stage import nearby
 from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.plants.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.plants.rib_stage.model import RibStage
 from ccd_casadi.plants.rib_stage.solver import StageError
 from ccd_casadi.plants.rib_stage.truncation import TWENTY, ModeCount
+from ccd_casadi.support.process_pool import Pool
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
 MODES = {10: ModeCount(), 20: TWENTY}
@@ -68,8 +71,8 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
     back = [NAMES.index(name) for name in names]
 
-    def evaluator(variant: RibStage) -> "StageEvaluator":
-        return StageEvaluator(variant, tuple(place), tuple(back))
+    def evaluator(variant: RibStage, derivatives: bool = True) -> "StageEvaluator":
+        return StageEvaluator(variant, tuple(place), tuple(back), derivatives)
 
     theta = ca.SX.sym("theta", len(NAMES))
     mass, constraints = stage.hardware([theta[i] for i in place])
@@ -86,22 +89,41 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
         outputs=count or len(stage.sensor_points),
         inputs=count or len(stage.actuator_points),
-        references={name: evaluator(variant) for name, variant in references.items()},
+        references={name: evaluator(variant, False) for name, variant in references.items()},
+        values=evaluator(stage, False),
+        nearby=partial(_nearby, evaluator(stage, False)) if nearby.applies(stage) else None,
     )
 
 
 class StageEvaluator:
-    """θ in the case's order -> Mechanics, derivatives in that order too."""
+    """θ in the case's order -> Mechanics, derivatives (if they are wanted) in that order too."""
 
-    def __init__(self, stage: RibStage, place: tuple[int, ...], back: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        stage: RibStage,
+        place: tuple[int, ...],
+        back: tuple[int, ...],
+        derivatives: bool = True,
+    ) -> None:
         self.stage, self.place, self.back = stage, place, back
+        self.derivatives = derivatives
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
-        found = self.stage.mechanics([float(theta[i]) for i in self.place])
-        if self.back == tuple(range(len(NAMES))):
+        here = [float(theta[i]) for i in self.place]
+        found = self.stage.mechanics(here, derivatives=self.derivatives)
+        if not self.derivatives or self.back == tuple(range(len(NAMES))):
             return found
         M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
         return replace(found, derivatives=(M, D, K, B, C))
+
+
+def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+    """A reduced basis of the stage within ± reach of θ, its snapshots solved by the pool."""
+    stage, here = own.stage, [float(theta[i]) for i in own.place]
+    tasks = [(stage, place) for place in nearby.places(here, reach)]
+    made = dict(pool.map_unordered(nearby.numbered_snapshot, list(enumerate(tasks))))
+    evaluate = nearby.reduced(stage, here, [made[i] for i in range(len(tasks))])
+    return lambda values: evaluate([float(values[i]) for i in own.place])
 
 
 def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[float, ...]] | None:

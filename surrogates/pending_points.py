@@ -1,4 +1,4 @@
-"""What the jobs on one run folder tell each other: who decides now, and which points are in flight.
+"""What jobs on one run folder tell each other: who decides now, and which points are evaluated.
 
 A job decides what to evaluate under one lock, and writes its points to a file that it keeps locked
 while it evaluates them. Locks end with the process that holds them, however it ends: the points of
@@ -17,11 +17,11 @@ import numpy as np
 
 from surrogates.interface import Array
 
-FOLDER = "claims"
+FOLDER = "claims"  # the name in run folders, which jobs of other versions look for as well
 
 
-class Claims:
-    """The claims of a run folder, of points with d inputs."""
+class PendingPoints:
+    """The points with d inputs that the jobs of a run folder are evaluating now."""
 
     def __init__(self, run: Path, d: int) -> None:
         self.folder, self.d = run / FOLDER, d
@@ -45,13 +45,13 @@ class Claims:
                     path.unlink(missing_ok=True)  # its job was killed
         return np.array(found, dtype=float).reshape(-1, self.d)
 
-    def claim(self, X: Array) -> "Claim":
-        """Claim X (m, d) from now until the claim is closed; call it while deciding."""
-        return Claim(self.folder / f"{os.getpid()}.json", X)
+    def reserve(self, X: Array) -> "Reservation":
+        """Reserve X (m, d) from now until it is closed; call it while deciding."""
+        return Reservation(self.folder / f"{os.getpid()}.json", X)
 
 
-class Claim:
-    """A file of points that is locked while this object is open: `with claim: ...`."""
+class Reservation:
+    """A file of points that is locked while this object is open: `with reservation: ...`."""
 
     def __init__(self, path: Path, X: Array) -> None:
         self.path = path
@@ -60,7 +60,7 @@ class Claim:
         json.dump(X.tolist(), self.stream)
         self.stream.flush()
 
-    def __enter__(self) -> "Claim":
+    def __enter__(self) -> "Reservation":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,16 +1,16 @@
-"""What the samples say so far: the surrogates, their optimum, and whether it is the true one."""
+"""One iteration of retraining: the surrogates, their optimum, and whether that is the true one."""
 
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
 
-from surrogates.acquisition import NEAR, Belief, maximiser, objective_and_violation
-from surrogates.designs import sobol
+from surrogates.acquisition import NEAR, Posterior, maximiser, objective_and_violation
 from surrogates.fitting import fit
 from surrogates.gaussian_process import GaussianProcess, loo_errors
 from surrogates.interface import Array
 from surrogates.optimum import Optimum, predicted_optimum
+from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth
 from surrogates.versions import Version, Versions
 
@@ -20,8 +20,8 @@ SAME = 1e-9  # of the box: samples that a version was fitted to
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
-    """A belief, its version and predicted optimum, and how far it is from the truth.
+class Iteration:
+    """The surrogates, their version and predicted optimum, and how far that is from the truth.
 
     x: the design to verify if nothing more is asked (None: there is none). step: from the
     predicted optimum to the nearest sample, share of the box. error: |ΔJ| / |J| and |Δg|, the
@@ -29,7 +29,7 @@ class Judgement:
     largest expected improvement, in units of J.
     """
 
-    belief: Belief
+    posterior: Posterior
     version: Version
     optimum: Optimum | None
     x: Array | None
@@ -46,19 +46,19 @@ class Judgement:
         return tuple(x for x in (self.x, predicted) if x is not None)
 
 
-def judge(
+def iterate(
     truth: Truth, observed: Observations, failed: Array, versions: Versions, seed: int
-) -> Judgement:
-    """Fit all that is observed (the newest version where it was fitted to just that), and judge."""
+) -> Iteration:
+    """Fit all that is observed (the newest version where it was fitted to that), and optimise."""
     newest = versions.newest()
     unit = (observed.X - truth.lower) / (truth.upper - truth.lower)
     if newest is not None and _fitted_to(newest[0], unit):
         surrogates = newest[0]
     else:
         newest, surrogates = None, fit_all(truth, observed, seed)
-    belief = Belief(truth, surrogates, observed, failed)
-    J, violation = belief.values()
-    best = belief.incumbent()
+    posterior = Posterior(truth, surrogates, observed, failed)
+    J, violation = posterior.values()
+    best = posterior.incumbent()
     first = int(np.argmin(violation)) if best is None else best
     starts = np.vstack([observed.X[first], sobol(truth.lower, truth.upper, STARTS, seed)])
     optimum = predicted_optimum(truth, surrogates, starts, failed)
@@ -71,8 +71,8 @@ def judge(
         if step <= NEAR or best is None:
             at, x = int(np.argmin(away)), optimum.x
         settled = settled or step <= NEAR
-    error = np.inf if at is None else _error_at(belief, at)
-    _, gain = maximiser(belief, False, () if optimum is None else (optimum.x, starts[0]), seed)
+    error = np.inf if at is None else _error_at(posterior, at)
+    _, gain = maximiser(posterior, False, () if optimum is None else (optimum.x, starts[0]), seed)
     version = (
         newest[1]
         if newest
@@ -90,14 +90,14 @@ def judge(
         )
     )
     true = np.nan if at is None else float(J[at])
-    return Judgement(belief, version, optimum, x, true, step, error, gain, settled)
+    return Iteration(posterior, version, optimum, x, true, step, error, gain, settled)
 
 
-def done(judgement: Judgement) -> bool:
+def converged(iteration: Iteration) -> bool:
     """Whether prediction and truth agree at an optimum that nothing promises to better."""
-    tolerance = judgement.belief.truth.tolerance
-    least = SETTLED * tolerance * abs(judgement.true)
-    return judgement.settled and judgement.error <= tolerance and judgement.gain <= least
+    tolerance = iteration.posterior.truth.tolerance
+    least = SETTLED * tolerance * abs(iteration.true)
+    return iteration.settled and iteration.error <= tolerance and iteration.gain <= least
 
 
 def fit_all(truth: Truth, observed: Observations, seed: int) -> tuple[GaussianProcess, ...]:
@@ -121,12 +121,12 @@ def _fitted_to(surrogates: tuple[GaussianProcess, ...], unit: Array) -> bool:
     return X.shape == unit.shape and bool(np.abs(X - unit).max() <= SAME)
 
 
-def _error_at(belief: Belief, row: int) -> float:
+def _error_at(posterior: Posterior, row: int) -> float:
     """The error of J (relative) and g at an observation, predicted without it."""
-    observed = belief.observed.rows(np.array([row]))
-    residuals = [loo_errors(process)[0][row] for process in belief.surrogates]
+    observed = posterior.observed.rows(np.array([row]))
+    residuals = [loo_errors(process)[0][row] for process in posterior.surrogates]
     left_out = replace(observed, Y=observed.Y - np.array(residuals))
-    J, g = objective_and_violation(belief.truth, observed.X, observed.Y)
-    J_out, g_out = objective_and_violation(belief.truth, observed.X, left_out.Y)
+    J, g = objective_and_violation(posterior.truth, observed.X, observed.Y)
+    J_out, g_out = objective_and_violation(posterior.truth, observed.X, left_out.Y)
     off = float(abs(J_out[0] - J[0]) / max(abs(J[0]), 1e-300))
     return max(off, float(abs(g_out[0] - g[0])) if np.isfinite(g[0]) else 0.0)

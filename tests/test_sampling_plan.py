@@ -11,7 +11,7 @@ LOW, HIGH = np.array([-1.0, 10.0, 0.1]), np.array([2.0, 11.0, 0.3])
 KINDS = st.sampled_from(["sobol", "lhs"])
 
 
-@settings(max_examples=25, derandomize=True, deadline=None)
+@settings(max_examples=25)
 @given(KINDS, st.integers(1, 70), st.integers(0, 2**31))
 def test_plans_fill_the_box_and_depend_on_the_seed_alone(kind: str, n: int, seed: int) -> None:
     X = design(kind, LOW, HIGH, n, seed)
@@ -22,7 +22,7 @@ def test_plans_fill_the_box_and_depend_on_the_seed_alone(kind: str, n: int, seed
     assert not np.array_equal(X, design(kind, LOW, HIGH, n, seed + 1))
 
 
-@settings(max_examples=15, derandomize=True, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(1, 60), st.integers(0, 1000))
 def test_latin_hypercube_has_one_point_in_every_slice(n: int, seed: int) -> None:
     unit = latin_hypercube(np.zeros(3), np.ones(3), n, seed)
@@ -30,7 +30,7 @@ def test_latin_hypercube_has_one_point_in_every_slice(n: int, seed: int) -> None
     np.testing.assert_array_equal(slices, np.tile(np.arange(n)[:, None], 3))
 
 
-@settings(max_examples=10, derandomize=True, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 1000))
 def test_sobol_is_balanced_and_nested(seed: int) -> None:
     X = sobol([0, 0], [1, 1], 16, seed)

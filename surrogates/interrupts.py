@@ -2,7 +2,8 @@
 
 Python raises KeyboardInterrupt between two instructions of whatever runs. Three places need care:
 imports (nothing has begun: the process just ends), finalizers (the exception is printed and lost),
-and compiled code (it comes out as another exception, with or without a trace of the first).
+and compiled code (it comes out as another exception, with or without a trace of the first; CasADi's
+solvers swallow it, so `interrupts_kept` holds it until they are done).
 """
 
 import _thread
@@ -17,6 +18,7 @@ from typing import Any
 
 AGAIN = 0.01  # s
 _pressed = threading.Event()
+_kept = threading.Event()
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
@@ -92,3 +94,32 @@ def was_ctrl_c(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def pending() -> bool:
+    """Whether Ctrl-C was pressed since the current solve began: end what is under way soon."""
+    return _kept.is_set()
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Hold Ctrl-C until the end of the block and raise KeyboardInterrupt there.
+
+    Only the main thread receives signals; elsewhere the block runs as it is.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def keep(number: int, frame: FrameType | None) -> None:
+        _kept.set()
+
+    before = signal.signal(signal.SIGINT, keep)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        held = _kept.is_set()
+        _kept.clear()
+    if held:
+        raise KeyboardInterrupt

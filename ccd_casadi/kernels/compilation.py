@@ -1,0 +1,241 @@
+"""Compiling every kernel once, on two processes, with words; and doing so when a user comes first.
+
+Numba compiles a function when it is first called and keeps it on disk, beside the sources or,
+where these cannot be written, in the user's own cache. One process does the search for γ_opt,
+the other the certificate; each loads from disk what the other has already left there.
+
+A stamp beside the compiled kernels names the sources, Numba and the processor that they are
+for. The first compilation that finds no such stamp starts the two processes, says so on stderr,
+and waits: so does a program that imports this package as a library. A lock lets one process
+compile; others wait for it. Ctrl-C leaves whole files only, and the next one goes on from these.
+"""
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from llvmlite import binding
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+from ccd_casadi.support.progress import Progress, duration
+
+PACKAGE = __name__.rpartition(".")[0]
+PARTS = ("search", "certificate")
+WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
+SECONDS = 60.0  # of one core, to compile all; measured, said before anything else is known
+
+
+def compile_part(part: str) -> None:
+    """Call the entry points of one part with arrays laid out as the Python layer passes them.
+
+    One tiny problem serves all: SISO and MIMO have the same types.
+    """
+    from ccd_casadi.kernels import design, frequency, gamma, riccati, sensitivity, synthesis
+    from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
+    from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
+
+    # 1/(s² + 0.1 s + 1) with the paper's weights
+    A, B, C = np.array([[0.0, 1.0], [-1.0, -0.1]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+    w = np.array([2.0, 1e-4, 4.0, 1e4, 1.0, 1.0, 1e-2, 1.0])
+    grid, none = np.geomspace(1e-2, 1e2, 41), np.zeros((1, 1))
+    if part == "search":
+        gp = generalized_plant(A, B, C, w)
+        A_, B1, B2, C1, _, d1, d2 = gp
+        H0 = riccati.lqr_hamiltonian(A_, B2, C1, d2, 1, 1)
+        squared_weights(w, 1.0)
+        stable_subspace(H0)
+        lyapunov_triangular(-np.eye(2), np.eye(2), False)
+        gamma.optimal_gamma(H0, B1, C1, d1, 0.6, 0.0, 1e-11, 1e-7)
+        synthesis.central_controller(*gp, H0, 10.0)
+        row = synthesis.synthesise(A, B, C, w, grid, np.ones(41), 1.02, 0.0, False)[0]
+        if row[0] != 0.0:
+            raise SystemExit("the compiled kernels find no controller where there is one")
+    else:
+        gamma.plant_gain(A, B, C, grid)
+        row = np.empty(int(design.Figure.COUNT))
+        assessed = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
+        design.assess(*assessed, w, 1e5, 1e-2, row)
+        if row[0] != design.Code.NO_BANDWIDTH:
+            raise SystemExit("the compiled kernels refuse a loop that is open")
+        G = frequency.prepare(A, B, C)
+        sensitivity.sensitivity_gain(G, G, none, 1.0)
+        frequency.response(G, 1.0)
+        gamma.gamma_lower_bound(G, w, grid, np.ones(41))
+        sensitivity.axis_frequencies(A, B, C, none, 1.0)
+
+
+def ensure_compiled() -> None:
+    """Compile all kernels on two processes unless the stamp says that they are; words on stderr.
+
+    What a process leaves undone is compiled where it is needed, in silence.
+    """
+    kernels = _kernels()
+    folder = Path(next(iter(kernels.values())).stats.cache_path)
+    stamp = folder / "compiled.stamp"
+    if _read(stamp) == _state():
+        return
+    with _alone(folder / "compiled.lock"):
+        if _read(stamp) == _state():  # another process has done it
+            return
+        count = min(len(PARTS), _cores())
+        _say(
+            "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
+            f" about {duration(SECONDS / count)} on {count} core{'s' if count > 1 else ''}"
+        )
+        try:
+            done = _compile(kernels, count)
+        except OSError as error:  # no process to be had: the kernels compile as they are called
+            _say(f"ccd_casadi: not done beforehand ({error})")
+            return
+        if done:
+            with contextlib.suppress(OSError):
+                draft = stamp.with_suffix(f".{os.getpid()}")
+                draft.write_text(_state())
+                draft.replace(stamp)
+
+
+def _compile(kernels: dict[str, Any], count: int) -> bool:
+    """Run the parts on `count` processes with a bar in percent; whether all ended well."""
+    root = str(Path(__file__).parents[PACKAGE.count(".") + 1])
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
+    settings = os.environ | {WORKER: "1", "PYTHONPATH": path}
+    cost = {name: _cost(kernel) for name, kernel in kernels.items()}
+    total, done, shown = sum(cost.values()), 0.0, 0
+    # both ends of the pipe in one place: lines are short, so they do not mix
+    read, write = os.pipe()
+    workers = []
+    try:
+        for first in range(count):
+            command = [sys.executable, "-m", f"{PACKAGE}.compilation", *PARTS[first::count]]
+            workers.append(subprocess.Popen(command, env=settings, stdout=write))
+        os.close(write)
+        write = -1
+        with Progress(100, "compiling kernels, %") as bar, os.fdopen(read) as lines:
+            read = -1
+            for line in lines:
+                done += cost.pop(line.strip(), 0.0)
+                bar.advance(int(100.0 * done / total) - shown)
+                shown = int(100.0 * done / total)
+            if all(worker.wait() == 0 for worker in workers):
+                bar.advance(100 - shown)  # what was on disk already
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+        for end in (read, write):
+            if end >= 0:
+                os.close(end)
+    return all(worker.returncode == 0 for worker in workers)
+
+
+def _kernels() -> dict[str, Any]:
+    """Every kernel, by module and name."""
+    import_module(f"{PACKAGE}.gradients")  # with it all the others
+    found = {}
+    for name, module in list(sys.modules.items()):
+        if name.startswith(PACKAGE + "."):
+            for kernel in vars(module).values():
+                if isinstance(kernel, Dispatcher):
+                    found[_name(kernel)] = kernel
+    return found
+
+
+def _name(kernel: Any) -> str:
+    return f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+
+
+def _cost(kernel: Any) -> float:
+    """What compiling one costs: its own code, and a third of what LLVM optimises with it anew."""
+    called = _called(kernel, {})
+    return _size(kernel) + sum(_size(other) for other in called.values()) / 3.0
+
+
+def _size(kernel: Any) -> int:
+    return 100 + len(kernel.py_func.__code__.co_code)
+
+
+def _called(kernel: Any, seen: dict[str, Any]) -> dict[str, Any]:
+    """All kernels that one calls, by others too."""
+    for name in kernel.py_func.__code__.co_names:
+        other = kernel.py_func.__globals__.get(name)
+        if isinstance(other, Dispatcher) and _name(other) not in seen:
+            seen[_name(other)] = other
+            _called(other, seen)
+    return seen
+
+
+def _state() -> str:
+    """What compiled kernels depend on: sources, versions, processor."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    sources = [f"{file.name} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in files]
+    machine = [sys.version, binding.get_host_cpu_name()]
+    return "\n".join([*sources, *machine, *(version(name) for name in ("numba", "llvmlite"))])
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text()
+    except OSError:
+        return ""
+
+
+def _cores() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on this system
+        return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def _alone(file: Path) -> Iterator[None]:
+    """Hold a lock on a file; nothing where the system has no such locks or the file no place."""
+    try:
+        import fcntl
+
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handle = file.open("a")
+    except (ImportError, OSError):
+        yield
+        return
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            _say("ccd_casadi: waiting for another process that compiles the kernels")
+            with contextlib.suppress(OSError):
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+
+
+def _say(words: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # stderr is closed
+        print(words, file=sys.stderr, flush=True)
+
+
+class _Report(event.Listener):
+    """In a process that compiles: the name of each kernel done, on stdout."""
+
+    def on_start(self, event: Any) -> None:
+        pass
+
+    def on_end(self, event: Any) -> None:
+        kernel = event.data["dispatcher"]
+        if kernel.py_func.__module__.startswith(PACKAGE):
+            os.write(1, f"{_name(kernel)}\n".encode())
+
+
+if __name__ == "__main__":
+    event.register("numba:compile", _Report())
+    with contextlib.suppress(KeyboardInterrupt):  # whoever started this hears it as well
+        for part in sys.argv[1:]:
+            compile_part(part)
+        sys.exit(0)
+    sys.exit(130)

@@ -1,0 +1,51 @@
+"""Files that are written whole or not at all, and a run folder copied as it is at one moment."""
+
+import os
+import secrets
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from surrogates.pending_points import FOLDER
+
+LOCAL = (FOLDER, "*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # of one place, or copied otherwise
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Replace a file in one step, text as UTF-8: a kill or a full disk leaves the old one.
+
+    Raises:
+        OSError: the folder cannot be written, or the disk is full.
+    """
+    # In the same folder, since a rename is atomic only within one file system; under a name of
+    # its own, since several jobs may write the same file.
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with draft.open("wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def copy_run(run: Path, out: Path) -> None:
+    """Copy a run folder to `out`, unless something is there already: then it is gone on with.
+
+    Databases go by SQLite's own backup, whole even in the middle of a transaction and while
+    somebody writes into them.
+    """
+    if out.exists() and any(out.iterdir()):
+        return
+    draft = out.with_name(out.name + ".part")  # a kill must not leave half a run to go on with
+    shutil.rmtree(draft, ignore_errors=True)
+    shutil.copytree(run, draft, ignore=shutil.ignore_patterns(*LOCAL))
+    for path in run.glob("*.sqlite"):
+        source = sqlite3.connect(path.resolve().as_uri() + "?mode=ro", uri=True)
+        with closing(source), closing(sqlite3.connect(draft / path.name)) as target:
+            source.backup(target)
+    if out.exists():
+        out.rmdir()
+    draft.rename(out)

@@ -1,0 +1,82 @@
+"""What the commands of all packages share: exit codes, validators, one line for a wrong option."""
+
+import argparse
+import math
+from collections.abc import Callable
+from enum import IntEnum
+from typing import NoReturn
+
+LONGEST = 1000  # characters of a line: somebody else's message in it may have millions
+
+
+class ExitCode(IntEnum):
+    """How a command ended."""
+
+    DONE = 0
+    BAD_INPUT = 2
+    INFEASIBLE = 3
+    NOT_VERIFIED = 4
+    INTERRUPTED = 130
+
+
+def one_line(value: object) -> str:
+    """Any text on one line: what a terminal would obey is escaped, a long middle left out."""
+    words = " ".join(str(value).split())
+    if len(words) > LONGEST:
+        words = f"{words[: LONGEST - 200]} ... {words[-150:]}"
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, as every other bad input, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with BAD_INPUT."""
+        self.exit(ExitCode.BAD_INPUT, f"{one_line(message)}; see {self.prog} --help\n")
+
+
+def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
+    """Return the type of an option that is a whole number from `least` to `most`.
+
+    >>> whole(1)("12")
+    12
+    """
+
+    def convert(text: str) -> int:
+        # Nine digits are enough for anyone, and within what every random generator takes.
+        if not (text.isdecimal() and len(text) < 10 and least <= int(text) <= most):
+            words = f"{text[:20]!r} is no whole number from {least} to {most}; give one"
+            raise argparse.ArgumentTypeError(words)
+        return int(text)
+
+    return convert
+
+
+def number(
+    least: float = 0.0, most: float = math.inf, *, strict: bool = False
+) -> Callable[[str], float]:
+    """Return the type of an option that is a finite number from `least` to `most`.
+
+    `strict` leaves the bounds out.
+
+    >>> number(0.0, strict=True)("2.5")
+    2.5
+    """
+    words = f"number above {least:g}" if strict else f"number from {least:g}"
+    if most < math.inf:
+        words += f" and below {most:g}" if strict else f" to {most:g}"
+
+    def convert(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        inside = least < value < most if strict else least <= value <= most
+        if not (inside and math.isfinite(value)):
+            raise argparse.ArgumentTypeError(f"{text[:20]!r} is no {words}; give one")
+        return value
+
+    return convert
+
+
+positive = number(strict=True)

@@ -1,0 +1,135 @@
+"""Kernels are compiled once, with words, and nothing that a command needs is left out."""
+
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
+from numba.core import event
+
+from ccd_casadi.kernels import compilation
+from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.kernels.synthesis import synthesise as search
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.derivatives import sensitivities
+from ccd_casadi.synthesis.synthesis import sweep, synthesise
+
+
+class Compiled(event.Listener):
+    """Kernels of the package that are compiled, not read from disk."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def on_start(self, event: Any) -> None:
+        pass
+
+    def on_end(self, event: Any) -> None:
+        function = event.data["dispatcher"].py_func
+        if function.__module__.startswith("ccd_casadi"):
+            self.names.append(f"{function.__module__}.{function.__name__}")
+
+
+def test_what_the_set_up_compiles_is_all_that_the_library_calls() -> None:
+    """One channel and several, each layer that calls a kernel, and the second attempt."""
+    compilation.ensure_compiled()
+    with event.install_listener("numba:compile", Compiled()) as found:
+        weights = PAPER.at(300.0 * HZ, 60.0 * HZ)
+        for plant in (two_mass(57.0, 61.0), flexible_case(3).plant):
+            design = synthesise(plant, weights, omega_low=OMEGA_LOW)
+            sensitivities(plant, weights, omega_low=OMEGA_LOW)
+            sweep(plant, weights, np.array([200.0, 300.0]) * HZ, np.array([60.0]) * HZ,
+                  omega_low=OMEGA_LOW)  # fmt: skip
+            measure(plant, design.controller, weights, gamma=2.0, omega_low=OMEGA_LOW)
+            numbers = (plant.grid, plant_gain(plant.A, plant.B, plant.C, plant.grid), 1.02, 0.0)
+            search(plant.A, plant.B, plant.C, weights.scaled(plant.omega_0), *numbers, True)
+    assert isinstance(design.controller, StateSpace)
+    assert found.names == []
+
+
+@pytest.fixture
+def empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A place on disk that holds no kernel; what would compile them says how often it was asked."""
+    kernel = SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path / "place")))
+    monkeypatch.setattr(compilation, "_kernels", lambda: {"one": kernel})
+    return tmp_path / "place"
+
+
+def test_the_first_to_come_compiles_with_words_and_the_second_does_not(
+    empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(compilation, "_compile", lambda kernels, count: asked.append(count) or True)
+    compilation.ensure_compiled()
+    said = capsys.readouterr().err
+    assert "compiling" in said
+    assert " s on " in said
+    assert said.count("\n") == 1
+    compilation.ensure_compiled()
+    assert len(asked) == 1
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(compilation, "_state", lambda: "another version of numba")
+    compilation.ensure_compiled()
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("how", ["ends badly", "interrupted", "no process"])
+def test_what_was_not_finished_is_not_taken_for_finished(
+    how: str, empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ended(kernels: object, count: int) -> bool:
+        if how == "interrupted":
+            raise KeyboardInterrupt
+        if how == "no process":
+            raise OSError("no memory")
+        return False
+
+    monkeypatch.setattr(compilation, "_compile", ended)
+    if how == "interrupted":
+        with pytest.raises(KeyboardInterrupt):
+            compilation.ensure_compiled()
+    else:
+        compilation.ensure_compiled()
+    assert ("no memory" in capsys.readouterr().err) == (how == "no process")
+    asked: list[int] = []
+    monkeypatch.setattr(compilation, "_compile", lambda kernels, count: asked.append(count) or True)
+    compilation.ensure_compiled()
+    assert len(asked) == 1
+
+
+def test_two_programs_do_not_compile_the_same(
+    empty: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun, go, asked = threading.Event(), threading.Event(), []
+
+    def slowly(kernels: object, count: int) -> bool:
+        asked.append(count)
+        begun.set()
+        return go.wait(30.0)
+
+    monkeypatch.setattr(compilation, "_compile", slowly)
+    said: list[str] = []
+    monkeypatch.setattr(compilation, "_say", said.append)
+    first = threading.Thread(target=compilation.ensure_compiled)
+    second = threading.Thread(target=compilation.ensure_compiled)
+    first.start()
+    assert begun.wait(30.0)
+    second.start()
+    while not any("waiting" in words for words in said):
+        assert second.is_alive()
+    go.set()
+    first.join(30.0)
+    second.join(30.0)
+    assert len(asked) == 1
+
+
+def test_costs_follow_what_a_kernel_calls() -> None:
+    """The bar counts a kernel by itself and by what is compiled into it."""
+    kernels = compilation._kernels()
+    cost = {name.rpartition(".")[2]: compilation._cost(kernel) for name, kernel in kernels.items()}
+    assert cost["assess"] > cost["peak"] > cost["axis_frequencies"] > cost["eigenvalues"]
+    assert cost["_synthesise"] > cost["optimal_gamma"] > cost["riccati_level"]
