@@ -262,6 +262,20 @@ def off_design_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Arr
     return (out, fixed, gaps) if ok else none
 
 
+def peak_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
+                   loops: Sequence[Loop]) -> Array:  # fmt: skip
+    """Gradients (k, n_θ + 8) of ln σ_max(S(jω)) at local maxima over ω; NaN where there are none.
+
+    The frequency of a maximum drops out (envelope). `row` and `gamma_slope` as above.
+    """
+    with np.errstate(all="ignore"):
+        gp, H0, f = _parts(design_plant.A, design_plant.B, design_plant.C, design_plant.w)
+        found, _, _, gains, _, ok = loop_gradients(
+            design_plant, gp, H0, f, float(row[Figure.GAMMA_OPT]), gamma_slope, loops
+        )
+    return found / gains[:, None] if ok else found
+
+
 def _parts(A, B, C, w):
     """The generalized plant, its Hamiltonian at γ = ∞ and the weights' state space."""
     gp = generalized_plant(A, B, C, w)
