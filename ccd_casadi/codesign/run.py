@@ -107,25 +107,37 @@ def co_design(
     A robust problem that leaves its design plant open is solved for each, and the best one kept.
     """
     began = perf_counter()
-    name = type(formulation).__name__.lower()
+    if unmet_constraint(sampler.problem, formulation.starts, seed):
+        return _co_design(sampler, formulation, seed)  # which says so
 
-    def verified(each: Sampler, outcome: FormulationResult) -> Solution:
+    def concluded(each: Sampler, outcome: FormulationResult) -> Solution:
+        name = type(formulation).__name__.lower()
         return conclude(each, name, outcome, formulation.tolerance, seed, began)
 
+    return best_over_design_plants(
+        sampler, lambda each: _co_design(each, formulation, seed, given), concluded
+    )
+
+
+def _co_design(
+    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
+) -> Solution:
+    """The same for a problem with one design plant."""
+    began = perf_counter()
+    name = type(formulation).__name__.lower()
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
-        return verified(sampler, FormulationResult(None, None, (), (), None, False, forbidden))
-
-    def solved(each: Sampler) -> Solution:
+        outcome = FormulationResult(None, None, (), (), None, False, forbidden)
+    else:
         if isinstance(formulation, Nested):
-            outcome = solve_nested(each, formulation, seed=seed, given=given)
+            outcome = solve_nested(sampler, formulation, seed=seed, given=given)
         elif isinstance(formulation, Lifted):
-            outcome = solve_lifted(each, formulation, seed=seed, given=given)
+            outcome = solve_lifted(sampler, formulation, seed=seed, given=given)
         else:
-            outcome = solve_direct(each, formulation, seed=seed)
-        return verified(each, rescue(each, outcome, seed) if outcome.x is None else outcome)
-
-    return best_over_design_plants(sampler, solved, verified)
+            outcome = solve_direct(sampler, formulation, seed=seed)
+        if outcome.x is None:
+            outcome = rescue(sampler, outcome, seed)
+    return conclude(sampler, name, outcome, formulation.tolerance, seed, began)
 
 
 def conclude(
