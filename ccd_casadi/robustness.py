@@ -41,6 +41,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         raise UserError(f"--damping: is {low:g} {high:g}; give a factor up to 1 and one from 1")
     place = options.out or options.run
     if options.controller is not None:
+        from ccd_casadi.deployment.given_controller import with_controller
+
         finished = with_controller(finished, options.controller)
         if options.out is None:  # the run's own page stays
             place = options.run / f"robustness_{options.controller.stem}"

@@ -6,10 +6,10 @@ checked, and the controller is certified again on the plant that the case file d
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -29,14 +29,27 @@ from ccd_casadi.synthesis.weights import Weights
 SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
 
 
+class SampledController(Protocol):
+    """A controller that runs every `period` (s), its hold and delay exact on any plant."""
+
+    @property
+    def period(self) -> float:
+        """Of sampling, in s."""
+
+    def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
+        """Stability, ω_b (rad/s), ‖S‖∞ and rate of growth (1/s) of the loop on a plant."""
+
+    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (k, p, m) and K (k, m, p) at frequencies (k,) in rad/s."""
+
+
 @dataclass(frozen=True)
 class FinishedRun:
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
-    `result` is result.json as it was written. With a controller in discrete time in place of the
-    run's own (`period` above 0, s) `sampled_judge` gives stability, ω_b, ‖S‖∞ and rate of growth of
-    the sampled loop on a plant, `sampled_responses` G and K at frequencies in rad/s.
+    `result` is result.json as it was written. `sampled` is a controller in discrete time in place
+    of the run's own, where one is judged.
     """
 
     folder: Path
@@ -48,9 +61,7 @@ class FinishedRun:
     controller: StateSpace
     figures: DesignFigures
     result: Mapping[str, Any]
-    sampled_judge: Callable[[ScaledPlant], tuple[bool, float, float, float]] | None = None
-    sampled_responses: Callable[[Array], tuple[np.ndarray, np.ndarray]] | None = None
-    period: float = 0.0
+    sampled: "SampledController | None" = None
     kappa: Array | None = None  # of a fixed structure, SI
 
 

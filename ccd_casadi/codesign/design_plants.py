@@ -2,8 +2,8 @@
 
     min over θ and design plants s of J(θ, s) = min over s of (min over θ of J(θ, s))
 
-Where none of them is verified, the range is reached by continuation: from the optimum of the plant
-alone the set is widened step by step, each design polished on the true problem of a wider one.
+Where none of them holds on the whole set, the range is reached by continuation: from the optimum of
+the plant alone the set is widened step by step, each design polished on the problem of a wider one.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 FIRST = 0.25  # share of the range of the first step of a continuation
-POLISHES = 8  # at most in a continuation
+POLISHES = 5  # at most in a continuation
 LEAST = 1.0 / 16.0  # share of the range under which a step is given up
 
 
@@ -81,7 +81,7 @@ def best_over_design_plants(
     samplers = [sampler.of(choice) if len(choices) > 1 else sampler for choice in choices]
     found = [solve(each) for each in samplers]
     share = None
-    if problem.robust is not None and not any(map(_verified, found)):
+    if problem.robust is not None and not any(map(_holds, found)):
         share = 0.0
         alone = solve(sampler.of(replace(problem, robust=None), traced=False))
         if alone.verified is not None:
@@ -102,6 +102,14 @@ def best_over_design_plants(
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     result["reason"] = _reason(samplers[best], problem, found[best], share)
     return replace(found[best], result=result, problem=choices[best])
+
+
+def _holds(item: Solution) -> bool:
+    """Whether the design keeps its constraints on the whole set, whatever else is said of it."""
+    checks = item.result.get("checks", {})
+    return bool(checks) and all(
+        checks.get(name, True) for name in ("certificate", "constraints", "robust")
+    )
 
 
 def _verified(item: Solution) -> bool:

@@ -55,6 +55,31 @@ class Given:
     delay: float = 0.0
 
 
+@dataclass(frozen=True)
+class Sampled:
+    """A controller in discrete time with its delay in s; see `SampledController`."""
+
+    system: DiscreteStateSpace
+    delay: float
+
+    @property
+    def period(self) -> float:
+        """Of sampling, in s."""
+        return self.system.period
+
+    def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
+        """Stability, ω_b, ‖S‖∞ and rate of growth of the sampled loop."""
+        held = sampled_plant(plant.plant_si(), self.period, self.delay)
+        f = sampled_figures(sensitivity_loop(held, self.system))
+        growth = np.log(max(f.spectral_radius, 1e-300)) / self.period
+        return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
+
+    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G behind hold and delay, and K."""
+        held = sampled_plant(plant.plant_si(), self.period, self.delay)
+        return held.response(omega), self.system.response(omega)
+
+
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
     """The run with the controller of a file in place of its own, measured on its plant.
 
@@ -74,28 +99,13 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
-    discrete = DiscreteStateSpace(K.A, K.B, K.C, K.D, given.period)
-
-    def judge(plant: ScaledPlant) -> tuple[bool, float, float, float]:
-        held = sampled_plant(plant.plant_si(), given.period, given.delay)
-        f = sampled_figures(sensitivity_loop(held, discrete))
-        growth = np.log(max(f.spectral_radius, 1e-300)) / given.period
-        return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
-
-    stable, bandwidth, peak, growth = judge(run.plant)
+    sampled = Sampled(DiscreteStateSpace(K.A, K.B, K.C, K.D, given.period), given.delay)
+    stable, bandwidth, peak, growth = sampled.judge(run.plant)
     if not stable:
         words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
         raise UserError(f"{path}: {words}")
     figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
-
-    def responses(omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        held = sampled_plant(run.plant.plant_si(), given.period, given.delay)
-        return held.response(omega), discrete.response(omega)
-
-    return replace(
-        run, controller=K, figures=figures, sampled_judge=judge, sampled_responses=responses,
-        period=given.period,
-    )  # fmt: skip
+    return replace(run, controller=K, figures=figures, sampled=sampled)
 
 
 def read_controller(path: Path) -> Given:

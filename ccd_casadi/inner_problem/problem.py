@@ -285,7 +285,8 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
 
         max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper)
 
-    An infeasible θ is a result without `optimum` that says what falls short.
+    The best over the design plants of a robust problem that leaves its own open. An infeasible θ
+    is a result without `optimum` that says what falls short.
 
     >>> import ccd_casadi as ccd
     >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))

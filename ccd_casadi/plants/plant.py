@@ -55,9 +55,9 @@ class Plant:
     not optimised. `values` is `evaluate` without derivatives where that is cheaper, `notes` what a
     reader of a result at θ must know of the plant, `domain` the bounds of θ beyond which it is not
     known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
-    to be checked by the true one.
-    `doubt` says what is wrong with the derivatives at θ, empty where nothing is. Without
-    `exact_hessian` second derivatives of `hardware` cost too much to be asked for.
+    to be checked by the true one. `doubt` says what is wrong with the derivatives at θ, empty where
+    nothing is. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
+    for.
     """
 
     names: tuple[str, ...]

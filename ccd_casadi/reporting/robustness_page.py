@@ -97,9 +97,10 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
     words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
-    if run.period:
+    if run.sampled is not None:
+        step = f"{1e6 * run.sampled.period:.5g} µs"
         words.append(
-            f"A controller in discrete time, a step every {1e6 * run.period:.5g} µs, hold and "
+            f"A controller in discrete time, a step every {step}, hold and "
             "delay exact; noise, the structured singular value and moves are of continuous ones."
         )
     return words

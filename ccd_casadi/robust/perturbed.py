@@ -50,8 +50,8 @@ class Line:
 
 def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Judged:
     """The run's controller on a plant."""
-    if run.sampled_judge is not None:
-        good, omega, height, growth = run.sampled_judge(scale_plant(modal, run.problem.weights.M_K))
+    if run.sampled is not None:
+        good, omega, height, growth = run.sampled.judge(scale_plant(modal, run.problem.weights.M_K))
         return Judged(place, good, omega, height if good else np.inf, growth)
     figures: DesignFigures = measure(
         scale_plant(modal, run.problem.weights.M_K),

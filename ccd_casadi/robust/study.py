@@ -39,8 +39,8 @@ class Study:
     of the plant without its suspension, `moves` the move without and with feedforward.
 
     `structured` is None where no flexible mode is in the loop, and where the bound was not computed
-    within the `overrun` seconds that it was given.
-    Of a controller in discrete time there are no `noise`, no `structured` bound and no `moves`.
+    within the `overrun` seconds that it was given. Of a controller in discrete time there are no
+    `noise`, no `structured` bound and no `moves`.
     """
 
     demands: Demands
@@ -79,7 +79,7 @@ def with_structured_bound(run: FinishedRun, found: Study, seconds: float | None 
 
     Given `seconds`, it is computed in a process of its own, which is ended after them.
     """
-    if run.period:  # the bound is of continuous loops
+    if run.sampled is not None:
         return found
     modal = modal_plant(system_of(run), run.problem.suspension)
     if seconds is None:
@@ -105,8 +105,8 @@ def tried(
     """Everything but the structured singular value; `workers` share what they can."""
     demands = demands or Demands()
     bandwidth_hz = run.figures.bandwidth / HZ
-    if run.period:
-        return _sampled(run, demands, seed, quiet)
+    if run.sampled is not None:
+        return _sampled(run, demands, seed, quiet, workers)
     loop = loop_data(
         run.plant, run.controller, run.weights, gamma=run.figures.gamma,
         bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
@@ -138,16 +138,16 @@ def tried(
     )
 
 
-def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool) -> Study:
+def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool | None) -> Study:
     """The part of the study that a controller in discrete time has, hold and delay exact."""
-    assert run.sampled_responses is not None
+    assert run.sampled is not None
     system = system_of(run)
-    nyquist = 0.5 / run.period
+    nyquist = 0.5 / run.sampled.period
     around = run.plant.grid * run.plant.omega_0 / HZ
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
-    G, K = run.sampled_responses(HZ * hz)
-    at = run.sampled_responses(np.array([run.figures.bandwidth]))[1][0]
+    G, K = run.sampled.responses(run.plant, HZ * hz)
+    at = run.sampled.responses(run.plant, np.array([run.figures.bandwidth]))[1][0]
     return Study(
         demands=d,
         hz=hz,
@@ -155,11 +155,11 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool) -> Study:
         margins=sampled_margins(hz, G, K),
         noise=None,
         statics=sampled_statics(run.plant.plant_si(), run.controller, at),
-        shift=shift_line(run, system, d.shift),
-        damping=damping_line(run, system, *d.damping),
+        shift=shift_line(run, system, d.shift, quiet=quiet),
+        damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet),
+        box=worst_in_box(run, system, d.shift, d.damping, quiet),
+        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
         structured=None,
         setpoint=setpoint(d.limits),
         free=False,
@@ -214,7 +214,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         "static_stiffness": found.statics.stiffness,
         "static_compliance": found.statics.compliance,
         "static_share": found.statics.share,
-        "period": run.period or None,
+        "period": None if run.sampled is None else run.sampled.period,
         "noise": None
         if found.noise is None
         else {"sensor_density": d.sensor, "force_density": d.disturbance}
