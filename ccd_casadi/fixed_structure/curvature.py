@@ -1,0 +1,63 @@
+"""The Hessian of the Lagrangian Σ μ_j c_j to (κ, τ), exact but for one difference in frequency.
+
+At a fixed frequency, with g = ∂ln K,
+
+    ∂²ln|S| = -Re(S T g gᵀ + T ∂²ln K),   ∂²ln|KS| = ∂²ln|T| = -Re(S T g gᵀ - S ∂²ln K),
+
+and a peak moves as κ does: -c_xκ c_xκᵀ/c_xx is added, x = ln v. (T here is without weight.)
+"""
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, evaluate
+from ccd_casadi.fixed_structure.structure import second_slopes
+from ccd_casadi.plant import Array
+
+STEP = 1e-5  # of ln v
+OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
+
+
+def lagrangian_hessian(
+    problem: Problem, kappa: Array, tau: float, rows: Constraints, mu: Array
+) -> Array:
+    """(n + 1, n + 1): κ, then τ; for multipliers μ >= 0 of these constraints."""
+    n = len(kappa)
+    out = np.zeros((n + 1, n + 1))
+    rows, mu = rows.only(mu > 0.0), mu[mu > 0.0]
+    if not len(mu):
+        return out
+    at = evaluate(problem, kappa, tau, rows.plant, rows.v)
+    T = 1.0 - at.S
+    of_s = np.isin(rows.curve, OF_S)
+    weight = mu * np.where(of_s, -T, at.S)
+    second = second_slopes(problem.structure, kappa, 1j * rows.v)
+    out[:n, :n] = np.einsum("m,mij->ij", weight, second).real
+    g = at.to_kappa
+    out[:n, :n] -= np.einsum("m,mi,mj->ij", mu * at.S * T, g, g).real
+    slopes, gradients = [], []
+    for sign in (1.0, -1.0):
+        moved = rows.v * np.exp(sign * STEP)
+        near = evaluate(problem, kappa, tau, rows.plant, moved)
+        slopes.append(_chosen(near.slopes, rows.curve))
+        factor = np.where(of_s, near.S - 1.0, near.S)
+        gradients.append((factor[:, None] * near.to_kappa).real)
+    slope = _chosen(at.slopes, rows.curve)
+    c_xx = (slopes[0] - slopes[1]) / (2.0 * STEP)
+    c_xk = (gradients[0] - gradients[1]) / (2.0 * STEP)
+    end = rows.curve == Curve.CROSSING
+    fixed = end | (rows.curve == Curve.S_LOW)
+    top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
+    out[:n, :n] -= np.einsum("m,mi,mj->ij", (mu / np.where(top, c_xx, np.inf))[top], c_xk[top],
+                             c_xk[top])  # fmt: skip
+    if end.any():
+        chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
+        out[:n, n] = out[n, :n] = (mu[end] * chain) @ c_xk[end]
+        out[n, n] = float((mu[end] * chain**2) @ c_xx[end])
+    return out
+
+
+def _chosen(parts: dict[Curve, Array], curve: np.ndarray) -> Array:
+    out = np.empty(len(curve))
+    for code in np.unique(curve):
+        out[curve == code] = parts[Curve(code)][curve == code]
+    return out

@@ -1,0 +1,335 @@
+"""The loop of one controller with every plant of a set, continuous or sampled, in one variable.
+
+Sampled at a rate 1/T, with a zero-order hold and a delay τ, the plant is z⁻ᵈ C f(A) B at the
+instants, exactly. It is written in w = (2/T)(z - 1)/(z + 1): the inside of the unit circle becomes
+the left half plane, z = e^{jωT} becomes w = jv with v = (2/T) tan(ωT/2), and K(w) is K(z) by
+Tustin's rule, without prewarping and without lead, as `deploy` discretises it. So both kinds of
+loop are one: poles in the left half plane, responses on jv. Without sampling v = ω. A delay comes
+with sampling only: then the loop has finitely many poles, and its stability is decided by them.
+
+Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from ccd_casadi.fixed_structure.structure import Structure, state_spaces
+from ccd_casadi.plant import Array, PlantError
+from ccd_casadi.scaling import ScaledPlant
+
+CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
+FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
+INSTANT = 1e-9  # share of a period that counts as none
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the loop runs: rate in Hz, delay from measurement to force in µs."""
+
+    rate_hz: float
+    delay_us: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.rate_hz > 0.0:
+            raise ValueError(f"rate_hz is {self.rate_hz}; give a rate above 0")
+        if not self.delay_us >= 0.0:
+            raise ValueError(f"delay_us is {self.delay_us}; give 0 or more")
+
+    @property
+    def period(self) -> float:
+        """T in s."""
+        return 1.0 / self.rate_hz
+
+    @property
+    def delay(self) -> float:
+        """τ in s."""
+        return 1e-6 * self.delay_us
+
+
+@dataclass(frozen=True)
+class LoopPlant:
+    """One plant as the loop sees it.
+
+    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B and `reading` = CV in
+    its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    poles: np.ndarray
+    drive: np.ndarray
+    reading: np.ndarray
+    dA: np.ndarray
+    dB: np.ndarray
+    dC: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlantSet:
+    """All plants in the units of the first: ω₀ in rad/s, force in N/m; T and τ in 1/ω₀.
+
+    `poles` and `residues` (P, n) are those of the continuous plants, the shorter ones with zeros.
+    """
+
+    plants: tuple[LoopPlant, ...]
+    omega_0: float
+    force: float
+    period: float | None
+    delay: float
+    poles: np.ndarray
+    residues: np.ndarray
+    zeros: tuple[np.ndarray, ...]
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    def frequency(self, v: Array) -> Array:
+        """ω of v, both over ω₀."""
+        if self.period is None:
+            return v
+        return np.asarray(2.0 / self.period * np.arctan(0.5 * self.period * v))
+
+    def variable(self, omega: Array) -> Array:
+        """v of ω, both over ω₀; infinite from half the sampling rate on."""
+        if self.period is None:
+            return omega
+        half = np.minimum(0.5 * self.period * omega, 0.5 * np.pi)
+        return np.asarray(2.0 / self.period * np.tan(half))
+
+    def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
+        p, r = self.poles[which], self.residues[which]
+        omega = self.frequency(v)
+        s = 1j * omega[..., None]
+        if self.period is None:
+            terms = 1.0 / (s - p)
+            G = (r * terms).sum(-1)
+            return G, -(r * terms * terms).sum(-1) * 1j * v
+        T = self.period
+        d, late, early = _moments(p, T, self.delay)
+        z = np.exp(s * T)
+        gap = np.exp(p * T) * np.expm1((s - p) * T)
+        value = r * (late + early / z) / gap
+        slope = r * early / (z * gap) + value * z / gap
+        shift = np.exp(-1j * omega * T * d)
+        G = value.sum(-1)
+        dG = -1j * T * (slope.sum(-1) + d * G)
+        return G * shift, dG * shift * v / (1.0 + (0.5 * T * v) ** 2)
+
+    def free_responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G(jω) of the continuous plant without hold and delay, and ∂G/∂ln v.
+
+        A disturbing force d e^{jωt} shows in the samples as G(jω) d, whatever the sampling.
+        """
+        omega = self.frequency(v)
+        terms = 1.0 / (1j * omega[..., None] - self.poles[which])
+        r = self.residues[which]
+        chain = omega if self.period is None else v / (1.0 + (0.5 * self.period * v) ** 2)
+        return (r * terms).sum(-1), -(r * terms * terms).sum(-1) * 1j * chain
+
+    def to_theta(self, which: int, v: Array, *, free: bool = False) -> np.ndarray:
+        """∂G/∂θ (len(v), n_θ) of one plant at jv; `free` of hold and delay.
+
+        dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B   (Daleckii and Krein)
+        """
+        plant = self.plants[which]
+        p = plant.poles
+        omega = self.frequency(np.asarray(v, float))
+        period = None if free else self.period
+        f, slope = _transfer(p, omega, period, self.delay)
+        gap = p[:, None] - p[None, :]
+        near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
+        middle = 0.5 * (p[:, None] + p[None, :])
+        between = np.where(
+            near,
+            _transfer(middle.ravel(), omega, period, self.delay)[1].reshape(-1, *gap.shape)
+            if (near.sum() > len(p))
+            else slope[:, :, None] * np.ones(len(p)),
+            (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap),
+        )
+        c, b = plant.reading, plant.drive
+        out = np.einsum("i,kij,j,tij->kt", c, between, b, plant.dA, optimize=True)
+        out += np.einsum("ti,ki,i->kt", plant.dC, f, b, optimize=True)
+        out += np.einsum("i,ki,ti->kt", c, f, plant.dB, optimize=True)
+        return np.asarray(out)
+
+
+def plant_set(plants: Sequence[ScaledPlant], sampling: Sampling | None = None) -> PlantSet:
+    """The plants in common units, with hold and delay where the loop is sampled.
+
+    Raises PlantError for a plant that is not SISO, not stable, or not diagonalisable.
+    """
+    if not plants:
+        raise PlantError("there is no plant in the set; give at least one")
+    omega_0, force = plants[0].omega_0, plants[0].force
+    period = None if sampling is None else sampling.period * omega_0
+    delay = 0.0 if sampling is None else sampling.delay * omega_0
+    found, zeros = [], []
+    for number, plant in enumerate(plants, 1):
+        found.append(_loop_plant(plant, number, omega_0, force, period, delay))
+        zeros.append(_zeros(found[-1]))
+    most = max(len(plant.poles) for plant in found)
+    poles = np.full((len(found), most), -1.0, complex)
+    residues = np.zeros((len(found), most), complex)
+    for i, loop in enumerate(found):
+        poles[i, : len(loop.poles)] = loop.poles
+        residues[i, : len(loop.poles)] = loop.reading * loop.drive
+    states = max(len(plant.A) for plant in found)
+    A = np.tile(-np.eye(states), (len(found), 1, 1))
+    B, C = np.zeros((len(found), states, 1)), np.zeros((len(found), 1, states))
+    for i, loop in enumerate(found):
+        n = len(loop.A)
+        A[i, :n, :n], B[i, :n], C[i, :, :n] = loop.A, loop.B, loop.C
+    D = np.array([plant.D for plant in found])
+    return PlantSet(
+        tuple(found), omega_0, force, period, delay, poles, residues, tuple(zeros), A, B, C, D
+    )
+
+
+def closed_loops(plants: PlantSet, structure: Structure, kappa: Array) -> np.ndarray:
+    """Poles (N, P, n) in w of every plant's loop with N controllers κ (N, n_κ); NaN if ill-posed.
+
+    An algebraic loop with 1 + D_G D_K = 0 has a pole at z = -1: it counts as not stable.
+    """
+    a, b, c, d = state_spaces(structure, np.atleast_2d(kappa))
+    N, P, n, k = len(a), len(plants.A), plants.A.shape[1], a.shape[1]
+    Dg, Dk = plants.D[None, :, 0, 0], d[:, None, 0, 0]
+    well = 1.0 + Dg * Dk
+    m = (1.0 / np.where(well == 0.0, 1.0, well))[..., None, None]
+    A, B, C = plants.A[None], plants.B[None], plants.C[None]
+    a, b, c = a[:, None], b[:, None], c[:, None]
+    Dg, Dk = Dg[..., None, None], Dk[..., None, None]
+    joint = np.empty((N, P, n + k, n + k))
+    joint[:, :, :n, :n] = A - m * Dk * (B @ C)
+    joint[:, :, :n, n:] = m * (B @ c)
+    joint[:, :, n:, :n] = -m * (b @ C)
+    joint[:, :, n:, n:] = a - m * Dg * (b @ c)
+    values = np.linalg.eigvals(joint)
+    return np.where((well != 0.0)[..., None], values, np.nan)
+
+
+def stable(poles: np.ndarray) -> np.ndarray:
+    """Whether all poles (..., n) lie in the open left half plane."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((poles.real < 0.0).all(-1))
+
+
+def _transfer(
+    p: np.ndarray, omega: Array, period: float | None, delay: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """f(p) and f'(p), (len(ω), len(p)), with which the plant's response is C f(A) B."""
+    s = 1j * omega[:, None]
+    if period is None:
+        f = 1.0 / (s - p)
+        return f, f * f
+    T = period
+    d, late, early = _moments(p, T, delay)
+    h = T * (np.floor(delay / T + INSTANT) + 1.0) - delay  # (1 - f)T
+    z = np.exp(s * T)
+    lam = np.exp(p * T)
+    gap = lam * np.expm1((s - p) * T)
+    d_late = (h * np.exp(p * h) - late) / p
+    rest = T - h
+    phi = np.expm1(p * rest) / p
+    d_early = h * early + np.exp(p * h) * (rest * np.exp(p * rest) - phi) / p
+    top = late + early / z
+    shift = np.exp(-s * T * d)
+    f = top / gap
+    return f * shift, ((d_late + d_early / z) / gap + f * T * lam / gap) * shift
+
+
+def _moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """Whole periods d of delay, and what u_{k-d} and u_{k-d-1} give a mode in one period."""
+    d = float(np.floor(delay / T + INSTANT))
+    rest = max(delay - d * T, 0.0)
+    h = T - rest
+    late = np.expm1(p * h) / p
+    early = np.exp(p * h) * np.expm1(p * rest) / p
+    return d, late, early
+
+
+def _loop_plant(
+    plant: ScaledPlant,
+    number: int,
+    omega_0: float,
+    force: float,
+    period: float | None,
+    delay: float,
+) -> LoopPlant:
+    if plant.B.shape[1] != 1 or plant.C.shape[0] != 1:
+        raise PlantError(f"plant {number} is not SISO; give one of its channels")
+    ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
+    A, B, C = ratio * plant.A, drive * plant.B, plant.C
+    poles, V = np.linalg.eig(A)
+    if not (poles.real < 0.0).all():
+        words = "is not stable; a suspension has to hold its rigid-body modes"
+        raise PlantError(f"plant {number} {words}")
+    W = np.linalg.inv(V)
+    b, c = W @ B[:, 0], C[0] @ V
+    at = 1j * np.geomspace(1e-2, 1e2, 7)
+    direct = [complex((C @ np.linalg.solve(s * np.eye(len(A)) - A, B))[0, 0]) for s in at]
+    modal = (c * b / (at[:, None] - poles)).sum(-1)
+    if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
+        words = "has poles that coincide and are coupled; move a damping ratio away from 1"
+        raise PlantError(f"plant {number} {words}")
+    state = (A, B, C, np.zeros((1, 1)))
+    if period is not None:
+        state = _in_w(*_sampled(A, B, C, period, delay), period)
+    theta = len(plant.dA)
+    dA = np.einsum("ij,tjk,kl->til", W, ratio * plant.dA, V) if theta else np.zeros((0, *A.shape))
+    dB = drive * plant.dB[:, :, 0] @ W.T
+    return LoopPlant(*state, poles, b, c, dA, dB, plant.dC[:, 0] @ V)
+
+
+def _sampled(
+    A: Array, B: Array, C: Array, T: float, delay: float
+) -> tuple[Array, Array, Array]:
+    """x_{k+1} = A x_k + B u_k behind hold and delay; states [x; u_{k-1}; …]."""
+    n = len(A)
+    d = int(np.floor(delay / T + INSTANT))
+    rest = max(delay - d * T, 0.0)
+    joint = np.zeros((n + 1, n + 1))
+    joint[:n] = np.hstack([A, B])
+    early, late = expm(joint * rest), expm(joint * (T - rest))
+    kept = d + (rest > 0.0)
+    Ad, Bd = np.zeros((n + kept, n + kept)), np.zeros((n + kept, 1))
+    Ad[:n, :n] = late[:n, :n] @ early[:n, :n]
+    for age, gain in ((d, late[:n, n:]), (d + 1, late[:n, :n] @ early[:n, n:])):
+        if age == 0:
+            Bd[:n] = gain
+        elif age <= kept:
+            Ad[:n, n + age - 1 : n + age] = gain
+    if kept:
+        Bd[n] = 1.0
+        Ad[n + 1 :, n : n + kept - 1] = np.eye(kept - 1)
+    return Ad, Bd, np.hstack([C, np.zeros((1, kept))])
+
+
+def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, Array]:
+    """z = (1 + wT/2)/(1 - wT/2) in a discrete state space."""
+    inverse = np.linalg.inv(A + np.eye(len(A)))
+    root = 2.0 / np.sqrt(T)
+    return (
+        2.0 / T * inverse @ (A - np.eye(len(A))),
+        root * inverse @ B,
+        root * C @ inverse,
+        -C @ inverse @ B,
+    )
+
+
+def _zeros(plant: LoopPlant) -> np.ndarray:
+    """Finite zeros in w: eigenvalues of A - B C_r⁺... by the pencil of the system matrix."""
+    from scipy.linalg import eig
+
+    n = len(plant.A)
+    system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
+    shape = np.zeros((n + 1, n + 1))
+    shape[:n, :n] = np.eye(n)
+    values = eig(system, shape, right=False)
+    return np.asarray(values[np.isfinite(values) & (np.abs(values) < 1e5)])

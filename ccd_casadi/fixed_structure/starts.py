@@ -1,0 +1,99 @@
+"""Where local searches start: loop-shaping rules and random controllers, all of them stable loops.
+
+A start has its crossover |L(jω_c)| = 1 at a chosen frequency, integrator and lead placed around it
+by the rules of thumb (ω_i = ω_c/6, lead from ω_c/3 to 3ω_c, roll-off at 8ω_c), and its biquads as
+notches at the plants' resonances (`by rules`) or anywhere (`at random`). Only those that every
+closed loop of the set is stable with are kept: that is decided by eigenvalues, for hundreds at once.
+"""
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.figures import Problem
+from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.structure import Kind, response
+from ccd_casadi.plant import Array
+
+
+def resonances(problem: Problem) -> Array:
+    """|p| of the flexible modes of the first plant that the loop sees, the strongest first."""
+    plants = problem.plants
+    p, r = plants.poles[0], plants.residues[0]
+    light = (p.imag > 0.0) & (-p.real < 0.2 * np.abs(p))
+    strength = np.abs(r) / np.maximum(-p.real, 1e-300)
+    order = np.argsort(-strength[light])
+    return np.asarray(np.abs(p[light])[order])
+
+
+def by_rules(problem: Problem, crossovers: Array) -> Array:
+    """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
+
+    Notches come narrow and wide, and shifted to either side.
+    """
+    tops = resonances(problem)
+    found = []
+    for crossover in crossovers:
+        for width, below in ((0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)):
+            values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)
+            for i in range(problem.structure.biquads):
+                notch = tops[i % len(tops)] if len(tops) else 4.0 * crossover
+                values[f"biquad {i + 1} zeros"] = notch * below ** (1 + i // max(len(tops), 1))
+                values[f"biquad {i + 1} zeros damping"] = 0.1
+                values[f"biquad {i + 1} poles"] = notch * below
+                values[f"biquad {i + 1} poles damping"] = width
+            found.append(_kappa(problem, values))
+    return _crossing(problem, np.array(found), np.repeat(crossovers, 4))
+
+
+def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:
+    """(N, n) random controllers with these crossovers."""
+    tops = resonances(problem)
+    found = []
+    for crossover in crossovers:
+        values = _around(problem, float(crossover), rng, 1.0)
+        for i in range(problem.structure.biquads):
+            near = len(tops) and rng.random() < 0.6
+            middle = rng.choice(tops) if near else crossover * np.exp(rng.uniform(-0.5, 2.5))
+            values[f"biquad {i + 1} zeros"] = middle * np.exp(rng.normal(0.0, 0.25))
+            values[f"biquad {i + 1} zeros damping"] = np.exp(rng.uniform(np.log(0.02), 0.0))
+            values[f"biquad {i + 1} poles"] = middle * np.exp(rng.normal(0.1, 0.4))
+            values[f"biquad {i + 1} poles damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
+        found.append(_kappa(problem, values))
+    return _crossing(problem, np.array(found), crossovers)
+
+
+def kept(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
+    """Those (N, n) with which every closed loop is stable."""
+    parts = [kappa[i : i + chunk] for i in range(0, len(kappa), chunk)]
+    good = [stable(closed_loops(problem.plants, problem.structure, part)).all(1) for part in parts]
+    return kappa[np.concatenate(good)] if len(kappa) else kappa
+
+
+def _around(
+    problem: Problem, crossover: float, rng: np.random.Generator, spread: float
+) -> dict[str, float]:
+    def near(factor: float) -> float:
+        return crossover * factor * float(np.exp(spread * rng.normal(0.0, 0.5)))
+
+    values = {"gain": 1.0, "integrator": near(1.0 / 6.0)}
+    for i in range(1, problem.structure.lead + 1):
+        values[f"lead {i} zero"], values[f"lead {i} pole"] = near(1.0 / 3.0), near(3.0 * i)
+    for i in range(1, problem.structure.roll_off // 2 + 1):
+        values[f"roll-off {i}"], values[f"roll-off {i} damping"] = near(8.0), 0.7
+    values["roll-off real"] = near(8.0)
+    return values
+
+
+def _kappa(problem: Problem, values: dict[str, float]) -> Array:
+    return np.log(np.array([values[name] for name in problem.structure.names]))
+
+
+def _crossing(problem: Problem, kappa: Array, crossovers: Array) -> Array:
+    """The same with the gain that gives |L| = 1 at the crossover of the first plant, boxed."""
+    kappa = np.clip(kappa, *problem.box)
+    kinds = np.array([kind is Kind.GAIN for kind in problem.structure.kinds])
+    v = problem.plants.variable(np.asarray(crossovers, float))
+    kappa[:, kinds] = 0.0
+    K = response(problem.structure, kappa.T, 1j * v)
+    G, _ = problem.plants.responses(np.zeros(len(v), int), v)
+    kappa[:, kinds] = -np.log(np.abs(G * K))[:, None]
+    return np.clip(kappa, *problem.box)

@@ -1,0 +1,262 @@
+"""A controller of fixed structure: gain, integrator, leads, biquads, roll-off.
+
+    K(s) = k (1 + ω_i/s) Π (1 + s/z)/(1 + s/p) Π q(s; ω_z, ζ_z)/q(s; ω_p, ζ_p) · 1/r(s)
+    q(s; ω, ζ) = 1 + 2ζ s/ω + s²/ω²,   r of order `roll_off`
+
+The parameters κ are the logarithms of k, ω_i, z, p, ω_z, ζ_z, ω_p, ζ_p and of the roll-off's
+frequency and damping ratio: all positive, so K is stable (but the integrator) and of minimum phase
+by construction. κ has the units of what it is multiplied with: everything here is blind to them.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import StateSpace
+
+LEAST_DAMPING = 1e-3  # of roots whose structure gives none: below it a notch is a needle
+MOST_DAMPING = 3.0  # two real roots a factor of 34 apart
+SOFTEST_ROLL_OFF = 0.3  # damping ratio: below it a roll-off is a resonance
+
+
+class Kind(StrEnum):
+    """What a parameter is, by which its unit is known."""
+
+    GAIN = "gain"
+    FREQUENCY = "frequency"
+    DAMPING = "damping"
+
+
+@dataclass(frozen=True)
+class Structure:
+    """How many of each section; `least_damping` of every pair of zeros and poles of the biquads."""
+
+    integrator: bool = True
+    lead: int = 1
+    biquads: int = 2
+    roll_off: int = 2
+    least_damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("lead", "biquads", "roll_off"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}; give 0 or more sections")
+        if not 0.0 <= self.least_damping < MOST_DAMPING:
+            raise ValueError(f"least_damping is {self.least_damping}; give a ratio from 0 to 1")
+
+    @property
+    def order(self) -> int:
+        """The number of states of K."""
+        return int(self.integrator) + self.lead + 2 * self.biquads + self.roll_off
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters in the order of κ."""
+        found = ["gain"] + ["integrator"] * self.integrator
+        for i in range(1, self.lead + 1):
+            found += [f"lead {i} zero", f"lead {i} pole"]
+        for i in range(1, self.biquads + 1):
+            for root in ("zeros", "poles"):
+                found += [f"biquad {i} {root}", f"biquad {i} {root} damping"]
+        for i in range(1, self.roll_off // 2 + 1):
+            found += [f"roll-off {i}", f"roll-off {i} damping"]
+        if self.roll_off % 2:
+            found.append("roll-off real")
+        return tuple(found)
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kind of each parameter."""
+        return tuple(
+            Kind.GAIN if name == "gain" else Kind.DAMPING if "damping" in name else Kind.FREQUENCY
+            for name in self.names
+        )
+
+    def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
+        """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""
+        least = max(self.least_damping, LEAST_DAMPING)
+        found = []
+        for name, kind in zip(self.names, self.kinds, strict=True):
+            if kind is Kind.GAIN:
+                found.append(gains)
+            elif kind is Kind.FREQUENCY:
+                found.append(frequencies)
+            elif name.startswith("roll-off"):
+                found.append((max(least, SOFTEST_ROLL_OFF), MOST_DAMPING))
+            else:
+                found.append((least, MOST_DAMPING))
+        return np.log(np.array(found).T)
+
+    def in_units(self, kappa: Array, frequency: float, gain: float) -> Array:
+        """κ with frequencies times `frequency` and the gain times `gain`."""
+        shift = {Kind.GAIN: np.log(gain), Kind.FREQUENCY: np.log(frequency), Kind.DAMPING: 0.0}
+        return kappa + np.array([shift[kind] for kind in self.kinds])
+
+
+def response(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
+    """K(s), of the shape of s; `kappa` (n,) or (n, ...) with trailing axes that go with s's."""
+    value = np.exp(kappa[0]) * np.ones_like(s)
+    for factor, sign, _, _ in _factors(structure, np.exp(kappa), s):
+        value = value * factor if sign > 0 else value / factor
+    return value
+
+
+def response_and_slopes(
+    structure: Structure, kappa: Array, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K(s), ∂ln K/∂κ with the parameters as the last axis, and ∂ln K/∂ln s.
+
+    K depends on s by its ratios to the frequencies only, so ∂ln K/∂ln s is minus the sum of the
+    derivatives to their logarithms.
+    """
+    value = np.exp(kappa[0]) * np.ones_like(s)
+    slopes = np.zeros((*s.shape, len(structure.names)), complex)
+    slopes[..., 0] = 1.0
+    slope = np.zeros_like(value)
+    for factor, sign, index, parts in _factors(structure, np.exp(kappa), s):
+        value = value * factor if sign > 0 else value / factor
+        for offset, part in enumerate(parts):
+            slopes[..., index + offset] = sign * part / factor
+        slope = slope - sign * parts[0] / factor
+    return value, slopes, slope
+
+
+def second_slopes(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
+    """∂²ln K/∂κ², (..., n, n); zero between parameters of different factors."""
+    n = len(structure.names)
+    out = np.zeros((*s.shape, n, n), complex)
+    for factor, sign, index, parts in _factors(structure, np.exp(kappa), s):
+        # ω and ζ enter a polynomial by ζ/ω and 1/ω²: its second derivatives are its parts again.
+        first = [part / factor for part in parts]
+        if len(parts) == 1:
+            inverse = structure.integrator and index == 1
+            second = {(0, 0): first[0] if inverse else -first[0]}
+        else:
+            middle = first[1]
+            second = {(0, 0): -2.0 * first[0] - middle, (0, 1): -middle, (1, 1): middle}
+        for (i, j), value in second.items():
+            entry = sign * (value - first[i] * first[j])
+            out[..., index + i, index + j] = out[..., index + j, index + i] = entry
+    return out
+
+
+def _factors(structure: Structure, values: Array, s: np.ndarray) -> list:
+    """(polynomial, +1 above or -1 below, index of its first parameter, its derivatives)."""
+    found, at = [], 1
+
+    def single() -> tuple:
+        x = s / values[at]
+        return 1.0 + x, (-x,)
+
+    def pair() -> tuple:
+        x, zeta = s / values[at], values[at + 1]
+        middle = 2.0 * zeta * x
+        return 1.0 + middle + x * x, (-middle - 2.0 * x * x, middle)
+
+    if structure.integrator:
+        x = values[at] / s
+        found.append((1.0 + x, 1, at, (x,)))
+        at += 1
+    for _ in range(structure.lead):
+        for sign in (1, -1):
+            factor, parts = single()
+            found.append((factor, sign, at, parts))
+            at += 1
+    for _ in range(structure.biquads):
+        for sign in (1, -1):
+            factor, parts = pair()
+            found.append((factor, sign, at, parts))
+            at += 2
+    for _ in range(structure.roll_off // 2):
+        factor, parts = pair()
+        found.append((factor, -1, at, parts))
+        at += 2
+    if structure.roll_off % 2:
+        factor, parts = single()
+        found.append((factor, -1, at, parts))
+    return found
+
+
+def roots(structure: Structure, kappa: Array) -> tuple[np.ndarray, np.ndarray]:
+    """The zeros and the poles of K, the integrator's pole included."""
+    values, at = np.exp(kappa), 1
+    zeros: list[complex] = []
+    poles: list[complex] = []
+    if structure.integrator:
+        zeros, poles, at = [-values[1]], [0.0], 2
+    for _ in range(structure.lead):
+        zeros.append(-values[at])
+        poles.append(-values[at + 1])
+        at += 2
+    for _ in range(structure.biquads):
+        zeros += _pair(values[at], values[at + 1])
+        poles += _pair(values[at + 2], values[at + 3])
+        at += 4
+    for _ in range(structure.roll_off // 2):
+        poles += _pair(values[at], values[at + 1])
+        at += 2
+    if structure.roll_off % 2:
+        poles.append(-values[at])
+    return np.array(zeros, complex), np.array(poles, complex)
+
+
+def _pair(omega: float, zeta: float) -> list[complex]:
+    root = np.sqrt(complex(zeta**2 - 1.0))
+    slow = -omega / (zeta + root) if zeta > 1.0 else omega * (-zeta + root)
+    return [slow, omega**2 / slow]
+
+
+def state_space(structure: Structure, kappa: Array) -> StateSpace:
+    """K as a real cascade of its sections, input e, output u; every section in its own scale."""
+    A, B, C, D = state_spaces(structure, np.asarray(kappa, float)[None])
+    return StateSpace(A[0], B[0], C[0], D[0])
+
+
+def state_spaces(structure: Structure, kappa: Array) -> tuple[Array, Array, Array, Array]:
+    """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D."""
+    kappa = np.asarray(kappa, float)
+    values, at, count = np.exp(kappa).T, 1, len(kappa)
+    A, B, C = np.zeros((count, 0, 0)), np.zeros((count, 0, 1)), np.zeros((count, 1, 0))
+    D = values[0][:, None, None] * np.ones((count, 1, 1))
+
+    def append(a: list, b: list, c: list, d: object) -> None:
+        """The next section behind what there is: u of it is y of the one before."""
+        nonlocal A, B, C, D
+        k, n = len(b), A.shape[1]
+        a_, b_ = _stack(a, count, (k, k)), _stack([[x] for x in b], count, (k, 1))
+        c_, d_ = _stack([c], count, (1, k)), _stack([[d]], count, (1, 1))
+        joint = np.zeros((count, n + k, n + k))
+        joint[:, :n, :n], joint[:, n:, n:], joint[:, n:, :n] = A, a_, b_ @ C
+        A, B = joint, np.concatenate([B, b_ @ D], axis=1)
+        C, D = np.concatenate([d_ @ C, c_], axis=2), d_ @ D
+
+    if structure.integrator:
+        append([[0.0]], [values[1]], [1.0], 1.0)
+        at = 2
+    for _ in range(structure.lead):
+        z, p = values[at], values[at + 1]
+        append([[-p]], [p], [1.0 - p / z], p / z)
+        at += 2
+    for _ in range(structure.biquads):
+        wz, dz, wp, dp = values[at : at + 4]
+        g = (wp / wz) ** 2
+        c = [1.0 - g, 2.0 * g * (dz * wz - dp * wp) / wp]
+        append([[0.0, wp], [-wp, -2.0 * dp * wp]], [0.0, wp], c, g)
+        at += 4
+    for _ in range(structure.roll_off // 2):
+        w, d = values[at], values[at + 1]
+        append([[0.0, w], [-w, -2.0 * d * w]], [0.0, w], [1.0, 0.0], 0.0)
+        at += 2
+    if structure.roll_off % 2:
+        append([[-values[at]]], [values[at]], [1.0], 0.0)
+    return A, B, C, D
+
+
+def _stack(entries: list, count: int, shape: tuple[int, int]) -> Array:
+    out = np.zeros((count, *shape))
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            out[:, i, j] = entries[i][j]
+    return out
