@@ -23,13 +23,19 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.loop import PlantSet, closed_loops, stable
-from ccd_casadi.fixed_structure.structure import Structure, response_and_slopes, roots
+from ccd_casadi.fixed_structure.structure import (
+    Structure,
+    response,
+    response_and_slope,
+    response_and_slopes,
+    roots,
+)
 from ccd_casadi.plant import Array
 from ccd_casadi.weights import Weights
 
 PER_DECADE = 24
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
-RELEVANT = -1.5  # ln of the share of its bound under which a peak is none of ours
+RELEVANT = -1.0  # ln of the share of its bound under which a peak is none of ours
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 9  # of a peak's bracket by false position; the error is squared, so is its effect
 HALF_POWER = 0.5 * np.log(2.0)
@@ -49,12 +55,16 @@ class Curve(IntEnum):
 
 @dataclass(frozen=True)
 class Problem:
-    """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ."""
+    """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ.
+
+    `margin` is how far (in logarithms) inside every bound its searches aim.
+    """
 
     plants: PlantSet
     structure: Structure
     bounds: Bounds
     box: Array
+    margin: float = 0.0
 
     @cached_property
     def low(self) -> float:
@@ -156,7 +166,7 @@ def assess(
     v, regular = _grid(problem, kappa, poles)
     P, k = v.shape
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
-    loops = evaluate(problem, kappa, tau, which, v, slopes=False)
+    loops = evaluate(problem, kappa, tau, which, v, order=0)
     found, near = [], []
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     for curve in problem.curves:
@@ -174,7 +184,8 @@ def assess(
         near.append((np.full(len(rows), curve), rows, v[rows, at]))
     curve, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
     top, closed = _closed(problem, kappa, tau, curve, rows, start, low, high)
-    whole = closed | (curve != Curve.SHAPE)  # the shape's open end is the crossing
+    # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
+    whole = closed | (curve != Curve.SHAPE) | (start < 0.1 * crossing)
     curve, rows, top = curve[whole], rows[whole], top[whole]
     plants = np.arange(P)
     low_v = float(problem.plants.variable(np.array([problem.low]))[0])
@@ -198,7 +209,7 @@ def constraints(
     value, to_tau = np.empty(len(v)), np.zeros(len(v))
     for code in np.unique(curve):
         chosen = curve == code
-        value[chosen] = loops.levels[Curve(code)][chosen]
+        value[chosen] = loops.levels[Curve(code)][chosen] + problem.margin
     T = 1.0 - loops.S
     of_s = np.isin(curve, (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS))
     factor = np.where(of_s, -T, loops.S)
@@ -213,50 +224,60 @@ def constraints(
 
 
 def evaluate(
-    problem: Problem,
-    kappa: Array,
-    tau: float,
-    which: np.ndarray,
-    v: Array,
-    *,
-    slopes: bool = True,
+    problem: Problem, kappa: Array, tau: float, which: np.ndarray, v: Array, *, order: int = 2
 ) -> Loops:
-    """All curves of the plants `which` at v (any one shape), relative to their bounds."""
+    """All curves of the plants `which` at v (any one shape), relative to their bounds.
+
+    `order` 0: levels only, 1: slopes to ln v too, 2: ∂ln K/∂κ too.
+    """
     plants, bounds = problem.plants, problem.bounds
     s = 1j * v
-    K, to_kappa, K_slope = response_and_slopes(problem.structure, kappa, s)
+    to_kappa = np.zeros((*v.shape, 0))
+    K_slope: np.ndarray = np.zeros(())
+    if order == 0:
+        K = response(problem.structure, kappa, s)
+    elif order == 1:
+        K, K_slope = response_and_slope(problem.structure, kappa, s)
+    else:
+        K, to_kappa, K_slope = response_and_slopes(problem.structure, kappa, s)
     G, dG = plants.responses(which, v)
     L = G * K
     S = 1.0 / (1.0 + L)
     omega = plants.frequency(v)
+    gradients: dict[Curve, Array] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         ln_S, ln_K, ln_L = np.log(np.abs(S)), np.log(np.abs(K)), np.log(np.abs(L))
-        slope_S = -(S * (K * dG + L * K_slope)).real
         levels = {
             Curve.S_MAX: ln_S - np.log(bounds.S_max),
             Curve.S_LOW: ln_S - np.log(bounds.S_low),
             Curve.CROSSING: ln_S + HALF_POWER,
+            Curve.SHAPE: ln_S + HALF_POWER,
         }
-        gradients = {Curve.S_MAX: slope_S, Curve.S_LOW: slope_S, Curve.CROSSING: slope_S}
-        chain = _chain(problem, v)
-        levels[Curve.SHAPE], gradients[Curve.SHAPE] = ln_S + HALF_POWER, slope_S
+        shaped = _shaped(problem, omega)
+        under = np.zeros(v.shape)
         if bounds.shape is not None:
-            shaped = _shaped(problem, omega)
-            under = np.log(bounds.shape * shaped) - tau
-            levels[Curve.SHAPE] = ln_S + HALF_POWER - np.minimum(under, 0.0)
-            gradients[Curve.SHAPE] = slope_S - ((under < 0.0) & (shaped == omega)) * chain
-        if bounds.weighted_level is not None and bounds.weights is not None:
+            under = np.minimum(np.log(bounds.shape * shaped) - tau, 0.0)
+            levels[Curve.SHAPE] = ln_S + HALF_POWER - under
+        weighted = bounds.weighted_level is not None and bounds.weights is not None
+        if weighted:
             ln_level = np.log(bounds.weighted_level)
             W, dW = log_weights(bounds.weights, omega * plants.omega_0)
             levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
             levels[Curve.T] = ln_L + ln_S + W[1] - ln_level
-            gradients[Curve.KS] = K_slope.real + slope_S + dW[0] * chain
-            gradients[Curve.T] = (K_slope + dG / G).real + slope_S + dW[1] * chain
         if bounds.compliance_max is not None:
-            free, slope = plants.free_responses(which, v)
+            free, free_slope = plants.free_responses(which, v)
             ceiling = np.log(bounds.compliance_max * plants.force)
             levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
-            gradients[Curve.GS] = (slope / free).real + slope_S
+        if order:
+            chain = _chain(problem, v)
+            slope = -(S * (K * dG + L * K_slope)).real
+            gradients = dict.fromkeys((Curve.S_MAX, Curve.S_LOW, Curve.CROSSING), slope)
+            gradients[Curve.SHAPE] = slope - ((under < 0.0) & (shaped == omega)) * chain
+            if weighted:
+                gradients[Curve.KS] = K_slope.real + slope + dW[0] * chain
+                gradients[Curve.T] = (K_slope + dG / G).real + slope + dW[1] * chain
+            if bounds.compliance_max is not None:
+                gradients[Curve.GS] = (free_slope / free).real + slope
     return Loops(v, which, S, K, to_kappa, levels, gradients)
 
 
@@ -353,7 +374,7 @@ def _closed(
         return start, np.zeros(0, bool)
 
     def slope(x: Array) -> Array:
-        loops = evaluate(problem, kappa, tau, which, np.exp(x))
+        loops = evaluate(problem, kappa, tau, which, np.exp(x), order=1)
         out = np.empty(len(x))
         for code in np.unique(curve):
             chosen = curve == code

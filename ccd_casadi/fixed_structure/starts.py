@@ -7,11 +7,15 @@ closed loop of the set is stable with are kept: that is decided by eigenvalues, 
 """
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from ccd_casadi.fixed_structure.figures import Problem
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
-from ccd_casadi.fixed_structure.structure import Kind, response
+from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
 from ccd_casadi.plant import Array
+from ccd_casadi.scaling import StateSpace
+
+FITS = 6
 
 
 def resonances(problem: Problem) -> Array:
@@ -97,3 +101,32 @@ def _crossing(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     G, _ = problem.plants.responses(np.zeros(len(v), int), v)
     kappa[:, kinds] = -np.log(np.abs(G * K))[:, None]
     return np.clip(kappa, *problem.box)
+
+
+def fitted(problem: Problem, controller: StateSpace, rng: np.random.Generator) -> Array:
+    """(N, n) structures fitted to a controller in SI over two decades around ω₀; stable or not.
+
+    Least squares of ln K, gain and phase, from random structures: a reduced H∞ controller as start.
+    """
+    plants, structure = problem.plants, problem.structure
+    v = np.geomspace(0.03, 3.0, 60)
+    omega = plants.frequency(v) * plants.omega_0
+    n = len(controller.A)
+    solved = np.linalg.solve(1j * omega[:, None, None] * np.eye(n) - controller.A,
+                             controller.B + 0j)  # fmt: skip
+    goal = (controller.C @ solved + controller.D)[:, 0, 0] / plants.force
+
+    def residual(kappa: Array) -> Array:
+        difference = np.log(response(structure, kappa, 1j * v) / goal)
+        return np.concatenate([difference.real, difference.imag])
+
+    def slope(kappa: Array) -> Array:
+        slopes = response_and_slopes(structure, kappa, 1j * v)[1]
+        return np.concatenate([slopes.real, slopes.imag])
+
+    found = []
+    for start in at_random(problem, np.exp(rng.uniform(np.log(0.05), 0.0, FITS)), rng):
+        inside = np.clip(start, problem.box[0] + 1e-6, problem.box[1] - 1e-6)
+        made = least_squares(residual, inside, slope, bounds=tuple(problem.box), max_nfev=60)
+        found.append(made.x)
+    return np.array(found)

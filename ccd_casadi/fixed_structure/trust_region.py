@@ -41,10 +41,9 @@ class Point:
     tau: float
     assessment: Assessment
 
-    @property
-    def merit(self) -> float:
+    def merit(self, penalty: float = PENALTY) -> float:
         """τ - ρ violation, to be made large."""
-        return self.tau - PENALTY * self.assessment.violation
+        return self.tau - penalty * self.assessment.violation
 
 
 @dataclass(frozen=True)
@@ -75,23 +74,25 @@ def ascend(
     radius: float = FIRST_RADIUS,
     least_radius: float = 1e-6,
     least_gain: float = 1e-8,
+    penalty: float = PENALTY,
 ) -> Ascent:
     """Climb from a start whose loops are stable; ends where steps no longer help."""
     point, evaluations = start, 0
     for _ in range(iterations):
-        step = best_step(problem, point, radius)
+        step = best_step(problem, point, radius, penalty)
         if step is None or step.predicted <= least_gain:
             break
         trial = _moved(problem, point, step)
         evaluations += 1
-        gained = trial.merit - point.merit
+        gained = trial.merit(penalty) - point.merit(penalty)
         if gained < ENOUGH * step.predicted and trial.assessment.stable:
-            again = _corrected(problem, point, step, trial, radius)
+            again = _corrected(problem, point, step, trial, radius, penalty)
             if again is not None:
                 other = _moved(problem, point, again)
                 evaluations += 1
-                if other.merit - point.merit > gained:
-                    trial, gained = other, other.merit - point.merit
+                better = other.merit(penalty) - point.merit(penalty)
+                if better > gained:
+                    trial, gained = other, better
         size = float(np.abs(step.change).max())
         if gained > 0.0:
             point = trial
@@ -110,32 +111,41 @@ def _moved(problem: Problem, point: Point, step: Step) -> Point:
     return Point(kappa, tau, assess(problem, kappa, tau))
 
 
-def best_step(problem: Problem, point: Point, radius: float) -> Step | None:
+def best_step(
+    problem: Problem, point: Point, radius: float, penalty: float = PENALTY
+) -> Step | None:
     """The step of the quadratic model; None where its programme has no answer."""
     rows = _rows(point.assessment, radius)
     flat = FLAT * np.eye(len(point.kappa) + 1)
-    linear = _programme(problem, point, rows, rows.value, flat, radius)
+    linear = _programme(problem, point, rows, rows.value, flat, radius, penalty)
     if linear is None:
         return None
-    mu = np.where(linear.multipliers > 1e-7 * PENALTY, linear.multipliers, 0.0)
+    mu = np.where(linear.multipliers > 1e-7 * penalty, linear.multipliers, 0.0)
     hessian = lagrangian_hessian(problem, point.kappa, point.tau, rows, mu)
     active = np.column_stack([rows.to_kappa, rows.to_tau])[mu > 0.0]
     values, vectors = np.linalg.eigh(hessian + CONVEXIFYING * active.T @ active)
     convex = (vectors * np.maximum(values, FLAT)) @ vectors.T
-    return _programme(problem, point, rows, rows.value, convex, radius) or linear
+    return _programme(problem, point, rows, rows.value, convex, radius, penalty) or linear
 
 
 def _corrected(
-    problem: Problem, point: Point, step: Step, trial: Point, radius: float
+    problem: Problem, point: Point, step: Step, trial: Point, radius: float, penalty: float
 ) -> Step | None:
     """The second-order correction: the same model with the constraints as they are at the trial."""
     rows = _rows(trial.assessment, radius)
     back = rows.to_kappa @ step.change[:-1] + rows.to_tau * step.change[-1]
-    return _programme(problem, point, rows, rows.value - back, step.hessian, radius)
+    value = rows.value - back
+    return _programme(problem, point, rows, value, step.hessian, radius, penalty)
 
 
 def _programme(
-    problem: Problem, point: Point, rows: Constraints, value: Array, hessian: Array, radius: float
+    problem: Problem,
+    point: Point,
+    rows: Constraints,
+    value: Array,
+    hessian: Array,
+    radius: float,
+    penalty: float,
 ) -> Step | None:
     n, m = len(point.kappa), len(rows.v)
     size = next(size for size in ROWS if size >= m)
@@ -146,7 +156,7 @@ def _programme(
     H = np.zeros((n + 2, n + 2))
     H[: n + 1, : n + 1], H[n + 1, n + 1] = hessian, FLAT
     cost = np.zeros(n + 2)
-    cost[n], cost[n + 1] = -1.0, PENALTY
+    cost[n], cost[n + 1] = -1.0, penalty
     low, high = np.full(n + 2, -radius), np.full(n + 2, radius)
     low[:n] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
     high[:n] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
@@ -161,7 +171,7 @@ def _programme(
             break
     else:
         return None
-    predicted = -float(found["cost"]) + PENALTY * violation
+    predicted = -float(found["cost"]) + penalty * violation
     mu = np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
     return Step(x[: n + 1], predicted, rows, mu, hessian)
 

@@ -1,0 +1,339 @@
+"""The judge of a controller on a set of plants; it shares nothing with the synthesis.
+
+From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
+stability; S, KS, T and GS are evaluated by dense solves on grids through every pole and zero of
+plant, controller and closed loop, refined at every local maximum that matters. For S the largest
+gain is confirmed by a Hamiltonian matrix (`norms`). A sampled loop is judged in z, its hold and
+delay exact, K by Tustin's rule; what happens between samples is not in it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.signal import cont2discrete
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.norms import hinf_norm
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import ScaledPlant, StateSpace, balanced, transmission_zeros
+
+HALF_POWER = 1.0 / np.sqrt(2.0)
+TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
+CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
+PER_DECADE = 60
+FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
+ZOOMS = 5  # each time eleven points between a maximum's neighbours: the spacing over 5
+
+
+@dataclass(frozen=True)
+class PlantFigures:
+    """One plant's loop in SI. Frequencies in rad/s; KS in N/m, GS in m/N; NaN where unstable.
+
+    `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
+    `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
+    `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peak by a Hamiltonian.
+    """
+
+    stable: bool
+    stability: float
+    S_peak: float
+    S_peak_frequency: float
+    S_low: float
+    crossing: float
+    bandwidth: float
+    KS: float
+    T: float
+    GS: float
+    weighted_KS: float
+    weighted_T: float
+    static_compliance: float
+    confirmed: bool
+
+    def over(self, bounds: Bounds) -> dict[str, float]:
+        """Every bound's figure over the bound; above 1 where it is not met."""
+        found = {"S_max": self.S_peak / bounds.S_max, "S_low": self.S_low / bounds.S_low}
+        if bounds.weighted_level is not None:
+            found["KS"] = self.weighted_KS / bounds.weighted_level
+            found["T"] = self.weighted_T / bounds.weighted_level
+        if bounds.compliance_max is not None:
+            found["GS"] = self.GS / bounds.compliance_max
+        return found
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What the judge found on every plant, and whether all bounds hold with `bandwidth` (rad/s)."""
+
+    passed: bool
+    bandwidth: float
+    plants: tuple[PlantFigures, ...]
+    worst: dict[str, float]
+    words: str
+
+
+def certify(
+    plants: Sequence[ScaledPlant],
+    controller: StateSpace,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    *,
+    integrator: bool = True,
+) -> Certificate:
+    """Judge an SI controller (e in, u out) on SISO plants against the bounds.
+
+    `integrator`: the shape counts from 0 on, else from ω_low. ω_b is the least of all plants.
+    """
+    found = [judged(plant, controller, bounds, sampling, integrator) for plant in plants]
+    unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
+    if unstable:
+        words = f"unstable on plant {unstable[0]} of {len(found)}"
+        return Certificate(False, np.nan, tuple(found), {}, words)
+    bandwidth = float(np.min([figures.bandwidth for figures in found]))
+    worst: dict[str, float] = {}
+    for figures in found:
+        for name, ratio in figures.over(bounds).items():
+            worst[name] = max(worst.get(name, 0.0), ratio)
+    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in worst.items()
+              if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
+    lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
+    if broken:
+        words = f"passes its bound on {', '.join(broken)} (relative)"
+    elif not bandwidth > 0.0:
+        words = "S does not start below -3 dB on every plant"
+    elif lost:
+        words = f"the peak of S on plant {lost[0]} is not confirmed by the level test"
+    else:
+        words = f"stable and within every bound on {len(found)} plants"
+    passed = not broken and not lost and bandwidth > 0.0
+    return Certificate(passed, bandwidth, tuple(found), worst, words)
+
+
+def judged(
+    plant: ScaledPlant,
+    controller: StateSpace,
+    bounds: Bounds,
+    sampling: Sampling | None,
+    integrator: bool,
+) -> PlantFigures:
+    """The figures of one loop."""
+    si = plant.plant_si()
+    G = StateSpace(*balanced(si.A, si.B, si.C), si.D)
+    K = StateSpace(*balanced(controller.A, controller.B, controller.C), controller.D)
+    loop = G, K
+    if sampling is not None:
+        loop = _sampled(G, sampling), _tustin(K, sampling.period)
+    S = _sensitivity(*loop)
+    poles = np.linalg.eigvals(S.A)
+    stability = float(poles.real.max() if sampling is None else np.abs(poles).max() - 1.0)
+    if not stability < 0.0:
+        return PlantFigures(False, stability, *[np.nan] * 11, False)
+    roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
+    roots += [transmission_zeros(*_scaled(x)) * _size(x) for x in (G, K) if not x.D.any()]
+    grid = _grid(roots, sampling, bounds.omega_low, _size(G))
+    table = _Responses(G, loop[0], loop[1], sampling, bounds)
+    values = table.at(grid)
+    tops = {name: _top(table, name, grid, value) for name, value in values.items()}
+    top, at = tops["S"]
+    norm = _norm(S, sampling)
+    crossing, bandwidth = _bandwidth(table, grid, values["S"], bounds, integrator)
+    weighted = [tops[name][0] if name in tops else np.nan for name in ("weighted KS", "weighted T")]
+    return PlantFigures(
+        stable=True,
+        stability=stability,
+        S_peak=max(top, norm),
+        S_peak_frequency=at,
+        S_low=float(table.at(np.array([bounds.omega_low]))["S"][0]),
+        crossing=crossing,
+        bandwidth=bandwidth,
+        KS=tops["KS"][0],
+        T=tops["T"][0],
+        GS=tops["GS"][0],
+        weighted_KS=weighted[0],
+        weighted_T=weighted[1],
+        static_compliance=float(values["GS"][0]),
+        confirmed=abs(norm / top - 1.0) <= CONFIRMED,
+    )
+
+
+class _Responses:
+    """|S|, |KS|, |T|, |GS| and the weighted ones at frequencies in rad/s, by dense solves."""
+
+    def __init__(
+        self,
+        free: StateSpace,
+        G: StateSpace,
+        K: StateSpace,
+        sampling: Sampling | None,
+        bounds: Bounds,
+    ) -> None:
+        self.free, self.G, self.K = free, G, K
+        self.period = None if sampling is None else sampling.period
+        self.bounds = bounds
+
+    def at(self, omega: Array) -> dict[str, Array]:
+        s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
+        g, k = _response(self.G, s), _response(self.K, s)
+        S = 1.0 / (1.0 + g * k)
+        free = g if self.period is None else _response(self.free, 1j * omega)
+        found = {
+            "S": np.abs(S),
+            "KS": np.abs(k * S),
+            "T": np.abs(g * k * S),
+            "GS": np.abs(free * S),
+        }
+        if self.bounds.weights is not None:
+            _, W_KS, W_T = np.abs(self.bounds.weights.responses(omega))
+            found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
+        return found
+
+
+def _response(system: StateSpace, s: np.ndarray) -> np.ndarray:
+    n = len(system.A)
+    solved = np.linalg.solve(s[:, None, None] * np.eye(n) - system.A, system.B + 0j)
+    return np.asarray((system.C @ solved + system.D)[:, 0, 0])
+
+
+def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:
+    """S, r to e, of a plant without feedthrough."""
+    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+    B = np.vstack([G.B @ K.D, K.B])
+    C = np.hstack([-G.C, np.zeros((1, len(K.A)))])
+    return StateSpace(A, B, C, np.eye(1))
+
+
+def _sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
+    """u_k to y_k with the delay as whole periods and a rest, in which the older force still acts.
+
+    ẋ = A x + B u with u held is integrated over both parts of a period by one exponential of
+    [[A, B, 0], [0, 0, 1/T], [0, 0, 0]]-like blocks each.
+    """
+    T, n = sampling.period, len(G.A)
+    whole = int(np.floor(sampling.delay / T + 1e-9))
+    rest = max(sampling.delay - whole * T, 0.0)
+    held = np.zeros((n + 1, n + 1))
+    held[:n, :n], held[:n, n:] = G.A, G.B
+    first, second = expm(held * rest), expm(held * (T - rest))
+    age = whole + 1  # u_{k-1} … u_{k-age} are kept
+    A, B = np.zeros((n + age, n + age)), np.zeros((n + age, 1))
+    A[:n, :n] = second[:n, :n] @ first[:n, :n]
+    A[:n, n + whole : n + whole + 1] = second[:n, :n] @ first[:n, n:]
+    if whole:
+        A[:n, n + whole - 1 : n + whole] += second[:n, n:]
+    else:
+        B[:n] = second[:n, n:]
+    B[n] = 1.0
+    for i in range(1, age):
+        A[n + i, n + i - 1] = 1.0
+    return StateSpace(A, B, np.hstack([G.C, np.zeros((1, age))]), np.zeros((1, 1)))
+
+
+def _tustin(K: StateSpace, period: float) -> StateSpace:
+    A, B, C, D, _ = cont2discrete((K.A, K.B, K.C, K.D), period, "bilinear")
+    return StateSpace(A, B, C, D)
+
+
+def _norm(S: StateSpace, sampling: Sampling | None) -> float:
+    """‖S‖∞ by Hamiltonian matrices; of a sampled loop with z = (1 + w)/(1 - w)."""
+    if sampling is None:
+        return hinf_norm(S)[0]
+    inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
+    root = np.sqrt(2.0)
+    A = inverse @ (S.A - np.eye(len(S.A)))
+    return hinf_norm(
+        StateSpace(A, root * inverse @ S.B, root * S.C @ inverse, S.D - S.C @ inverse @ S.B)
+    )[0]
+
+
+def _grid(
+    roots: Sequence[np.ndarray], sampling: Sampling | None, omega_low: float, size: float
+) -> Array:
+    values = [np.concatenate(roots)]
+    if sampling is not None:
+        with np.errstate(divide="ignore"):
+            # Poles are in z here; those of the plant's zeros are left in s, on the same axis.
+            z = np.concatenate(roots[:3])
+            values = [np.log(z[z != 0.0]) / sampling.period, np.concatenate(roots[3:])]
+    joint = np.concatenate(values)
+    joint = joint[np.isfinite(joint) & (np.abs(joint) > 0.0)]
+    slow = np.abs(joint)[np.abs(joint) > 1e-6 * size].min()
+    bottom, top = 0.01 * min(omega_low, slow), 300.0 * max(size, np.abs(joint).max())
+    if sampling is not None:
+        top = np.pi / sampling.period
+    count = int(PER_DECADE * np.log10(top / bottom))
+    near = (np.abs(joint.imag)[:, None] + np.abs(joint.real)[:, None] * FLANKS).ravel()
+    grid = np.concatenate([np.geomspace(bottom, top, count), near, np.abs(joint), [omega_low]])
+    return np.unique(grid[(grid >= bottom) & (grid <= top)])
+
+
+def _top(table: _Responses, name: str, grid: Array, value: Array) -> tuple[float, float]:
+    """The largest value and its frequency, every local maximum within 10 % of it zoomed into."""
+    inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
+    inner = inner[value[inner] > 0.9 * value.max()]
+    best = int(np.argmax(value))
+    top, at = float(value[best]), float(grid[best])
+    low, high = grid[inner - 1], grid[inner + 1]
+    for _ in range(ZOOMS):
+        if not len(low):
+            break
+        points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
+        found = table.at(points.ravel())[name].reshape(points.shape)
+        i = np.argmax(found, axis=1)
+        rows = np.arange(len(low))
+        k = int(np.argmax(found[rows, i]))
+        if found[k, i[k]] > top:
+            top, at = float(found[k, i[k]]), float(points[k, i[k]])
+        low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
+    return top, at
+
+
+def _bandwidth(
+    table: _Responses, grid: Array, S: Array, bounds: Bounds, integrator: bool
+) -> tuple[float, float]:
+    """The first ω with |S| = 1/√2, and the largest ω_b with |S| <= min(1, shape ω/ω_b)/√2 below."""
+    above = np.flatnonzero(S > HALF_POWER)
+    if S[0] > HALF_POWER or not len(above):
+        return np.nan, 0.0
+    low, high = float(grid[above[0] - 1]), float(grid[above[0]])
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if table.at(np.array([middle]))["S"][0] > HALF_POWER:
+            high = middle
+        else:
+            low = middle
+    if bounds.shape is None:
+        return low, low
+    # Every dip of the room h(ω) = shape ω/(√2|S|), closed in on; ω_b <= h(ω) for all ω <= ω_b.
+    omega = np.unique(np.concatenate([grid[: above[0]], np.geomspace(low / 30.0, low, 1000)]))
+    omega = omega[omega <= low]
+
+    def room(x: Array) -> Array:
+        counted = x if integrator else np.maximum(x, bounds.omega_low)
+        return np.asarray(bounds.shape * counted * HALF_POWER / table.at(x)["S"])
+
+    value = room(omega)
+    inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1
+    dips = [(float(value[i]), float(omega[i])) for i in (0, len(omega) - 1)]
+    left, right = omega[inner - 1], omega[inner + 1]
+    for _ in range(ZOOMS):
+        points = left[:, None] + (right - left)[:, None] * np.linspace(0.0, 1.0, 11)
+        found = room(points.ravel()).reshape(points.shape)
+        i, rows = np.argmin(found, axis=1), np.arange(len(left))
+        left, right = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
+    if len(inner):
+        dips += zip(found[rows, i].tolist(), points[rows, i].tolist(), strict=True)
+    bandwidth = low
+    while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
+        height, at = min(broken)
+        bandwidth = height if height >= at else at * (1.0 - 1e-9)
+    return low, bandwidth
+
+
+def _size(system: StateSpace) -> float:
+    return float(np.abs(np.linalg.eigvals(system.A)).max())
+
+
+def _scaled(system: StateSpace) -> tuple[Array, Array, Array]:
+    return system.A / _size(system), system.B, system.C

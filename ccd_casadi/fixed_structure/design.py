@@ -1,0 +1,304 @@
+"""The largest bandwidth of a fixed structure on a set of plants: starts, races, certificate.
+
+Many starts climb some steps each, the better half goes on, and so forth; what is left climbs until
+steps help no longer. The best one whose controller passes the judge (`certificate`) is the design.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
+from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.optimality import (
+    Optimality,
+    log_bandwidth_gradient,
+    optimality,
+)
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
+from ccd_casadi.fixed_structure.structure import Structure, state_space
+from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import ScaledPlant, StateSpace
+
+MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
+CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
+POOL = 12  # random starts tried for stability for each one that is raced
+RACE = (15, 30, 60)  # steps of each round, after which the better half goes on
+LAST = 3  # that climb to the end
+LONGEST = 300
+SAME = 2e-3  # relative: bandwidths of one local optimum
+RESTORING = 400.0  # penalty when an end is to be brought within its bounds
+
+
+class SectionsOutcome(StrEnum):
+    """How a synthesis ended; only CERTIFIED designs are to be used."""
+
+    CERTIFIED = "certified"
+    NO_STABLE_START = "no start is stable on every plant of the set"
+    BOUND_NOT_MET = "no controller was found that meets every bound"
+    NOT_CERTIFIED = "the judge does not confirm what the search found"
+
+
+@dataclass(frozen=True)
+class LocalOptimum:
+    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached."""
+
+    bandwidth: float
+    count: int
+
+
+@dataclass(frozen=True)
+class SectionsDesign:
+    """A controller of fixed structure; SI, frequencies in rad/s.
+
+    `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state
+    space (sampled loops: to be discretised by Tustin's rule without prewarping). `bandwidth` holds
+    on every plant. `multipliers` by kind of bound: change of ln ω_b per ln of it. `short` names the
+    bounds that the nearest controller misses, with the factor, where none meets all.
+    """
+
+    outcome: SectionsOutcome
+    words: str
+    structure: Structure
+    kappa: Array
+    controller: StateSpace | None
+    bandwidth: float
+    certificate: Certificate | None
+    multipliers: dict[str, float]
+    at_box: tuple[tuple[str, str, float], ...]
+    kkt_residual: float
+    short: dict[str, float]
+    local_optima: tuple[LocalOptimum, ...]
+    starts: int
+    evaluations: int
+    seed: int
+    seconds: float
+
+    @property
+    def certified(self) -> bool:
+        """Whether the design may be used."""
+        return self.outcome is SectionsOutcome.CERTIFIED
+
+
+Progress = Callable[[str], None]
+
+
+def problem_for(
+    plants: Sequence[ScaledPlant],
+    structure: Structure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+) -> Problem:
+    """The problem in the units of the first plant, with a box of κ that its time scale gives.
+
+    Frequencies lie within 1e-3 and 100 ω₀ (sampled: half the rate over π... at most 2/T), the gain
+    within a factor 1e6 of M_K.
+    """
+    family = plant_set(plants, sampling)
+    fastest = 30.0 * max(1.0, float(np.abs(family.poles).max()))
+    if family.period is not None:
+        fastest = min(fastest, 2.0 / family.period)
+    slowest = 1e-3 if family.period is None else min(1e-3, 0.01 * fastest)
+    return Problem(family, structure, bounds, structure.bounds((slowest, fastest), (1e-6, 1e6)),
+                   MARGIN)  # fmt: skip
+
+
+def synthesise_sections(
+    plants: Sequence[ScaledPlant],
+    structure: Structure,
+    bounds: Bounds,
+    *,
+    sampling: Sampling | None = None,
+    starts: int = 24,
+    seed: int = 0,
+    initial: Sequence[Array | StateSpace] = (),
+    only_initial: bool = False,
+    progress: Progress | None = None,
+) -> SectionsDesign:
+    """max ω_b over the parameters of a structure, with every bound on every SISO plant.
+
+    `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they race
+    beside `starts` others by rules and at random, or alone with `only_initial`. Raises PlantError
+    for plants that cannot be in a set.
+    """
+    begun = perf_counter()
+    problem = problem_for(plants, structure, bounds, sampling)
+    rng = np.random.default_rng(seed)
+    pool = _initial(problem, initial, rng)
+    if not only_initial:
+        pool = np.concatenate([pool, _pool(problem, starts, rng)])
+    tell = progress or (lambda words: None)
+
+    def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
+        return SectionsDesign(
+            outcome, words or outcome.value, structure, np.full(len(structure.names), np.nan), None,
+            np.nan, None, {}, (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
+        )  # fmt: skip
+
+    if not len(pool):
+        return failed(SectionsOutcome.NO_STABLE_START)
+    ends, evaluations = _race(problem, pool, tell)
+    best: SectionsDesign | None = None
+    optima = _distinct(problem, ends)
+    for end in sorted(ends, key=lambda end: -end.point.merit()):
+        point = end.point
+        if point.assessment.violation > MARGIN:
+            again = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02)
+            evaluations += again.evaluations
+            point = again.point
+        last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
+                      least_gain=1e-14)  # fmt: skip
+        evaluations += last.evaluations
+        point = last.point
+        made = _designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
+                         perf_counter() - begun)  # fmt: skip
+        if best is None or (made.certified and not best.certified):
+            best = made
+        if best.certified:
+            break
+    assert best is not None
+    tell(f"{best.outcome.value}: {best.bandwidth / (2.0 * np.pi):.2f} Hz")
+    return best
+
+
+def bandwidth_and_gradient(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    sampling: Sampling | None = None,
+) -> tuple[float, Array]:
+    """ω_b* in rad/s and dω_b*/dθ at a design that is optimal on these plants (envelope theorem).
+
+    The gradient is NaN where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    """
+    problem = problem_for(plants, design.structure, bounds, sampling)
+    kappa = _scaled(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    found = _optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    slope = log_bandwidth_gradient(problem, kappa, found)
+    return design.bandwidth, design.bandwidth * slope
+
+
+def _optimality(problem: Problem, point: Point) -> Optimality:
+    return optimality(problem, point)
+
+
+def _scaled(problem: Problem, kappa: Array) -> Array:
+    P = problem.plants
+    return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
+
+
+def _initial(
+    problem: Problem, initial: Sequence[Array | StateSpace], rng: np.random.Generator
+) -> Array:
+    found = [np.zeros((0, len(problem.structure.names)))]
+    for item in initial:
+        if isinstance(item, StateSpace):
+            found.append(fitted(problem, item, rng))
+        else:
+            found.append(np.clip(_scaled(problem, item), *problem.box)[None])
+    return kept(problem, np.concatenate(found))
+
+
+def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
+    """Half by rules, half at random, of those that are stable; the nearest to the bounds of each.
+
+    Where none is stable the search for one goes on with slower crossovers.
+    """
+    low, high = CROSSOVERS
+    for _ in range(3):
+        rules = kept(problem, by_rules(problem, np.geomspace(low, high, 12)))
+        draws = np.exp(rng.uniform(np.log(low), np.log(high), POOL * starts))
+        random = kept(problem, at_random(problem, draws, rng))
+        if len(rules) + len(random):
+            half = max(starts // 2, 1)
+            near, far = _nearest(problem, rules, half), _nearest(problem, random, 4 * half)
+            chosen = rng.permutation(len(far))[: max(starts - len(near), half)]
+            return np.concatenate([near, far[chosen]])
+        low, high = 0.03 * low, low
+    return np.zeros((0, len(problem.structure.names)))
+
+
+def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
+    """The `count` controllers that miss the bounds least at a modest bandwidth."""
+    tau = float(np.log(0.1))
+    misses = [assess(problem, one, tau).violation for one in kappa]
+    return kappa[np.argsort(misses)[:count]]
+
+
+def _race(problem: Problem, pool: Array, tell: Progress) -> tuple[list[Ascent], int]:
+    tau = float(np.log(0.1))
+    field = [Ascent(Point(k, tau, assess(problem, k, tau)), FIRST_RADIUS, 0) for k in pool]
+    evaluations = len(field)
+    scale = problem.plants.omega_0 / (2.0 * np.pi)
+    for steps in (*RACE, LONGEST):
+        moved = []
+        for runner in field:
+            end = ascend(problem, runner.point, iterations=steps, radius=runner.radius)
+            moved.append(end)
+            evaluations += end.evaluations
+        field = sorted(moved, key=lambda end: -end.point.merit())
+        lead = field[0].point
+        tell(f"{len(field)} searches, {evaluations} loops: {np.exp(lead.tau) * scale:.2f} Hz, "
+             f"bounds passed by {lead.assessment.violation:.1g}")  # fmt: skip
+        if steps != LONGEST:
+            field = field[: max(LAST, len(field) // 2 if steps != RACE[-1] else LAST)]
+    return field, evaluations
+
+
+def _distinct(problem: Problem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, ...]:
+    values = sorted((float(np.exp(end.point.tau)) * problem.plants.omega_0 for end in ends
+                     if end.point.assessment.violation <= 1e-4), reverse=True)  # fmt: skip
+    found: list[LocalOptimum] = []
+    for value in values:
+        if found and value >= found[-1].bandwidth * (1.0 - SAME):
+            found[-1] = LocalOptimum(found[-1].bandwidth, found[-1].count + 1)
+        else:
+            found.append(LocalOptimum(value, 1))
+    return tuple(found)
+
+
+def _designed(
+    problem: Problem,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    point: Point,
+    optima: tuple[LocalOptimum, ...],
+    starts: int,
+    evaluations: int,
+    seed: int,
+    seconds: float,
+) -> SectionsDesign:
+    structure, bounds, P = problem.structure, problem.bounds, problem.plants
+    kappa = structure.in_units(point.kappa, P.omega_0, P.force)
+    controller = state_space(structure, kappa)
+    found = _optimality(problem, point)
+    bandwidth = float(np.exp(point.tau)) * P.omega_0
+    judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
+    short: dict[str, float] = {}
+    peaks = point.assessment.peaks
+    assert peaks is not None
+    for code, value in zip(peaks.curve, peaks.value, strict=True):
+        if value > 2.0 * MARGIN:
+            name = Curve(int(code)).name
+            short[name] = max(short.get(name, 0.0), float(np.exp(value)))
+    outcome, words = SectionsOutcome.CERTIFIED, judged.words
+    if short:
+        outcome = SectionsOutcome.BOUND_NOT_MET
+        missed = ", ".join(f"{name} by a factor {ratio:.4g}" for name, ratio in short.items())
+        words = f"the nearest controller misses {missed}"
+    elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
+        outcome = SectionsOutcome.NOT_CERTIFIED
+        words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"
+    if outcome is SectionsOutcome.CERTIFIED:
+        bandwidth = min(bandwidth, judged.bandwidth)
+    return SectionsDesign(
+        outcome, words, structure, kappa, controller, bandwidth, judged, found.named(), found.ends,
+        found.residual, short, optima, starts, evaluations, seed, seconds,
+    )  # fmt: skip
