@@ -15,11 +15,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
-from ccd_casadi.fixed_structure.optimality import (
-    Optimality,
-    log_bandwidth_gradient,
-    optimality,
-)
+from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
 from ccd_casadi.fixed_structure.structure import Structure, state_space
 from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
@@ -178,18 +174,15 @@ def bandwidth_and_gradient(
     The gradient is NaN where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
     """
     problem = problem_for(plants, design.structure, bounds, sampling)
-    kappa = _scaled(problem, design.kappa)
+    kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = _optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    found = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
     slope = log_bandwidth_gradient(problem, kappa, found)
     return design.bandwidth, design.bandwidth * slope
 
 
-def _optimality(problem: Problem, point: Point) -> Optimality:
-    return optimality(problem, point)
-
-
-def _scaled(problem: Problem, kappa: Array) -> Array:
+def in_problem_units(problem: Problem, kappa: Array) -> Array:
+    """SI parameters κ in the units of the problem."""
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
 
@@ -202,7 +195,7 @@ def _initial(
         if isinstance(item, StateSpace):
             found.append(fitted(problem, item, rng))
         else:
-            found.append(np.clip(_scaled(problem, item), *problem.box)[None])
+            found.append(np.clip(in_problem_units(problem, item), *problem.box)[None])
     return kept(problem, np.concatenate(found))
 
 
@@ -278,7 +271,7 @@ def _designed(
     structure, bounds, P = problem.structure, problem.bounds, problem.plants
     kappa = structure.in_units(point.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
-    found = _optimality(problem, point)
+    found = optimality(problem, point)
     bandwidth = float(np.exp(point.tau)) * P.omega_0
     judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
     short: dict[str, float] = {}

@@ -154,14 +154,22 @@ class Assessment:
 
 
 def assess(
-    problem: Problem, kappa: Array, tau: float, *, within: float = 0.5, depth: float = RELEVANT
+    problem: Problem,
+    kappa: Array,
+    tau: float,
+    *,
+    within: float = 0.5,
+    depth: float = RELEVANT,
+    each: bool = False,
 ) -> Assessment:
     """Stability by the eigenvalues of every loop, then the constraints with c > `depth`.
 
     `within`: how far below 0 a value on the base grid may be to be among `near`.
+    `each`: the constraints of unstable loops are given too, where some are stable.
     """
     poles = closed_loops(problem.plants, problem.structure, kappa)[0]
-    if not stable(poles).all():
+    good = stable(poles)
+    if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     v, regular = _grid(problem, kappa, poles)
     P, k = v.shape

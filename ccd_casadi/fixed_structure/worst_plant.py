@@ -1,0 +1,228 @@
+"""The worst plants of a box are searched and added to the set until none passes a bound.
+
+    max over p in the box of  max_j c_j(κ, τ; p)
+
+by compass searches from many points at once; an unstable loop is worst of all. What the end says is
+what was done: the number of plants that were looked at, a lattice of the box among them, and the
+worst of them. It is no proof for what lies between, though c is smooth and the lattice fine.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from scipy.stats import qmc
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.design import (
+    SectionsDesign,
+    in_problem_units,
+    problem_for,
+    synthesise_sections,
+)
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.plant import Array
+from ccd_casadi.scaling import StateSpace
+
+WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
+UNSTABLE = 10.0  # ln: what an unstable loop counts as
+LATTICE = 200  # plants, evenly over the box
+SEARCHES = 6
+ROUNDS = 7  # of a compass search, its step halved each time
+AT_ONCE = 3  # plants added in one round
+
+
+@dataclass(frozen=True)
+class Excess:
+    """The largest c of one plant: (option, point), and its value in logarithms of its bound."""
+
+    option: int
+    point: Array
+    value: float
+
+
+@dataclass(frozen=True)
+class RobustDesign:
+    """A design on a set of plants that the search found, judged on many more.
+
+    `added` are the set's (option, point); `worst` what the search found last; `certificate` is the
+    judge's on `checked` plants of a lattice and the worst ones. `words` say what holds where.
+    """
+
+    design: SectionsDesign
+    added: tuple[tuple[int, Array], ...]
+    worst: Excess
+    certificate: Certificate | None
+    checked: int
+    rounds: int
+    seconds: float
+    words: str
+
+    @property
+    def certified(self) -> bool:
+        """On every plant that was looked at."""
+        return self.design.certified and self.certificate is not None and self.certificate.passed
+
+
+def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int, Array]]:
+    """About `count` points over the box of every option, its corners among them."""
+    box, n = uncertain.box, len(uncertain.names)
+    found = uncertain.corners()
+    if n == 0:
+        return found
+    if n == 1:
+        unit = np.linspace(0.0, 1.0, count)[:, None]
+    else:
+        unit = qmc.Halton(n, seed=seed).random(count)
+    points = box[0] + unit * (box[1] - box[0])
+    share = max(1, len(uncertain.options))
+    return found + [(i % share, point) for i, point in enumerate(points)]
+
+
+def excesses(
+    uncertain: UncertainPlant,
+    points: Sequence[tuple[int, Array]],
+    structure: Structure,
+    kappa: Array,
+    bandwidth: float,
+    bounds: Bounds,
+    sampling: Sampling | None,
+) -> Array:
+    """The largest c of every plant's loop, with SI parameters κ and ω_b in rad/s."""
+    problem = problem_for(uncertain.plants(points), structure, bounds, sampling)
+    scaled = in_problem_units(problem, kappa)
+    tau = float(np.log(bandwidth / problem.plants.omega_0))
+    found = assess(problem, scaled, tau, each=True)
+    out = np.full(len(points), -np.inf)
+    if found.peaks is not None:
+        np.maximum.at(out, found.peaks.plant, found.peaks.value - problem.margin)
+    grown = found.poles.real.max(axis=1)
+    return np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
+
+
+def worst_plants(
+    uncertain: UncertainPlant,
+    structure: Structure,
+    kappa: Array,
+    bandwidth: float,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    *,
+    seed: int = 0,
+    count: int = LATTICE,
+) -> tuple[list[Excess], int]:
+    """The worst plants found, the worst first, and how many were looked at."""
+
+    def values(points: Sequence[tuple[int, Array]]) -> Array:
+        return excesses(uncertain, points, structure, kappa, bandwidth, bounds, sampling)
+
+    points = lattice(uncertain, count, seed)
+    value = values(points)
+    looked, n = len(points), len(uncertain.names)
+    heads = [Excess(*points[i], float(value[i])) for i in np.argsort(-value)[:SEARCHES]]
+    if n == 0:
+        return heads, looked
+    box = uncertain.box
+    step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
+    for _ in range(ROUNDS):
+        moves = [
+            (head.option, np.clip(head.point + sign * step * np.eye(n)[i], *box))
+            for head in heads
+            for i in range(n)
+            for sign in (1.0, -1.0)
+        ]
+        found = values(moves).reshape(len(heads), 2 * n)
+        looked += len(moves)
+        best = np.argmax(found, axis=1)
+        heads = [
+            Excess(*moves[2 * n * row + best[row]], float(found[row, best[row]]))
+            if found[row, best[row]] > head.value
+            else head
+            for row, head in enumerate(heads)
+        ]
+        step = 0.5 * step
+    return sorted(heads, key=lambda head: -head.value), looked
+
+
+def synthesise_robustly(
+    uncertain: UncertainPlant,
+    structure: Structure,
+    bounds: Bounds,
+    *,
+    sampling: Sampling | None = None,
+    starts: int = 24,
+    seed: int = 0,
+    initial: Sequence[Array | StateSpace] = (),
+    rounds: int = 8,
+    progress: Callable[[str], None] | None = None,
+) -> RobustDesign:
+    """max ω_b with every bound on every plant of a box, as far as searches find none that fails.
+
+    The set starts with the models and the corners of the box. Each round designs on the set,
+    searches the worst plants of the box, and adds those that pass a bound.
+    """
+    begun = perf_counter()
+    tell = progress or (lambda words: None)
+    members = uncertain.corners()
+    made = synthesise_sections(uncertain.plants(members), structure, bounds, sampling=sampling,
+                               starts=starts, seed=seed, initial=initial, progress=progress)  # fmt: skip
+    looked, turn = 0, 0
+    worst = Excess(0, uncertain.nominal, np.nan)
+    while made.certified:
+        heads, count = worst_plants(uncertain, structure, made.kappa, made.bandwidth, bounds,
+                                    sampling, seed=seed + turn)  # fmt: skip
+        looked += count
+        worst = heads[0]
+        turn += 1
+        tell(f"worst of {count} plants: {np.expm1(worst.value):+.2%} of a bound at {worst.point}")
+        if worst.value <= WITHIN or turn > rounds:
+            break
+        members = members + _apart(heads, members, uncertain.box)
+        made = synthesise_sections(uncertain.plants(members), structure, bounds, sampling=sampling,
+                                   seed=seed, initial=[made.kappa], only_initial=True,
+                                   progress=progress)  # fmt: skip
+    judged: Certificate | None = None
+    checked = 0
+    if made.certified and made.controller is not None:
+        points = lattice(uncertain, LATTICE, seed + 1000) + [(worst.option, worst.point)]
+        checked = len(points)
+        tolerant = _loosened(bounds, 2.0 * WITHIN)
+        judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,
+                         integrator=structure.integrator)  # fmt: skip
+    if judged is None:
+        words = made.words
+    else:
+        words = (f"{judged.words}; searches over {looked} plants found none worse than "
+                 f"{np.expm1(worst.value):+.1e} of a bound; nothing is proven between them")  # fmt: skip
+    return RobustDesign(made, tuple(members), worst, judged, checked, turn,
+                        perf_counter() - begun, words)  # fmt: skip
+
+
+def _apart(
+    heads: Sequence[Excess], members: Sequence[tuple[int, Array]], box: Array
+) -> list[tuple[int, Array]]:
+    """Of the plants that pass a bound some, each away from the others and from what is there."""
+    width = np.maximum(box[1] - box[0], 1e-300)
+    found: list[tuple[int, Array]] = []
+    for head in heads:
+        near = [np.abs((head.point - point) / width).max(initial=0.0) for option, point in
+                (*members, *found) if option == head.option]  # fmt: skip
+        if head.value > WITHIN and (not near or min(near) > 1e-4) and len(found) < AT_ONCE:
+            found.append((head.option, head.point))
+    return found
+
+
+def _loosened(bounds: Bounds, by: float) -> Bounds:
+    level, compliance = bounds.weighted_level, bounds.compliance_max
+    return replace(
+        bounds,
+        S_max=bounds.S_max * (1.0 + by),
+        S_low=bounds.S_low * (1.0 + by),
+        weighted_level=None if level is None else level * (1.0 + by),
+        compliance_max=None if compliance is None else compliance * (1.0 + by),
+    )
