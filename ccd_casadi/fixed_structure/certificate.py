@@ -132,7 +132,11 @@ def judged(
         return PlantFigures(False, stability, *[np.nan] * 11, False)
     roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
     roots += [transmission_zeros(*_scaled(x)) * _size(x) for x in (G, K) if not x.D.any()]
-    grid = _grid(roots, sampling, bounds.omega_low, _size(G))
+    corner = 0.0
+    if bounds.weights is not None:
+        w = bounds.weights
+        corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
+    grid = _grid(roots, sampling, bounds.omega_low, _size(G), corner)
     table = _Responses(G, loop[0], loop[1], sampling, bounds)
     values = table.at(grid)
     tops = {name: _top(table, name, grid, value) for name, value in values.items()}
@@ -248,7 +252,11 @@ def _norm(S: StateSpace, sampling: Sampling | None) -> float:
 
 
 def _grid(
-    roots: Sequence[np.ndarray], sampling: Sampling | None, omega_low: float, size: float
+    roots: Sequence[np.ndarray],
+    sampling: Sampling | None,
+    omega_low: float,
+    size: float,
+    corner: float,
 ) -> Array:
     values = [np.concatenate(roots)]
     if sampling is not None:
@@ -259,7 +267,7 @@ def _grid(
     joint = np.concatenate(values)
     joint = joint[np.isfinite(joint) & (np.abs(joint) > 0.0)]
     slow = np.abs(joint)[np.abs(joint) > 1e-6 * size].min()
-    bottom, top = 0.01 * min(omega_low, slow), 300.0 * max(size, np.abs(joint).max())
+    bottom, top = 0.01 * min(omega_low, slow), max(300.0 * max(size, np.abs(joint).max()), 30.0 * corner)
     if sampling is not None:
         top = np.pi / sampling.period
     count = int(PER_DECADE * np.log10(top / bottom))

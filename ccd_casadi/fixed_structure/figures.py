@@ -77,8 +77,11 @@ class Problem:
         sizes = np.abs(self.plants.poles[self.plants.residues != 0.0])
         bottom = 0.03 * min(self.low, float(sizes.min()))
         top = 100.0 * float(sizes.max())
+        if self.bounds.weighted_level is not None and self.bounds.weights is not None:
+            w = self.bounds.weights  # a K without enough roll-off has its largest W_KS KS there
+            top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
         if self.plants.period is not None:
-            top = max(top, 100.0 / self.plants.period)
+            top = 100.0 / self.plants.period
         return np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
 
     @cached_property
