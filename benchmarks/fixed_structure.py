@@ -43,6 +43,7 @@ WEIGHTS = Weights(
 BOUNDS = Bounds(
     S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=8.426, weights=WEIGHTS
 )
+LEVELS = 12  # of the grids of a PID
 SAMPLED = Sampling(10000.0, 100.0)
 
 
@@ -128,7 +129,7 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     """
     structure = Structure(True, 1, 0, 0)
     problem = problem_for([plant], structure, bounds)
-    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.02, 3.0, 700)]))
+    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 2200)]))
     v = v[(v >= problem.base[0]) & (v <= problem.base[-1])]
     G, _ = problem.plants.responses(np.zeros(len(v), int), v)
     weights = bounds.weights or WEIGHTS
@@ -139,10 +140,11 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     G_low, _ = problem.plants.responses(np.zeros(1, int), at_low)
     best, centre = -np.inf, 0.5 * (low + high)
     width = 0.5 * (high - low)
-    for level in range(9):
-        count = 15 if level == 0 else 7
-        axes = [c + w * np.linspace(-1.0, 1.0, count) for c, w in zip(centre, width, strict=True)]
-        points = np.array(list(itertools.product(*axes)))
+    for level in range(LEVELS):
+        counts = (21, 9, 9, 9) if level == 0 else (21, 7, 7, 7)
+        axes = [c + w * np.linspace(-1.0, 1.0, count)
+                for c, w, count in zip(centre, width, counts, strict=True)]  # fmt: skip
+        points = np.clip(np.array(list(itertools.product(*axes))), *problem.box)
         for part in np.array_split(points, max(1, len(points) // 2000)):
             part = part[stable(closed_loops(problem.plants, structure, part)).all(1)]
             if not len(part):
@@ -160,17 +162,19 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
             good &= np.abs(1.0 / (1.0 + G_low * K_low))[:, 0] <= bounds.S_low
             # ω_b: the last ω up to which room >= ω, room the least shape ω/(√2|S|) so far
             room = np.minimum.accumulate((bounds.shape or np.inf) * v / (np.sqrt(2.0) * S), axis=1)
-            fine = (S <= np.sqrt(0.5)) & (room >= v)
+            fine = (np.sqrt(0.5) >= S) & (room >= v)
             last = np.where(fine.all(1), len(v) - 1, np.argmin(fine, axis=1) - 1)
             value = np.where(good & (last >= 0), v[last], -np.inf)
             k = int(np.argmax(value))
             if value[k] > best:
                 best, centre = float(value[k]), part[k]
-        width *= 0.55 if level else 2.5 / 14.0
+        width *= 0.75 if level else 0.35
     if not np.isfinite(best):
         return np.nan
     kappa = structure.in_units(centre, plant.omega_0, plant.force)
     figures = judged(plant, state_space(structure, kappa), bounds, None, True)
+    worst = max(figures.over(bounds).values())
+    assert worst < 1.0 + 2e-3, f"the grid's frequencies miss a peak: {worst}"
     return figures.bandwidth / HZ
 
 
@@ -220,7 +224,7 @@ def derivatives(seed: int, count: int = 200) -> dict[str, float]:
         assert peaks is not None
         size = np.abs(peaks.to_kappa).max(1) + 1e-3
 
-        def values(problem, kappa, tau):  # noqa: ANN001, ANN202
+        def values(problem, kappa, tau):
             return constraints(problem, kappa, tau, peaks.curve, peaks.plant, peaks.v)  # noqa: B023
 
         for i in range(len(kappa)):

@@ -29,7 +29,8 @@ SLOW = Sampling(2500.0, 900.0)  # two whole periods and a quarter of delay
 def plant(shift: float = 0.0, damping: float = 1.0, theta: Array | None = None) -> ScaledPlant:
     """Case study 1, at (55, 55) kg unless told."""
     theta = np.array([55.0, 55.0]) if theta is None else theta
-    modal = modal_plant(mechanics(two_mass_model(), theta), SUSPENSION, Perturbation(shift, damping))
+    system = mechanics(two_mass_model(), theta)
+    modal = modal_plant(system, SUSPENSION, Perturbation(shift, damping))
     return scale_plant(modal, WEIGHTS.M_K)
 
 

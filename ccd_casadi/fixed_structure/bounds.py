@@ -28,7 +28,7 @@ class Bounds:
     def __post_init__(self) -> None:
         if not self.S_max > 1.0:
             raise ValueError(f"S_max is {self.S_max}; no loop with roll-off stays below 1")
-        if not 0.0 < self.S_low or not self.omega_low > 0.0:
+        if not self.S_low > 0.0 or not self.omega_low > 0.0:
             raise ValueError("S_low and omega_low have to be above 0")
         if self.shape is not None and not self.shape >= 1.0:
             raise ValueError(f"shape is {self.shape}; below 1 no loop reaches -3 dB at ω_b")

@@ -129,7 +129,7 @@ def judged(
     poles = np.linalg.eigvals(S.A)
     stability = float(poles.real.max() if sampling is None else np.abs(poles).max() - 1.0)
     if not stability < 0.0:
-        return PlantFigures(False, stability, *[np.nan] * 11, False)
+        return _unstable(stability)
     roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
     roots += [transmission_zeros(*_scaled(x)) * _size(x) for x in (G, K) if not x.D.any()]
     corner = 0.0
@@ -159,6 +159,13 @@ def judged(
         weighted_T=weighted[1],
         static_compliance=float(values["GS"][0]),
         confirmed=abs(norm / top - 1.0) <= CONFIRMED,
+    )
+
+
+def _unstable(stability: float) -> PlantFigures:
+    nan = np.nan
+    return PlantFigures(
+        False, stability, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False
     )
 
 
@@ -267,7 +274,8 @@ def _grid(
     joint = np.concatenate(values)
     joint = joint[np.isfinite(joint) & (np.abs(joint) > 0.0)]
     slow = np.abs(joint)[np.abs(joint) > 1e-6 * size].min()
-    bottom, top = 0.01 * min(omega_low, slow), max(300.0 * max(size, np.abs(joint).max()), 30.0 * corner)
+    bottom = 0.01 * min(omega_low, slow)
+    top = max(300.0 * max(size, float(np.abs(joint).max())), 30.0 * corner)
     if sampling is not None:
         top = np.pi / sampling.period
     count = int(PER_DECADE * np.log10(top / bottom))
@@ -300,7 +308,7 @@ def _top(table: _Responses, name: str, grid: Array, value: Array) -> tuple[float
 def _bandwidth(
     table: _Responses, grid: Array, S: Array, bounds: Bounds, integrator: bool
 ) -> tuple[float, float]:
-    """The first ω with |S| = 1/√2, and the largest ω_b with |S| <= min(1, shape ω/ω_b)/√2 below."""
+    """The first ω with |S| = 1/√2, and the largest ω_b that keeps the shape below it."""
     above = np.flatnonzero(S > HALF_POWER)
     if S[0] > HALF_POWER or not len(above):
         return np.nan, 0.0
@@ -317,9 +325,11 @@ def _bandwidth(
     omega = np.unique(np.concatenate([grid[: above[0]], np.geomspace(low / 30.0, low, 1000)]))
     omega = omega[omega <= low]
 
+    shape = bounds.shape
+
     def room(x: Array) -> Array:
         counted = x if integrator else np.maximum(x, bounds.omega_low)
-        return np.asarray(bounds.shape * counted * HALF_POWER / table.at(x)["S"])
+        return np.asarray(shape * counted * HALF_POWER / table.at(x)["S"])
 
     value = room(omega)
     inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1

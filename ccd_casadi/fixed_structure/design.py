@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
-from ccd_casadi.fixed_structure.structure import Structure, state_space
+from ccd_casadi.fixed_structure.structure import Kind, Structure, state_space
 from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
 from ccd_casadi.plant import Array
 from ccd_casadi.scaling import ScaledPlant, StateSpace
@@ -26,7 +26,8 @@ MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 POOL = 12  # random starts tried for stability for each one that is raced
 RACE = (15, 30, 60)  # steps of each round, after which the better half goes on
-LAST = 3  # that climb to the end
+LAST = 3  # that climb to the end, if they are
+BEHIND = 0.1  # (in ln ω_b) no further behind
 LONGEST = 300
 SAME = 2e-3  # relative: bandwidths of one local optimum
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
@@ -55,14 +56,16 @@ class SectionsDesign:
 
     `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state
     space (sampled loops: to be discretised by Tustin's rule without prewarping). `bandwidth` holds
-    on every plant. `multipliers` by kind of bound: change of ln ω_b per ln of it. `short` names the
-    bounds that the nearest controller misses, with the factor, where none meets all.
+    on every plant. `frequencies` bounded those of K's roots. `multipliers` by kind of bound: change
+    of ln ω_b per ln of it. `short` names the bounds that the nearest controller misses, with the
+    factor, where none meets all.
     """
 
     outcome: SectionsOutcome
     words: str
     structure: Structure
     kappa: Array
+    frequencies: tuple[float, float]
     controller: StateSpace | None
     bandwidth: float
     certificate: Certificate | None
@@ -90,17 +93,20 @@ def problem_for(
     structure: Structure,
     bounds: Bounds,
     sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
 ) -> Problem:
-    """The problem in the units of the first plant, with a box of κ that its time scale gives.
+    """The problem in the units of the first plant.
 
-    Frequencies lie within 1e-3 and 100 ω₀ (sampled: half the rate over π... at most 2/T), the gain
-    within a factor 1e6 of M_K.
+    `frequencies` (rad/s) bound those of K's roots; by default 1e-3 ω₀ and 30 times the fastest
+    pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
     """
     family = plant_set(plants, sampling)
     fastest = 30.0 * max(1.0, float(np.abs(family.poles).max()))
     if family.period is not None:
         fastest = min(fastest, 2.0 / family.period)
-    slowest = 1e-3 if family.period is None else min(1e-3, 0.01 * fastest)
+    slowest = min(1e-3, 0.01 * fastest)
+    if frequencies is not None:
+        slowest, fastest = (frequency / family.omega_0 for frequency in frequencies)
     return Problem(family, structure, bounds, structure.bounds((slowest, fastest), (1e-6, 1e6)),
                    MARGIN)  # fmt: skip
 
@@ -115,26 +121,29 @@ def synthesise_sections(
     seed: int = 0,
     initial: Sequence[Array | StateSpace] = (),
     only_initial: bool = False,
+    frequencies: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every SISO plant.
 
     `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they race
-    beside `starts` others by rules and at random, or alone with `only_initial`. Raises PlantError
+    beside `starts` others by rules and at random, or alone with `only_initial`. `frequencies` as in
+    `problem_for`: give them where designs at several θ are compared. Raises PlantError
     for plants that cannot be in a set.
     """
     begun = perf_counter()
-    problem = problem_for(plants, structure, bounds, sampling)
+    problem = problem_for(plants, structure, bounds, sampling, frequencies)
     rng = np.random.default_rng(seed)
     pool = _initial(problem, initial, rng)
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
+    spanned = _span(problem)
 
     def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
         return SectionsDesign(
-            outcome, words or outcome.value, structure, np.full(len(structure.names), np.nan), None,
-            np.nan, None, {}, (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
+            outcome, words or outcome.value, structure, np.full(len(structure.names), np.nan),
+            spanned, None, np.nan, None, {}, (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
         )  # fmt: skip
 
     if not len(pool):
@@ -173,7 +182,7 @@ def bandwidth_and_gradient(
 
     The gradient is NaN where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
     """
-    problem = problem_for(plants, design.structure, bounds, sampling)
+    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
     kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
     found = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
@@ -185,6 +194,13 @@ def in_problem_units(problem: Problem, kappa: Array) -> Array:
     """SI parameters κ in the units of the problem."""
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
+
+
+def _span(problem: Problem) -> tuple[float, float]:
+    """The bounds of frequencies of K's roots in rad/s."""
+    index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
+    low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
+    return float(low), float(high)
 
 
 def _initial(
@@ -242,6 +258,8 @@ def _race(problem: Problem, pool: Array, tell: Progress) -> tuple[list[Ascent], 
              f"bounds passed by {lead.assessment.violation:.1g}")  # fmt: skip
         if steps != LONGEST:
             field = field[: max(LAST, len(field) // 2 if steps != RACE[-1] else LAST)]
+        if steps == RACE[-1]:
+            field = [end for end in field if end.point.merit() > lead.tau - BEHIND] or field[:1]
     return field, evaluations
 
 
@@ -292,6 +310,6 @@ def _designed(
     if outcome is SectionsOutcome.CERTIFIED:
         bandwidth = min(bandwidth, judged.bandwidth)
     return SectionsDesign(
-        outcome, words, structure, kappa, controller, bandwidth, judged, found.named(), found.ends,
-        found.residual, short, optima, starts, evaluations, seed, seconds,
+        outcome, words, structure, kappa, _span(problem), controller, bandwidth, judged,
+        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed, seconds,
     )  # fmt: skip

@@ -193,21 +193,21 @@ def assess(
         found.append((np.full(len(rows), curve), rows, v[rows, at], low, high))
         rows, at = np.nonzero(regular & (value > -within))
         near.append((np.full(len(rows), curve), rows, v[rows, at]))
-    curve, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
-    top, closed = _closed(problem, kappa, tau, curve, rows, start, low, high)
+    kind, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
+    top, closed = _closed(problem, kappa, tau, kind, rows, start, low, high)
     # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
-    whole = closed | (curve != Curve.SHAPE) | (start < 0.1 * crossing)
-    curve, rows, top = curve[whole], rows[whole], top[whole]
+    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing)
+    kind, rows, top = kind[whole], rows[whole], top[whole]
     plants = np.arange(P)
     low_v = float(problem.plants.variable(np.array([problem.low]))[0])
-    curve = np.concatenate([curve, np.full(P, Curve.S_LOW), np.full(P, Curve.CROSSING)])
+    kind = np.concatenate([kind, np.full(P, Curve.S_LOW), np.full(P, Curve.CROSSING)])
     rows = np.concatenate([rows, plants, plants])
     top = np.concatenate([top, np.full(P, low_v), np.full(P, crossing)])
     other = [np.concatenate(part) for part in zip(*near, strict=True)]
     return Assessment(
         True,
         poles,
-        constraints(problem, kappa, tau, curve, rows, top),
+        constraints(problem, kappa, tau, kind, rows, top),
         constraints(problem, kappa, tau, *other),
     )
 
@@ -269,8 +269,10 @@ def evaluate(
         if bounds.shape is not None:
             under = np.minimum(np.log(bounds.shape * shaped) - tau, 0.0)
             levels[Curve.SHAPE] = ln_S + HALF_POWER - under
-        weighted = bounds.weighted_level is not None and bounds.weights is not None
+        weighted = Curve.KS in problem.curves
         if weighted:
+            assert bounds.weighted_level is not None
+            assert bounds.weights is not None
             ln_level = np.log(bounds.weighted_level)
             W, dW = log_weights(bounds.weights, omega * plants.omega_0)
             levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
@@ -379,7 +381,7 @@ def _closed(
 ) -> tuple[Array, np.ndarray]:
     """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
 
-    Where a bracket's slopes do not change sign (an end) the start stays; second comes where they do.
+    Where a bracket's slopes do not change sign (an end) the start stays; second: where they do.
     """
     if not len(start):
         return start, np.zeros(0, bool)

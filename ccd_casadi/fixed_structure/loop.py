@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import eig, expm
 
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
 from ccd_casadi.plant import Array, PlantError
@@ -324,9 +324,7 @@ def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, 
 
 
 def _zeros(plant: LoopPlant) -> np.ndarray:
-    """Finite zeros in w: eigenvalues of A - B C_r⁺... by the pencil of the system matrix."""
-    from scipy.linalg import eig
-
+    """Finite zeros in w: the finite eigenvalues of the system matrix's pencil."""
     n = len(plant.A)
     system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
     shape = np.zeros((n + 1, n + 1))

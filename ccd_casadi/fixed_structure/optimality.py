@@ -20,7 +20,8 @@ RESIDUAL = 1e-3  # of ∇τ, which is 1: above it there is no envelope gradient
 
 @dataclass(frozen=True)
 class Optimality:
-    """What binds, its multipliers (change of ln ω_b per ln of a bound), the residual over ‖∇τ‖.
+    """What binds, its multipliers (change of ln ω_b per ln of a bound), the residual over ‖∇τ‖,
+    and by how much a bound is passed (logarithm).
 
     `ends` are the parameters at an end of their box, as (name, "lower" or "upper", multiplier).
     """
@@ -29,6 +30,7 @@ class Optimality:
     multipliers: Array
     ends: tuple[tuple[str, str, float], ...]
     residual: float
+    violation: float
 
     def named(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
@@ -44,7 +46,7 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     """Non-negative least squares on the active constraints of a point whose loops are stable."""
     peaks = point.assessment.peaks
     assert peaks is not None
-    active = peaks.only(np.abs(peaks.value) <= ACTIVE + point.assessment.violation)
+    active = peaks.only(np.abs(peaks.value) <= ACTIVE)
     n = len(point.kappa)
     columns = [np.column_stack([active.to_kappa, active.to_tau])]
     ends = []
@@ -56,17 +58,17 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     matrix = np.concatenate(columns).T
     goal = np.eye(n + 1)[n]
     if matrix.shape[1] == 0:
-        return Optimality(active, np.zeros(0), (), 1.0)
+        return Optimality(active, np.zeros(0), (), 1.0, point.assessment.violation)
     mu, _ = nnls(matrix, goal, maxiter=100 * matrix.shape[1])
     residual = float(np.abs(matrix @ mu - goal).max())
     count = len(active.v)
     found = tuple((*end, float(value)) for end, value in zip(ends, mu[count:], strict=True))
-    return Optimality(active, mu[:count], found, residual)
+    return Optimality(active, mu[:count], found, residual, point.assessment.violation)
 
 
 def log_bandwidth_gradient(problem: Problem, kappa: Array, found: Optimality) -> Array:
     """d ln ω_b*/dθ (n_θ,); NaN where the conditions of optimality do not hold."""
     slopes = to_theta(problem, kappa, found.active)
-    if found.residual > RESIDUAL:
+    if found.residual > RESIDUAL or found.violation > ACTIVE:
         return np.full(slopes.shape[1], np.nan)
     return -found.multipliers @ slopes

@@ -2,8 +2,8 @@
 
 A start has its crossover |L(jω_c)| = 1 at a chosen frequency, integrator and lead placed around it
 by the rules of thumb (ω_i = ω_c/6, lead from ω_c/3 to 3ω_c, roll-off at 8ω_c), and its biquads as
-notches at the plants' resonances (`by rules`) or anywhere (`at random`). Only those that every
-closed loop of the set is stable with are kept: that is decided by eigenvalues, for hundreds at once.
+notches at the plants' resonances (`by_rules`) or anywhere (`at_random`). Only those that every
+closed loop of the set is stable with are kept, as eigenvalues say, for hundreds at once.
 """
 
 import numpy as np

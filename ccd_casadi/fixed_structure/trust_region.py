@@ -11,6 +11,7 @@ CasADi's DAQP, or by its interior-point method where that one fails.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,9 +25,10 @@ LARGEST_RADIUS = 1.5
 PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth so many of ω_b
 ROWS = (64, 128, 256, 400)  # sizes of programmes, so that few solvers are made
 FLAT = 1e-4  # least curvature, which leaves a linear programme one
-ENOUGH = 0.7  # share of the predicted gain that a model has to keep to be trusted further
+ENOUGH = 0.7  # of the predicted gain: with it a model is trusted further
 KEPT = 1e-7  # by how much a programme's answer may miss its own rows
-OPTIONS = {  # the dual active-set method is fast, the interior-point method misses nothing
+# The dual active-set method is fast, the interior-point method misses nothing.
+OPTIONS: dict[str, dict[str, Any]] = {
     "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}},
     "ipqp": {"print_iter": False, "print_header": False, "print_info": False},
 }
@@ -162,10 +164,9 @@ def _programme(
     high[:n] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
     violation = point.assessment.violation
     low[n + 1], high[n + 1] = 0.0, 1e4
-    data = {"h": H, "g": cost, "a": A, "lba": -np.inf, "uba": upper, "lbx": low, "ubx": high}
     for name in ("daqp", "ipqp"):
         solver = _solver(name, n + 2, size)
-        found = solver(**data)
+        found = solver(h=H, g=cost, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
         x = np.array(found["x"]).ravel()
         if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
             break

@@ -40,7 +40,7 @@ class UncertainPlant:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The uncertain parameters; a single mode's own shift is the common one's where it is one."""
+        """The uncertain parameters, those whose range is not zero."""
         found = ["resonance_shift"] if self.resonance_shift else []
         if self.mode_shift:
             found += [f"mode_shift {i}" for i in range(1, self.modes + 1)]
@@ -104,10 +104,10 @@ class UncertainPlant:
                     row = [(number >> i) & 1 for i in range(n)]
                     found.append((option, box[row, np.arange(n)]))
             else:
-                for row in (0, 1):
-                    found.append((option, box[row]))
+                for end in (0, 1):
+                    found.append((option, box[end]))
                     for i in range(n):
                         point = centre.copy()
-                        point[i] = box[row, i]
+                        point[i] = box[end, i]
                         found.append((option, point))
         return found

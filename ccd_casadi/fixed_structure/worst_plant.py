@@ -101,7 +101,7 @@ def excesses(
     out = np.full(len(points), -np.inf)
     if found.peaks is not None:
         np.maximum.at(out, found.peaks.plant, found.peaks.value - problem.margin)
-    grown = found.poles.real.max(axis=1)
+    grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
     return np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
 
 
@@ -124,7 +124,8 @@ def worst_plants(
     points = lattice(uncertain, count, seed)
     value = values(points)
     looked, n = len(points), len(uncertain.names)
-    heads = [Excess(*points[i], float(value[i])) for i in np.argsort(-value)[:SEARCHES]]
+    first = np.argsort(-value)[:SEARCHES]
+    heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
         return heads, looked
     box = uncertain.box
@@ -139,12 +140,10 @@ def worst_plants(
         found = values(moves).reshape(len(heads), 2 * n)
         looked += len(moves)
         best = np.argmax(found, axis=1)
-        heads = [
-            Excess(*moves[2 * n * row + best[row]], float(found[row, best[row]]))
-            if found[row, best[row]] > head.value
-            else head
-            for row, head in enumerate(heads)
-        ]
+        for row, k in enumerate(best):
+            if found[row, k] > heads[row].value:
+                option, point = moves[2 * n * row + int(k)]
+                heads[row] = Excess(option, point, float(found[row, k]))
         step = 0.5 * step
     return sorted(heads, key=lambda head: -head.value), looked
 
@@ -169,8 +168,10 @@ def synthesise_robustly(
     begun = perf_counter()
     tell = progress or (lambda words: None)
     members = uncertain.corners()
-    made = synthesise_sections(uncertain.plants(members), structure, bounds, sampling=sampling,
-                               starts=starts, seed=seed, initial=initial, progress=progress)  # fmt: skip
+    made = synthesise_sections(
+        uncertain.plants(members), structure, bounds, sampling=sampling, starts=starts, seed=seed,
+        initial=initial, progress=progress,
+    )  # fmt: skip
     looked, turn = 0, 0
     worst = Excess(0, uncertain.nominal, np.nan)
     while made.certified:
@@ -189,7 +190,7 @@ def synthesise_robustly(
     judged: Certificate | None = None
     checked = 0
     if made.certified and made.controller is not None:
-        points = lattice(uncertain, LATTICE, seed + 1000) + [(worst.option, worst.point)]
+        points = [*lattice(uncertain, LATTICE, seed + 1000), (worst.option, worst.point)]
         checked = len(points)
         tolerant = _loosened(bounds, 2.0 * WITHIN)
         judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,
@@ -197,8 +198,8 @@ def synthesise_robustly(
     if judged is None:
         words = made.words
     else:
-        words = (f"{judged.words}; searches over {looked} plants found none worse than "
-                 f"{np.expm1(worst.value):+.1e} of a bound; nothing is proven between them")  # fmt: skip
+        found = f"{np.expm1(worst.value):+.1e} of a bound; nothing is proven between them"
+        words = f"{judged.words}; searches over {looked} plants found none worse than {found}"
     return RobustDesign(made, tuple(members), worst, judged, checked, turn,
                         perf_counter() - begun, words)  # fmt: skip
 
