@@ -43,7 +43,7 @@ WEIGHTS = Weights(
 BOUNDS = Bounds(
     S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=8.426, weights=WEIGHTS
 )
-LEVELS = 12  # of the grids of a PID
+LEVELS = 11  # of the grids of a PID
 SAMPLED = Sampling(10000.0, 100.0)
 
 
@@ -129,7 +129,7 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     """
     structure = Structure(True, 1, 0, 0)
     problem = problem_for([plant], structure, bounds)
-    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 2200)]))
+    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 5000)]))
     v = v[(v >= problem.base[0]) & (v <= problem.base[-1])]
     G, _ = problem.plants.responses(np.zeros(len(v), int), v)
     weights = bounds.weights or WEIGHTS
@@ -274,16 +274,20 @@ def carriage(theta: tuple[float, float]) -> Mechanics:
 
 
 def stage(seed: int) -> dict[str, dict[str, object]]:
-    """The tutorial's stage at +-5 %, several heights of rib, plate 6 mm."""
+    """The tutorial's stage at +-5 %, plate 6 mm.
+
+    16.12 is the largest |W_KS KS| of the tutorial's own nominal H-infinity design, whose |W_T T|
+    reaches 22.4; 8.426 is the level of case study 1.
+    """
     weights = replace(WEIGHTS, omega_K=200.0 * HZ, M_K=2e6)
     found = {}
-    for rib, level in itertools.product((19.0, 17.0), (8.426, None)):
+    for rib, level in itertools.product((19.0, 17.0), (16.12, 8.426)):
         bounds = Bounds(S_max=2.0, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=level,
                         weights=weights if level else None)  # fmt: skip
         uncertain = UncertainPlant((carriage((rib, 6.0)),), Suspension(), 2e6,
                                    resonance_shift=0.05)  # fmt: skip
         made = synthesise_robustly(uncertain, Structure(least_damping=0.05), bounds, seed=seed,
-                                   starts=12)  # fmt: skip
+                                   starts=8)  # fmt: skip
         name = f"rib {rib:g} mm, weighted level {level}"
         design = made.design
         row: dict[str, object] = {"mass_kg": 5.9 + 0.05 * rib, "outcome": design.outcome.value}

@@ -25,7 +25,7 @@ TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still 
 CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
 PER_DECADE = 60
 FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
-ZOOMS = 5  # each time eleven points between a maximum's neighbours: the spacing over 5
+ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 
 
 @dataclass(frozen=True)

@@ -141,9 +141,10 @@ def synthesise_sections(
     spanned = _span(problem)
 
     def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
+        nothing = np.full(len(structure.names), np.nan)
         return SectionsDesign(
-            outcome, words or outcome.value, structure, np.full(len(structure.names), np.nan),
-            spanned, None, np.nan, None, {}, (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
+            outcome, words or outcome.value, structure, nothing, spanned, None, np.nan, None, {},
+            (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
         )  # fmt: skip
 
     if not len(pool):
@@ -311,5 +312,6 @@ def _designed(
         bandwidth = min(bandwidth, judged.bandwidth)
     return SectionsDesign(
         outcome, words, structure, kappa, _span(problem), controller, bandwidth, judged,
-        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed, seconds,
+        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
+        seconds,
     )  # fmt: skip
