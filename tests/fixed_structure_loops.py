@@ -1,0 +1,48 @@
+"""Loops for the tests of fixed structures: plants, bounds, random stable controllers."""
+
+import numpy as np
+from helpers import HZ, PAPER, SUSPENSION, two_mass_model
+
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.figures import Problem
+from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.support.arrays import Array
+
+WEIGHTS = PAPER.at(PAPER.omega_S, 25.0 * HZ)
+BOUNDS = Bounds(
+    S_max=1.75,
+    S_low=0.03,
+    omega_low=HZ,
+    shape=1.1,
+    weighted_level=8.426,
+    weights=WEIGHTS,
+    compliance_max=1e-6,
+)
+FAST = Sampling(10000.0, 130.0)
+LATE = Sampling(5000.0, 250.0)  # a whole period and a quarter
+SLOW = Sampling(2500.0, 900.0)  # two whole periods and a quarter of delay
+
+
+def plant(shift: float = 0.0, damping: float = 1.0, theta: Array | None = None) -> ScaledPlant:
+    """Case study 1, at (55, 55) kg unless told."""
+    theta = np.array([55.0, 55.0]) if theta is None else theta
+    system = mechanics(two_mass_model(), theta)
+    modal = modal_plant(system, SUSPENSION, Perturbation(shift, damping))
+    return scale_plant(modal, WEIGHTS.M_K)
+
+
+def loop(
+    seed: int, structure: Structure, sampling: Sampling | None = None, shifts: tuple = (0.0,)
+) -> tuple[Problem, Array]:
+    """A problem on shifted plants, and a random controller that all of them are stable with."""
+    rng = np.random.default_rng(seed)
+    problem = problem_for([plant(shift) for shift in shifts], structure, BOUNDS, sampling)
+    for _ in range(50):
+        found = kept(problem, at_random(problem, np.exp(rng.uniform(-4.0, -1.0, 40)), rng))
+        if len(found):
+            return problem, found[0]
+    raise AssertionError("no random controller is stable")

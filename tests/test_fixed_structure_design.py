@@ -1,0 +1,244 @@
+"""Fixed structures: the search, the judge, the envelope gradient and the box of plants."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
+from helpers import HZ, SUSPENSION, two_mass_model
+
+from ccd_casadi.fixed_structure import (
+    Bounds,
+    Sampling,
+    SectionsOutcome,
+    Structure,
+    bandwidth_and_gradient,
+    certify,
+    synthesise_sections,
+)
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.optimality import optimality
+from ccd_casadi.fixed_structure.structure import response, state_space
+from ccd_casadi.fixed_structure.trust_region import Point
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
+from ccd_casadi.plants.modal import Perturbation, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import scale_plant, scale_state_space
+from ccd_casadi.synthesis.closed_loop import measure, responses
+
+# One notch and a first-order roll-off are quick to find and have every kind of bound.
+SMALL = Structure(biquads=1, roll_off=2)
+EASY = replace(BOUNDS, S_max=2.0, compliance_max=None)
+
+
+@pytest.fixture(scope="module")
+def design():
+    """The small structure on case study 1, one plant."""
+    return synthesise_sections([plant()], SMALL, EASY, starts=2, seed=1)
+
+
+def test_a_design_is_certified_optimal_and_within_its_bounds(design) -> None:
+    assert design.outcome is SectionsOutcome.CERTIFIED
+    assert design.kkt_residual < 1e-4
+    assert design.certificate.passed
+    assert max(design.certificate.worst.values()) <= 1.0
+    assert design.bandwidth > 20.0 * HZ
+    assert sum(optimum.count for optimum in design.local_optima) >= 1
+    poles = np.linalg.eigvals(design.controller.A)
+    assert (poles.real < 0.0).sum() == SMALL.order - 1  # all but the integrator's
+
+
+def test_the_judge_agrees_with_the_projects_own(design) -> None:
+    """‖S‖∞, |S(jω_low)| and ω_b against `closed_loop.measure`, which is compiled and older."""
+    own = measure(plant(), design.controller, WEIGHTS, gamma=1e9, omega_low=EASY.omega_low)
+    judged = design.certificate.plants[0]
+    assert own.certificate.stable
+    assert judged.S_peak == pytest.approx(own.sensitivity_peak, rel=1e-6)
+    assert judged.S_low == pytest.approx(own.sensitivity_low, rel=1e-5)
+    assert judged.crossing == pytest.approx(own.bandwidth, rel=1e-6)
+
+
+def test_no_small_change_of_the_parameters_is_better(design) -> None:
+    """Local optimality by trial: feasible neighbours have no higher ω_b."""
+    problem = problem_for([plant()], SMALL, EASY)
+    kappa = in_problem_units(problem, design.kappa)
+    tau = np.log(design.bandwidth / problem.plants.omega_0)
+    rng = np.random.default_rng(0)
+    for size in (1e-2, 1e-3):
+        for _ in range(40):
+            moved = np.clip(kappa + size * rng.normal(size=len(kappa)), *problem.box)
+            assert assess(problem, moved, tau + 1e-2 * size).violation > 0.0
+
+
+def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
+    value, slope = bandwidth_and_gradient([plant()], EASY, design)
+    assert value == design.bandwidth
+    h = 0.02
+    for i in range(2):
+        ends = []
+        for sign in (1.0, -1.0):
+            theta = np.array([55.0, 55.0])
+            theta[i] += sign * h
+            made = synthesise_sections(
+                [plant(theta=theta)], SMALL, EASY, initial=[design.kappa], only_initial=True,
+                frequencies=design.frequencies,
+            )  # fmt: skip
+            assert made.certified
+            ends.append(made.bandwidth)
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slope[i], rel=2e-3)
+
+
+def test_a_gradient_is_not_made_up_away_from_an_optimum(design) -> None:
+    moved = replace(design, kappa=design.kappa + 0.01)
+    _, slope = bandwidth_and_gradient([plant()], EASY, moved)
+    assert np.isnan(slope).all()
+
+
+def test_the_judge_refutes_what_is_unstable_or_passes_a_bound(design) -> None:
+    louder = replace(design.controller, C=4.0 * design.controller.C)
+    assert not certify([plant()], louder, EASY).passed
+    S_max = 0.999 * design.certificate.plants[0].S_peak
+    assert not certify([plant()], design.controller, replace(EASY, S_max=S_max)).passed
+    turned = replace(design.controller, C=-design.controller.C, D=-design.controller.D)
+    judged = certify([plant(), plant(0.03)], turned, EASY)
+    assert not judged.passed
+    assert "unstable on plant 1" in judged.words
+
+
+def test_a_flat_shelf_is_no_bandwidth() -> None:
+    """ω_b is the largest below which |S| keeps the shape, far below -3 dB where |S| is flat."""
+    structure = Structure(integrator=True, lead=0, biquads=1, roll_off=0)
+    problem = problem_for([plant()], structure, EASY)
+    hz = HZ / problem.plants.omega_0
+    # Zeros at 3 Hz make K G, a double integrator, flat up to the poles: |S| is near 1/2.1 there.
+    kappa = np.log(np.array([1.0, 0.05 * hz, 3.0 * hz, 1.0, 90.0 * hz, 0.7]))
+    at = np.array([20.0 * hz])
+    G = problem.plants.responses(np.zeros(1, int), at)[0]
+    kappa[0] += np.log(1.1 / np.abs(G * response(structure, kappa, 1j * at)))[0]
+    si = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    K = state_space(structure, si)
+    judged = certify([plant()], K, EASY).plants[0]
+    assert judged.stable
+    assert certify([plant()], K, replace(EASY, shape=None)).bandwidth == judged.crossing
+    assert judged.bandwidth < 0.5 * judged.crossing
+    omega = np.geomspace(1e-3 * judged.crossing, judged.crossing, 20001)
+    S = np.abs(responses(plant(), K, omega)[2][:, 0, 0])
+    for factor, kept in ((1.0 - 1e-6, True), (1.02, False)):
+        end = factor * judged.bandwidth
+        allowed = np.minimum(EASY.shape * omega / end, 1.0) / np.sqrt(2.0)
+        assert bool((allowed >= S)[omega <= end].all()) == kept
+
+
+@pytest.mark.parametrize("sampling", [None, FAST, Sampling(3000.0, 700.0)])
+def test_the_judge_finds_the_peaks_of_the_search(sampling: Sampling | None) -> None:
+    for seed in range(3):
+        problem, kappa = loop(seed, Structure(), sampling, (-0.02, 0.02))
+        members = problem.plants
+        tau = np.log(0.05)
+        peaks = assess(problem, kappa, tau, depth=-60.0).peaks
+        assert peaks is not None
+        si = problem.structure.in_units(kappa, members.omega_0, members.force)
+        K = state_space(problem.structure, si)
+        judged = certify([plant(-0.02), plant(0.02)], K, BOUNDS, sampling)
+        for i, figures in enumerate(judged.plants):
+            over = figures.over(BOUNDS)
+            assert figures.stable
+            assert figures.confirmed
+            for code, name in enumerate(("S_max", None, "S_low", "KS", "T", "GS")):
+                if name is not None:
+                    own = peaks.value[(peaks.curve == code) & (peaks.plant == i)].max()
+                    assert np.exp(own - problem.margin) == pytest.approx(over[name], rel=1e-5)
+
+
+def test_pid_alone_is_the_best_of_a_grid() -> None:
+    """Gain and lead against a grid of both zero and pole, the gain the best for each."""
+    structure = Structure(integrator=False, lead=1, biquads=0, roll_off=0)
+    bounds = Bounds(S_max=1.75, S_low=0.05, omega_low=HZ, shape=1.1, weighted_level=5.0,
+                    weights=replace(WEIGHTS, c_K=10.0))  # fmt: skip
+    made = synthesise_sections([plant()], structure, bounds, starts=2, seed=0)
+    assert made.certified
+    problem = problem_for([plant()], structure, bounds)
+    centre = in_problem_units(problem, made.kappa)
+    tau = np.log(made.bandwidth / problem.plants.omega_0)
+    axes = [np.linspace(-0.4, 0.4, 7)] * 3
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    better = tau + np.log(1.005)
+    values = [assess(problem, np.clip(centre + d, *problem.box), better).violation for d in grid]
+    assert min(values) > 0.0
+
+
+def test_what_cannot_be_had_is_said(design) -> None:
+    none = synthesise_sections([plant()], SMALL, replace(EASY, S_low=1e-5), starts=3)
+    assert none.outcome is SectionsOutcome.BOUND_NOT_MET
+    assert "S_LOW" in none.short
+    turned = replace(plant(), B=-plant().B)
+    lost = synthesise_sections([turned], Structure(lead=0, biquads=0, roll_off=1), EASY, starts=2)
+    assert lost.outcome is SectionsOutcome.NO_STABLE_START
+    assert lost.controller is None
+
+
+def test_a_set_of_unlike_plants_is_brought_to_common_units(design) -> None:
+    """A plant scaled with another M_K, or given as a state space, is the same plant."""
+    other = scale_plant(modal_plant(mechanics(two_mass_model(), (55.0, 55.0)), SUSPENSION), 3e6)
+    again = scale_state_space(plant().plant_si(), 1e7)
+    problem = problem_for([plant(), other, again], SMALL, EASY)
+    kappa = in_problem_units(problem, design.kappa)
+    found = assess(problem, kappa, float(np.log(design.bandwidth / problem.plants.omega_0))).peaks
+    assert found is not None
+    for code in np.unique(found.curve):
+        tops = [found.value[(found.curve == code) & (found.plant == i)].max() for i in range(3)]
+        np.testing.assert_allclose(tops, tops[0], atol=1e-6)
+
+
+def uncertain(**changes: object) -> UncertainPlant:
+    system = mechanics(two_mass_model(), (55.0, 55.0))
+    return UncertainPlant((system,), SUSPENSION, WEIGHTS.M_K, **changes)
+
+
+def test_the_box_holds_the_plants_that_it_names() -> None:
+    box = uncertain(resonance_shift=0.03, mode_shift=0.02, damping=(0.5, 2.0), gain=0.05)
+    assert box.names == ("resonance_shift", "mode_shift 1", "damping", "gain")
+    nominal = box.plant(box.nominal)
+    np.testing.assert_allclose(nominal.A, plant().A)
+    common = box.plant(np.array([0.03, 0.0, 0.5, 0.0]))
+    np.testing.assert_allclose(common.A, plant(0.03, 0.5).A, rtol=1e-12)
+    own = box.plant(np.array([0.0, 0.02, 1.0, 0.05]))
+    assert own.natural[-1] == pytest.approx(1.02 * nominal.natural[-1])
+    assert own.natural[0] == nominal.natural[0]
+    members = problem_for([nominal, own], SMALL, EASY).plants
+    flexible = members.poles[:, np.abs(members.poles[0]).argmax()]
+    assert abs(flexible[1]) == pytest.approx(1.02 * abs(flexible[0]), rel=1e-9)
+    low = np.array([1e-4])
+    G = [members.responses(np.array([i]), low)[0][0] for i in range(2)]
+    assert abs(G[1] / G[0]) == pytest.approx(1.05, rel=1e-4)
+
+
+def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
+    box = uncertain(resonance_shift=0.02, gain=0.03)
+    asked = (SMALL, design.kappa, design.bandwidth, EASY, None)
+    heads, looked = worst_plants(box, *asked, count=40)
+    values = excesses(box, lattice(box, 60, 7), *asked)
+    assert looked > 40
+    assert heads[0].value >= values.max() - 1e-6
+    assert heads[0].value == pytest.approx(
+        excesses(box, [(heads[0].option, heads[0].point)], *asked)[0]
+    )
+
+
+def test_stationarity_is_measured_not_assumed(design) -> None:
+    problem = problem_for([plant()], SMALL, EASY)
+    kappa = in_problem_units(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    at = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    off = optimality(problem, Point(kappa, tau - 0.05, assess(problem, kappa, tau - 0.05)))
+    assert at.residual < 1e-4
+    assert off.residual > 0.1
+
+
+def test_shifted_plants_are_those_of_the_robust_set() -> None:
+    system = mechanics(two_mass_model(), (55.0, 55.0))
+    modal = modal_plant(system, SUSPENSION, Perturbation(-0.02))
+    np.testing.assert_allclose(uncertain(resonance_shift=0.02).plant(np.array([-0.02])).A,
+                               scale_plant(modal, WEIGHTS.M_K).A)  # fmt: skip
