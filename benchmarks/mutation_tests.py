@@ -40,7 +40,8 @@ GROUPS = (
     Group(
         _kernels(
             "certificate", "closed_loop", "generalized_plant", "frequency", "sensitivity",
-            "design", "refine", "small", "riccati", "gamma", "synthesis", "balance", "figures",
+            "design", "refine", "small", "blocks", "riccati", "gamma", "synthesis", "balance",
+            "figures",
         ),
         (*DESIGN_TESTS, "tests/test_derivatives.py"),
         f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
