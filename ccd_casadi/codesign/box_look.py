@@ -2,7 +2,8 @@
 
 The true inner problem is solved at θ spread over the box (Sobol, seeded), those that the
 formulation solved itself counted in. With surrogates over (θ, ω_S, ω_T) a θ is passed over where
-even their optimistic values (if left-out samples say that they are to be trusted),
+even their optimistic values (if left-out samples say that they are to be trusted, and no local
+maximum of S is near -3 dB),
 
     ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
 
@@ -19,12 +20,14 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, objective
 from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.kkt import HALF_POWER
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
 LOCAL_STARTS = 8  # local solves at most, from the best of the points that beat their neighbours
@@ -35,6 +38,7 @@ TRIES = 4
 OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
 CHECKED = 4  # of those passed over that are solved nevertheless
 COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 COARSE = 1.02  # what the best between the points of the mesh may be above the best on it
 MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
@@ -78,6 +82,8 @@ def look_over_box(
     """
     problem = sampler.problem
     quantities = TrueQuantities(problem, sampler.record)
+    if processes and _may_jump(sampler, x):
+        processes = ()
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
     values = np.array([_objective(problem, sample) for sample in feasible])
@@ -156,6 +162,18 @@ def _spread(
         if solve:
             known = [*known, *sampler.bandwidths(np.array(solve), "looking over the box")]
     return known, passed_over
+
+
+def _may_jump(sampler: Sampler, x: Array) -> bool:
+    """Whether a local maximum of S at x is near -3 dB: there ω_b jumps, and surrogates do not."""
+    problem = sampler.problem
+    peaks = local_peaks_with_gradients(
+        scaled_plant(problem, tuple(x[:-2])),
+        problem.weights.at(float(np.exp(x[-2])), float(np.exp(x[-1]))),
+        gamma_backoff=problem.inner.gamma_backoff,
+        least=float(np.exp(HALF_POWER - NEAR_SHELF)),
+    )
+    return any(abs(p.ln_gain - HALF_POWER) <= NEAR_SHELF for p in peaks if p.member == 0)
 
 
 def _trustworthy(processes: tuple[GaussianProcess, ...], seed: int) -> bool:
