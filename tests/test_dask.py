@@ -12,11 +12,11 @@ from helpers import problem
 from test_parallel import TaskFailure, failing, square, whereabouts
 from test_sampling import THETAS, TWO_MASS, X, table
 
-from ccd_casadi import solve
 from ccd_casadi.sampling import cluster as module
 from ccd_casadi.sampling.cluster import Cluster
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.solve import main
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 
@@ -40,7 +40,7 @@ def test_a_solve_on_a_cluster_is_the_solve_on_one_worker(
     """Result, controller, surrogate and rows, to the last bit."""
     folder = tmp_path / "run"
     words = [str(TWO_MASS), "--out", str(folder), "--formulation", "lifted", "--quiet"]
-    assert solve.main([*words, "--scheduler", shared.address]) == 0
+    assert main([*words, "--scheduler", shared.address]) == 0
     here, there = (json.loads((f / "result.json").read_text()) for f in (two_mass_run, folder))
     assert here.pop("seconds") > 0.0 < there.pop("seconds")
     assert here == there
@@ -104,7 +104,7 @@ def test_tls_by_the_settings_of_dask(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def told(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """The one line on stderr of a command that ends with 2 and leaves nothing behind."""
-    code = solve.main([str(TWO_MASS), "--out", str(tmp_path / "o"), "--scheduler", address])
+    code = main([str(TWO_MASS), "--out", str(tmp_path / "o"), "--scheduler", address])
     output, errors = capsys.readouterr()
     assert (code, output, errors.count("\n")) == (2, "", 1), errors
     assert not (tmp_path / "o" / "samples.sqlite").exists()

@@ -334,14 +334,14 @@ import numpy as np
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 
 if __name__ == "__main__":
     problem = problem_of(load_case({str(TWO_MASS)!r}))
     with SampleStore(sys.argv[1]) as store, Workers(int(sys.argv[2])) as workers:
-        truth = Truth(problem, store, workers)
-        truth.bandwidths(np.random.default_rng(0).uniform(55.0, 70.0, (40, 2)))
-        print(truth.syntheses)
+        sampler = Sampler(problem, store, workers)
+        sampler.bandwidths(np.random.default_rng(0).uniform(55.0, 70.0, (40, 2)))
+        print(sampler.syntheses)
 """
 
 
