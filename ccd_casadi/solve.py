@@ -59,6 +59,7 @@ def summary(solution: "Solution") -> str:
 def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
     from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.reporting.verdict import terminal_lines
 
     units = result["units"]
     theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
@@ -66,6 +67,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
+        *terminal_lines(result),
         f"theta         {theta}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant   predicted "

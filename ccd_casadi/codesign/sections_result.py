@@ -14,6 +14,8 @@ from ccd_casadi.codesign.result import (
     versions,
 )
 from ccd_casadi.codesign.sections_run import VerifiedSections
+from ccd_casadi.codesign.sections_verdict import sections_verdict
+from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
@@ -131,8 +133,12 @@ def sections_result(
         "inner_optimum": bool(verified.race_gap <= tolerance),
         "robust": verified.wide.passed,
     }
+    verdict = sections_verdict(
+        verified, constraints=checks["constraints"], error=error, tolerance=tolerance
+    )
+    checks["optimality"] = verdict.optimal.state is not State.FAILED
     failed = [name for name, passed in checks.items() if not passed]
-    words = "" if not failed else "failed: " + ", ".join(failed)
+    words = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
     notes = list(plant.notes(verified.theta))
     sections = sections_of_problem(problem)
     if sections.weighted_level is None:
@@ -142,6 +148,7 @@ def sections_result(
     result = {
         **design_dict(verified.problem, made),
         "status": "not_verified" if failed else "verified",
+        "verdict": verdict_dict(verdict),
         "reason": "; ".join(part for part in (words, outcome.message) if part),
         "formulation": formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),

@@ -1,0 +1,90 @@
+"""The five lines of the verdict on a controller of fixed structure; see `verdict`."""
+
+import math
+
+from ccd_casadi.codesign.sections_run import VerifiedSections
+from ccd_casadi.codesign.verdict import Line, State, Verdict
+from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.support.units import HZ
+
+# Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3.
+KKT_LEVEL = 1e-2
+
+
+def sections_verdict(
+    verified: VerifiedSections, *, constraints: bool, error: float, tolerance: float
+) -> Verdict:
+    """`constraints`: λ(θ) <= 0; `error`: of the predicted bandwidth, relative."""
+    return Verdict(
+        certified=_certified(verified, constraints),
+        optimal=_optimal(verified, tolerance),
+        predicted=_predicted(error, tolerance),
+        survives=_survives(verified),
+        deployable=_deployable(verified),
+    )
+
+
+def _certified(verified: VerifiedSections, constraints: bool) -> Line:
+    made = verified.design
+    figures = {} if made.certificate is None else {"figures_over_bounds": made.certificate.worst}
+    if not made.certified:
+        return Line(State.FAILED, made.words, figures)
+    if not constraints:
+        return Line(State.FAILED, "certified, but a constraint on theta is not met", figures)
+    count = 0 if made.certificate is None else len(made.certificate.plants)
+    words = f"stable and within every bound on the {count} plants that it was designed on"
+    return Line(State.PASSED, words, figures)
+
+
+def _optimal(verified: VerifiedSections, tolerance: float) -> Line:
+    residual, gap = verified.kkt.stationarity, verified.race_gap
+    found = [value / HZ for value, _ in verified.raced.optima]
+    figures = {
+        "kkt_residual": residual,
+        "kkt_level": KKT_LEVEL,
+        "inner_gap": gap,
+        "local_optima_hz": found,
+    }
+    raced = ", ".join(f"{value:.2f}" for value in found)
+    known = f"a full race at this theta ended at {raced} Hz; gap not known"
+    if gap > tolerance:
+        words = f"a race found a controller with {100.0 * gap:.2g} % more bandwidth at this theta"
+        return Line(State.FAILED, words, figures)
+    if not math.isfinite(residual):
+        return Line(State.WARNED, f"KKT residual over theta unknown; {known}", figures)
+    if residual > KKT_LEVEL:
+        words = f"not optimal: KKT residual {residual:.1e} over theta, above {KKT_LEVEL:g}"
+        return Line(State.FAILED, f"{words}; {known}", figures)
+    return Line(State.PASSED, f"KKT residual {residual:.1e} over theta; {known}", figures)
+
+
+def _predicted(error: float, tolerance: float) -> Line:
+    state = State.PASSED if error <= tolerance else State.FAILED
+    return Line(
+        state, f"bandwidth predicted to {error:.1e}", {"error": error, "tolerance": tolerance}
+    )
+
+
+def _survives(verified: VerifiedSections) -> Line:
+    wide, excess = verified.wide, math.expm1(verified.worst.value)
+    figures = {"plants": verified.checked, "worst_excess": excess}
+    where = f"{verified.checked} plants of the box that [robust] names"
+    if not wide.passed:
+        return Line(State.FAILED, f"on {where}: {wide.words}", figures)
+    words = f"within every bound on {where}, the worst searched {100.0 * excess:+.2g} % of a bound"
+    if verified.checked <= 1:
+        return Line(State.WARNED, "[robust] names no plant but the model", figures)
+    return Line(State.PASSED, f"{words}; between them nothing is proven", figures)
+
+
+def _deployable(verified: VerifiedSections) -> Line:
+    sampling = sections_of_problem(verified.problem).sampling
+    if sampling is None:
+        words = "designed as if continuous: run deploy, or give rate_hz and delay_us in [loop]"
+        return Line(State.UNKNOWN, words, {})
+    words = (
+        f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold and "
+        "delay exact at the instants; run deploy for the code"
+    )
+    figures = {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
+    return Line(State.PASSED, words, figures)
