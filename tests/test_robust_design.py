@@ -189,6 +189,7 @@ def over_shifts(run: FinishedRun, count: int = 61) -> list[DesignFigures]:
     return found
 
 
+@pytest.mark.slow  # a whole robust co-design; CI has the tutorial's
 def test_robust_co_design_of_case_study_1(two_mass_run: Path, tmp_path: Path) -> None:
     """‖S‖∞ <= S_max over ±3 % for 40.06 Hz instead of 72.05; the nominal design is not stable."""
     path = tmp_path / "robust.toml"
@@ -213,6 +214,7 @@ def test_robust_co_design_of_case_study_1(two_mass_run: Path, tmp_path: Path) ->
     assert nominal[-1].sensitivity_peak > 1.75
 
 
+@pytest.mark.slow  # a whole robust co-design; CI has the tutorial's
 def test_what_no_robust_design_meets_is_infeasible(tmp_path: Path, capsys) -> None:
     path = tmp_path / "robust.toml"
     text = (RUNS / "two_mass.toml").read_text().replace("S_max = 1.75", "S_max = 1.3")
