@@ -122,7 +122,8 @@ def test_an_exception_reaches_the_caller(count: int) -> None:
         found: list[int] = []
         with pytest.raises(TaskFailure, match="at three"):
             found.extend(workers.map_unordered(failing, range(40)))
-        assert set(found) < set(range(40)) - {3}
+        # how many others end before the news of it arrives is up to the machine
+        assert set(found) <= set(range(40)) - {3}
         # and the workers are still of use
         assert sorted(workers.map_unordered(square, [1, 2])) == [1, 4]
 
