@@ -12,7 +12,7 @@ solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
 test: setup-test lint docs
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 	$(BIN)/python benchmarks/processors.py --other
 
 # The suite under the kernels that OpenBLAS has for other processors, three times each, with

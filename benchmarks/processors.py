@@ -95,8 +95,9 @@ def run_tests(kernels: str, seed: int, jobs: int, tests: Sequence[str]) -> Run:
     env = os.environ | {"OPENBLAS_CORETYPE": kernels, "HYPOTHESIS_PROFILE": "study"}
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
-        words = [sys.executable, "-m", "pytest", "-n", str(jobs), "-p", "no:cacheprovider"]
-        words += [f"--hypothesis-seed={seed}", f"--junitxml={report}", *tests]
+        words = [sys.executable, "-m", "pytest", "-n", str(jobs), "--dist", "worksteal"]
+        words += ["-p", "no:cacheprovider", f"--hypothesis-seed={seed}", f"--junitxml={report}"]
+        words += tests
         began = time.monotonic()
         done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
         seconds = time.monotonic() - began

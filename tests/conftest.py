@@ -1,9 +1,10 @@
 """One BLAS thread: the matrices are small, and figures then repeat to the last digit."""
 
+import fcntl
 import os
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,15 +49,32 @@ def camel_copy(camel_run: tuple[Path, Any, Any], tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def two_mass_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run folder of case study 1, solved once (lifted); it is not to be changed."""
-    from ccd_casadi.solve import main
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The run folder of case study 1 in a formulation; it is not to be changed.
 
-    folder = tmp_path_factory.mktemp("two_mass")
-    case = Path(__file__).parent.parent / "runs" / "two_mass.toml"
-    options = ["--out", str(folder), "--formulation", "lifted", "--workers", "1", "--quiet"]
-    assert main([str(case), *options]) == 0
-    return folder
+    Solved once for all processes of pytest-xdist, whose own folders lie beside each other.
+    """
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def solve(formulation: str) -> Path:
+        from commands import run
+
+        folder, making = base / f"two_mass_{formulation}", base / f"making_{formulation}"
+        with (base / f"{formulation}.lock").open("a") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # until the file is closed
+            if not folder.exists():
+                assert run(making, "--formulation", formulation) == 0
+                making.rename(folder)
+        return folder
+
+    return solve
+
+
+@pytest.fixture(scope="session")
+def two_mass_run(solved: Callable[[str], Path]) -> Path:
+    """The run folder of case study 1 by the lifted formulation; it is not to be changed."""
+    return solved("lifted")
 
 
 @pytest.fixture(scope="module")

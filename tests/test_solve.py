@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -36,21 +37,6 @@ KEYS = {
     "syntheses", "seconds", "versions", "seed", "formulation",
 }  # fmt: skip
 CERTIFICATE = {"stable", "max_real_pole", "norm", "norm_bound", "passed"}
-
-
-@pytest.fixture(scope="module")
-def solved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The run folder of a formulation, solved once."""
-    folders: dict[str, Path] = {}
-
-    def solve(formulation: str) -> Path:
-        if formulation not in folders:
-            folder = tmp_path_factory.mktemp(formulation) / "run"
-            assert run(folder, "--formulation", formulation) == 0
-            folders[formulation] = folder
-        return folders[formulation]
-
-    return solve
 
 
 @pytest.mark.parametrize("formulation", ["nested", "lifted", "direct"])
@@ -173,9 +159,9 @@ def test_the_report_opens_offline(solved: Callable[[str], Path]) -> None:
 
 
 def test_a_second_run_reuses_every_sample(
-    solved: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    solved: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = solved("nested")
+    folder = Path(shutil.copytree(solved("nested"), tmp_path / "run"))
     before = read(folder)
 
     def untouchable(*_: Any) -> None:
@@ -190,9 +176,9 @@ def test_a_second_run_reuses_every_sample(
 
 
 def test_the_summary_says_what_matters(
-    solved: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
+    solved: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = solved("direct")
+    folder = Path(shutil.copytree(solved("direct"), tmp_path / "run"))
     words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--formulation", "direct"]
     assert main(words) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -228,7 +214,9 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 
 
 def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> None:
-    case = own_plant(tmp_path, 118.0, "\n[sampling]\npoints = 4\n")
+    case = own_plant(
+        tmp_path, 118.0, "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\n"
+    )
     objectives = []
     for formulation in ("nested", "lifted", "direct"):
         folder = tmp_path / formulation
