@@ -10,7 +10,7 @@ import pytest
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.discretise import Discretisation
-from ccd_casadi.deployment.pipeline import SAMPLED_PEAK, Timing, deploy
+from ccd_casadi.deployment.pipeline import SAMPLED_PEAK, Deployment, Timing, deploy
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.modal import Perturbation, modal_plant
@@ -30,10 +30,17 @@ def robust_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("robust")
     text = (RUNS / "two_mass.toml").read_text()
     more = '\n[robust]\nresonance_shift = 0.02\nshifts = 3\ndesign_at = "low"\n'
-    (folder / "case.toml").write_text(text + more + "[sampling]\nlifted_points = 24\n")
+    more += "[sampling]\nlifted_points = 24\n[outer]\nbox_points = 0\n"
+    (folder / "case.toml").write_text(text + more)
     options = ["--formulation", "lifted", "--workers", "1", "--quiet", "--out", str(folder / "run")]
     assert solve([str(folder / "case.toml"), *options]) == 0
     return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def deployed(robust_run: Path) -> tuple[FinishedRun, Deployment]:
+    run = read_run(robust_run)
+    return run, deploy(run, ONE_WAY)
 
 
 def peaks(run: FinishedRun, found, shifts) -> list[float]:  # type: ignore[no-untyped-def]
@@ -49,9 +56,10 @@ def peaks(run: FinishedRun, found, shifts) -> list[float]:  # type: ignore[no-un
     return out
 
 
-def test_what_is_verified_holds_between_the_plants_too(robust_run: Path) -> None:
-    run = read_run(robust_run)
-    found = deploy(run, ONE_WAY)
+def test_what_is_verified_holds_between_the_plants_too(
+    deployed: tuple[FinishedRun, Deployment],
+) -> None:
+    run, found = deployed
     assert found.passed
     assert found.stable
     shifts = np.random.default_rng(0).uniform(-0.02, 0.02, 30)
@@ -61,13 +69,14 @@ def test_what_is_verified_holds_between_the_plants_too(robust_run: Path) -> None
     assert {at.shift for at, _ in found.measured_members} >= {-0.02, 0.02}
 
 
-def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(robust_run: Path) -> None:
+def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(
+    deployed: tuple[FinishedRun, Deployment],
+) -> None:
     """The finding that this is for: the sampled loop within its target on one plant of the set."""
-    run = read_run(robust_run)
-    needed = deploy(run, ONE_WAY).needed_hz
+    run, needed = deployed[0], deployed[1].needed_hz
     assert needed is not None
     failed = 0
-    for rate in np.geomspace(0.3, 0.97, 6) * needed:
+    for rate in np.array([0.4, 0.75, 0.95]) * needed:
         if rate < 4.0 * run.figures.bandwidth / HZ:
             continue
         found = deploy(run, Timing(float(rate), method=Discretisation.RAMP, lead=True))
@@ -114,11 +123,10 @@ def test_a_rate_below_twice_the_peak_is_one_line(
 
 
 def test_robustness_judges_the_deployed_controller_on_the_same_plants(
-    robust_run: Path, tmp_path: Path
+    robust_run: Path, deployed: tuple[FinishedRun, Deployment], tmp_path: Path
 ) -> None:
-    run = read_run(robust_run)
+    run, found = deployed
     assert main([str(robust_run), *QUICK, "--out", str(tmp_path / "deploy")]) == 0
-    found = deploy(run, ONE_WAY)
     out = tmp_path / "r"
     words = ["--controller", str(tmp_path / "deploy" / "controller.json"), "--shift", "2"]
     words += ["--samples", "2", "--quiet", "--out", str(out)]

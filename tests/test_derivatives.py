@@ -130,7 +130,7 @@ def summed(errors: list[Errors]) -> Errors:
     )
 
 
-@pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [12, pytest.param(200, marks=pytest.mark.slow)])
 def test_total_derivatives_of_the_two_mass_plant(count: int) -> None:
     rng = np.random.default_rng(5)
     errors = []
@@ -154,11 +154,11 @@ def flexible_errors(seed: int) -> tuple[Errors, bool]:
 
 
 def test_total_derivatives_of_flexible_plants_of_both_limits() -> None:
-    results = [flexible_errors(seed) for seed in (1, 3, 5, 6, 23, 47)]
+    results = [flexible_errors(seed) for seed in (5, 23)]
     total = summed([errors for errors, _ in results])
-    assert [limited for _, limited in results] == [False] * 3 + [True] * 3
+    assert [limited for _, limited in results] == [False, True]
     assert total.worst < ACCURACY
-    assert total.compared > 60
+    assert total.compared > 20
 
 
 def test_gradient_of_the_bound_at_a_sharp_transmission_zero() -> None:

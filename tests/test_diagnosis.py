@@ -142,7 +142,8 @@ def test_solve_tells_what_is_serious_unless_it_is_quiet(
 ) -> None:
     path = case_file(tmp_path, THREE, before=HIDDEN)
     text = path.read_text().replace("S_max = 1.75", "S_max = 1.001")
-    path.write_text(text + "\n[sampling]\nlifted_points = 8\n[outer]\nmax_refinements = 0\n")
+    quick = "\n[sampling]\nlifted_points = 8\n[outer]\nmax_refinements = 0\nbox_points = 0\n"
+    path.write_text(text + quick)
     words = [str(path), "--formulation", "lifted", "--workers", "1", "--out", str(tmp_path / "run")]
     assert solve(words) == 3
     assert "warning: plant: the mode at" in capsys.readouterr().err

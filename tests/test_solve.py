@@ -198,7 +198,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 ) -> None:
     """To the last bit, seconds aside; the pool is started although the work is short."""
     monkeypatch.setattr(import_module("ccd_casadi.solve"), "PATIENCE", 0.0)
-    quick = "\n[sampling]\npoints = 2\nlifted_points = 12\n[outer]\nstarts = 2\n"
+    quick = "\n[sampling]\npoints = 2\nlifted_points = 12\n[outer]\nstarts = 2\nbox_points = 4\n"
     case = changed(tmp_path, more=quick + "max_refinements = 0\n")
     for workers in ("1", "2"):
         words = ["--out", str(tmp_path / workers), "--quiet", "--formulation", formulation]
@@ -214,9 +214,8 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 
 
 def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> None:
-    case = own_plant(
-        tmp_path, 118.0, "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\n"
-    )
+    quick = "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\nbox_points = 4\n"
+    case = own_plant(tmp_path, 118.0, quick)
     objectives = []
     for formulation in ("nested", "lifted", "direct"):
         folder = tmp_path / formulation
@@ -277,10 +276,8 @@ def test_a_constraint_that_no_theta_meets_is_named(tmp_path: Path, formulation: 
 def test_what_is_not_verified_is_not_called_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    case = changed(
-        tmp_path,
-        more="\n[sampling]\npoints = 2\n[outer]\ntolerance = 1e-15\nmax_refinements = 0\n",
-    )
+    strict = "[outer]\ntolerance = 1e-15\nmax_refinements = 0\nbox_points = 0\n"
+    case = changed(tmp_path, more=f"\n[sampling]\npoints = 2\n{strict}")
     assert run(tmp_path / "run", case=case) == 4
     result = read(tmp_path / "run")
     assert result["status"] == "not_verified"
@@ -296,7 +293,7 @@ def test_what_is_not_verified_is_not_called_so(
 
 def test_an_infeasible_run_leaves_no_design_of_an_earlier_one(tmp_path: Path) -> None:
     """The folder is reused with a harder case: what lies in it must belong together."""
-    small = "\n[sampling]\npoints = 2\n[outer]\nmax_refinements = 0\n"
+    small = "\n[sampling]\npoints = 2\n[outer]\nmax_refinements = 0\nbox_points = 0\n"
     case = changed(tmp_path, more=small)
     run(tmp_path / "run", case=case)
     assert (tmp_path / "run" / "controller.json").exists()
