@@ -25,6 +25,7 @@ def solved(case: Path, folder: Path) -> FinishedRun:
     return read_run(folder)
 
 
+@pytest.mark.usefixtures("no_page")
 def test_three_mass_axis_is_designed_between_its_bounds(tmp_path: Path) -> None:
     run = solved(EXAMPLES / "three_mass_axis" / "case.toml", tmp_path)
     assert run.result["status"] == "verified"

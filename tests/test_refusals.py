@@ -252,8 +252,6 @@ def test_a_store_that_is_none_is_refused(
 @pytest.mark.parametrize(
     "words",
     [
-        ["ccd_casadi.solve", "bad.toml"],
-        ["ccd_casadi.solve", "absent.toml"],
         ["ccd_casadi.inner", "bad.toml", "--theta", "m1=60,m2=60"],
         ["ccd_casadi.solve", "own.toml"],
     ],

@@ -158,6 +158,7 @@ def test_the_report_opens_offline(solved: Callable[[str], Path]) -> None:
     assert re.findall(r"""(?:url\(|@import)\s*["']?\s*(?:https?:)?//""", page) == []
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_second_run_reuses_every_sample(
     solved: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,6 +176,7 @@ def test_a_second_run_reuses_every_sample(
     assert after == before
 
 
+@pytest.mark.usefixtures("no_page")
 def test_the_summary_says_what_matters(
     solved: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,6 +194,7 @@ def test_the_summary_says_what_matters(
     assert str(folder) in found["run"]
 
 
+@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("formulation", ["lifted", pytest.param("nested", marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
@@ -213,6 +216,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 # ---- constraints, and cases that cannot be solved ------------------------------------------------
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> None:
     quick = "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\nbox_points = 4\n"
     case = own_plant(tmp_path, 118.0, quick)
@@ -273,6 +277,7 @@ def test_a_constraint_that_no_theta_meets_is_named(tmp_path: Path, formulation: 
     assert "1.5" in result["reason"], "by how much"
 
 
+@pytest.mark.usefixtures("no_page")
 def test_what_is_not_verified_is_not_called_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -291,6 +296,7 @@ def test_what_is_not_verified_is_not_called_so(
     assert (tmp_path / "run" / "controller.json").exists()
 
 
+@pytest.mark.usefixtures("no_page")
 def test_an_infeasible_run_leaves_no_design_of_an_earlier_one(tmp_path: Path) -> None:
     """The folder is reused with a harder case: what lies in it must belong together."""
     small = "\n[sampling]\npoints = 2\n[outer]\nmax_refinements = 0\nbox_points = 0\n"
