@@ -91,6 +91,8 @@ def test_the_difference_equation_is_the_state_space() -> None:
     limit = 0.3 * float(np.abs(u).max())
     clipped = difference_equation(Realisation(found.system, found.blocks, limit), e)
     np.testing.assert_array_equal(clipped, np.clip(u, -limit, limit))
+    f = np.random.default_rng(3).normal(size=u.shape)
+    np.testing.assert_array_equal(difference_equation(found, e, f)[0], u[0] + f[0])
 
 
 def build(folder: Path, found: Realisation) -> Path:
