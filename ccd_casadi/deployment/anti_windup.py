@@ -1,16 +1,16 @@
-"""A controller that knows its limits: back-calculation while it saturates, and a start without a jump.
+"""Back-calculation while a controller saturates, and a start without a jump.
 
 The controller watches the force that it could apply, not the one that it asked for:
 
     v_k = C x_k + D e_k + f_k,   u_k = clip(v_k),   x_{k+1} = A x_k + B e_k + L (u_k - v_k).
 
 Between the limits nothing changes. Beyond them the states follow A - L C instead of A: the
-integrator is led back at the rate that L says (back-calculation, Åström & Wittenmark 1997, 3.5), and
-poles of K outside the unit circle are held too. L is the gain of the stationary Kalman filter that
-estimates the controller's states from its own force, the errors e being white of the size that asks
-for the whole limit at ω_b, and the force known to `TRUST` of the limit: A - L C is stable wherever
-K has no unobservable unstable state. For TRUST -> 0 its poles go to K's zeros inside the circle (the
-conditioning technique, Hanus, Kinnaert & Henrotte 1987), for TRUST -> ∞ to K's own poles.
+integrator is led back (back-calculation, Åström & Wittenmark 1997, 3.5), and poles of K outside the
+unit circle are held too. L is the gain of the stationary Kalman filter that estimates the
+controller's states from its own force, the errors e being white of the size that asks for the whole
+limit at ω_b, and the force being off by a share of the limit, `TRUSTS`: A - L C is stable wherever
+K has no unobservable unstable state. As the share goes to 0 its poles go to K's zeros inside the
+circle (the conditioning technique, Hanus, Kinnaert & Henrotte 1987), as it grows to K's own poles.
 
 A controller that takes over from another begins at x₀ = X [e₀; u₀]: its first force is u₀, and of all
 such states it is the one that changes least in the first sample, min ‖(A - I) x + B e‖ (with an

@@ -169,6 +169,11 @@ _CLIP = """\
         cut[i] = sum - cut[i];
 """
 
+_BACK = """\
+/* Back-calculation: states x forces. */
+static const double L[] = {L};
+"""
+
 _LEAD_BACK = """\
             for (j = 0; j < CONTROLLER_FORCES; j++)
                 sum += L[i * CONTROLLER_FORCES + j] * cut[j];
@@ -276,7 +281,7 @@ def c_files(
         blocks="{" + ", ".join(str(size) for size in realisation.blocks or (0,)) + "}",
         A=_numbers(realisation.block_entries), B=_numbers(K.B), C=_numbers(K.C),
         D=_numbers(K.D), room=max(n, 1), clip=clip,
-        L="" if L is None else f"/* Back-calculation: states x forces. */\nstatic const double L[] = {_numbers(L)};\n",
+        L="" if L is None else _BACK.format(L=_numbers(L)),
         X=_numbers(takeover(K)),
         F=_numbers(np.zeros((ORDER + 1, m, p)) if forward is None else forward),
         cut_declared="    double cut[CONTROLLER_FORCES];\n" if clip else "",

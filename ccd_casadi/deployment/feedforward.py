@@ -2,8 +2,8 @@
 
     f = Σ_k F_k r^(k),   Σ_k F_k sᵏ = e^{s(τ + T/2)} G(s)⁺ + O(s⁵)
 
-F_0 is the suspension's stiffness, F_1 its damping, F_2 the mass; F_3 (jerk) makes up for the delay τ
-and for half a hold T/2, F_4 (snap) for the compliance of the flexible modes (Boerlage, Tousain &
+F_0 is the suspension's stiffness, F_1 its damping, F_2 the mass; F_3 (jerk) makes up for the delay
+τ and for half a hold T/2, F_4 (snap) for the compliance of the flexible modes (Boerlage, Tousain &
 Steinbuch 2004). A setpoint of fourth order has all of these derivatives bounded.
 """
 
@@ -32,9 +32,10 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
     s = RADIUS * nearest * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
-    G = plant.C @ np.linalg.solve(
-        s[:, None, None] * np.eye(len(plant.A)) - plant.A, plant.B + 0j
-    ) + plant.D
+    G = (
+        plant.C @ np.linalg.solve(s[:, None, None] * np.eye(len(plant.A)) - plant.A, plant.B + 0j)
+        + plant.D
+    )
     ahead = np.exp(s * (delay + 0.5 * period))[:, None, None] * np.linalg.pinv(G)
     series = np.fft.fft(ahead, axis=0).real / POINTS
     powers = (RADIUS * nearest) ** np.arange(ORDER + 1)
@@ -42,7 +43,7 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
 
 
 def _zeros(plant: StateSpace) -> np.ndarray:
-    """Finite transmission zeros of a square plant; none of another (G⁺ then has none in general)."""
+    """Finite transmission zeros of a square plant; none of another (in general it has none)."""
     n, m = plant.B.shape
     if len(plant.C) != m:
         return np.zeros(0)

@@ -1,11 +1,11 @@
-"""A move as the machine makes it: sampled, delayed, saturated, quantised, with a delay that jitters.
+"""A move as the machine makes it: sampled, delayed, saturated, quantised, with a jittering delay.
 
 Every period is cut in `PARTS`; the plant is stepped exactly from one to the next, and the force
 that was computed at kT reaches it at kT + τ_k, rounded up to a part. What is read at kT, and what
 the actuator is told, are multiples of a step where one is given.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import expm
@@ -76,15 +76,14 @@ def move(
     K, T = realisation.system, realisation.system.period
     n, m, p = len(plant.A), len(K.C), len(plant.C)
     count = int(np.ceil((1.0 + TAIL) * profile.duration / T))
-    time = T * np.arange(count)
+    time = np.arange(count, dtype=float) * T
     wanted = profile.at(time)
     ahead = np.zeros((count, m))
     if forward is not None:
         ahead = np.einsum("kt,km->tm", wanted, forward[:, :, axis])
     joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([plant.A, plant.B])
-    part = expm(joint * (T / PARTS))
-    A, B = part[:n, :n], part[:n, n:]
+    ahead_by = [expm(joint * (T * i / PARTS))[:n] for i in range(PARTS + 1)]
     rng = np.random.default_rng(hardware.seed)
     late = delay + hardware.jitter * rng.uniform(-1.0, 1.0, count)
     reaches = np.ceil(np.maximum(late, 0.0) / T * PARTS - 1e-9).astype(int)
@@ -107,21 +106,20 @@ def move(
             z = z + gain @ (u - v)
         clipped += bool(np.any(u != v))
         force[k] = _stepped(u, hardware.force_step)
-        for i in range(PARTS * k, PARTS * (k + 1)):
-            while arriving <= k and reaches[arriving] <= i:
+        part, end = PARTS * k, PARTS * (k + 1)
+        while part < end:  # from one arrival to the next
+            while arriving <= k and reaches[arriving] <= part:
                 u_now = force[arriving]
                 arriving += 1
-            x = A @ x + B @ u_now
+            following = min(end, reaches[arriving]) if arriving <= k else end
+            step = ahead_by[following - part]
+            x = step[:, :n] @ x + step[:, n:] @ u_now
+            part = following
     outside = np.flatnonzero(np.abs(error).max(axis=1) > window)
     last = outside[-1] if outside.size else -1
     settled = np.inf if last == count - 1 else float(time[last + 1])
     rest = float(np.abs(error[-max(count // 4, 1) :]).max())
     return SampledMove(time, wanted[0], error, force, settled, rest, clipped / count)
-
-
-def without_back_calculation(realisation: Realisation) -> Realisation:
-    """The controller that only clips, for comparison."""
-    return replace(realisation, back_calculation=None)
 
 
 def _stepped(value: Array, step: float) -> Array:
