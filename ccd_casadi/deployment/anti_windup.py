@@ -12,9 +12,9 @@ limit at ω_b, and the force being off by a share of the limit, `TRUSTS`: A - L 
 K has no unobservable unstable state. As the share goes to 0 its poles go to K's zeros inside the
 circle (the conditioning technique, Hanus, Kinnaert & Henrotte 1987), as it grows to K's own poles.
 
-A controller that takes over from another begins at x₀ = X [e₀; u₀]: its first force is u₀, and of all
-such states it is the one that changes least in the first sample, min ‖(A - I) x + B e‖ (with an
-integrator: not at all, where e₀ = 0).
+A controller that takes over from another begins at x₀ = X [e₀; u₀]: its first force is u₀, and of
+all such states it is the one that changes least in the first sample, min ‖(A - I) x + B e‖ (with
+an integrator: not at all, where e₀ = 0).
 """
 
 from dataclasses import replace
