@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError, one_line
 from ccd_casadi.support.optional_packages import require
@@ -15,6 +16,7 @@ from surrogates.options import number, positive
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
+    from ccd_casadi.deployment.on_hardware import OnHardware
     from ccd_casadi.deployment.pipeline import Deployment
 
 LEADS = {"auto": None, "on": True, "off": False}
@@ -26,7 +28,11 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
+    from ccd_casadi.deployment.move import Hardware
+    from ccd_casadi.deployment.on_hardware import on_hardware
     from ccd_casadi.deployment.pipeline import deploy
+    from ccd_casadi.deployment.structured_text import FILE as ST_FILE
+    from ccd_casadi.deployment.structured_text import structured_text
 
     require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
@@ -47,25 +53,39 @@ def command(options: argparse.Namespace) -> ExitCode:
     )
     count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
     channels = len(finished.plant.C) if finished.plant.channels else 1
-    with Progress(channels + count + 1, "deploying", options.quiet) as bar:
+    moved = None
+    with Progress(channels + count + 3, "deploying", options.quiet) as bar:
         found = deploy(
             finished, timing, saturation=options.saturation, seed=options.seed,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
-    for name in (*DESIGN_FILES, *C_FILES):  # an earlier controller must not pass for this one
+        if found.stable:
+            moved = on_hardware(
+                finished.plant.plant_si(), found.realisation, found.delay,
+                finished.figures.bandwidth, limits=move_limits(options), window=options.window,
+                hardware=Hardware(
+                    options.sensor_step, options.force_step, options.jitter, options.seed
+                ),
+                progress=lambda words: bar.advance(note=words),
+            )  # fmt: skip
+    # an earlier controller must not pass for this one
+    for name in (*DESIGN_FILES, *C_FILES, ST_FILE):
         (folder / name).unlink(missing_ok=True)
-    write_files(folder, finished, found, options.seed)
-    if found.stable:
-        write_c(
-            folder, found.realisation, title=options.run.resolve().name, delay=found.delay,
-            verified=found.passed,
-        )  # fmt: skip
+    write_files(folder, finished, found, options.seed, moved)
+    if moved is not None:
+        naming = {
+            "title": options.run.resolve().name, "delay": found.delay, "verified": found.passed
+        }  # fmt: skip
+        write_c(folder, found.realisation, **naming, forward=moved.forward)
+        (folder / ST_FILE).write_text(structured_text(found.realisation, **naming), "utf-8")
     if not options.quiet:
         print(_summary(finished, found))
+        if moved is not None:
+            print(f"{'a move':13s} {_move_words(moved)}")
         print(f"report        {folder / 'report.html'}")
     from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
 
-    write_report(folder / "report.html", finished, found)
+    write_report(folder / "report.html", finished, found, moved)
     if found.passed:
         return ExitCode.DONE
     print(one_line(f"not verified: {_shortfall(finished, found)}"), file=sys.stderr)
@@ -111,6 +131,19 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     if found.statics is not None:
         lines.append(("at rest", found.statics.words))
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
+
+
+def _move_words(moved: "OnHardware") -> str:
+    last = moved.ways[-1]
+    ends = (
+        f"in its window after {last.move.settled:.4g} s"
+        if last.move.settled < float("inf")
+        else f"not in its window of {1e6 * moved.window:g} um"
+    )
+    return (
+        f"{moved.profile.duration:.4g} s, {last.words}: {ends}, "
+        f"peak error {1e6 * last.move.peak_error:.4g} um"
+    )
 
 
 def _shortfall(run: "FinishedRun", found: "Deployment") -> str:
@@ -159,8 +192,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     arguments.add_argument(
         "--saturation", metavar="NEWTON", type=positive,
-        help="clip every u to plus or minus this (default: off)",
+        help="limit every u to plus or minus this, with anti-windup (default: off)",
     )  # fmt: skip
+    for name, metavar, words in (
+        ("sensor-step", "METRE", "of the simulated sensor"),
+        ("force-step", "NEWTON", "of the simulated actuator"),
+        ("jitter", "SECONDS", "of the simulated delay, uniform within plus or minus this"),
+    ):
+        arguments.add_argument(
+            f"--{name}", metavar=metavar, type=number(), default=0.0, help=f"{words} (default: 0)"
+        )
+    add_move_options(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.deployment.pipeline"])
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
 
-from ccd_casadi.robust.demands import Demands, Limits
+from ccd_casadi.robust.demands import Demands, add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
@@ -13,15 +13,6 @@ from ccd_casadi.support.progress import Progress
 from surrogates.options import number, positive, whole
 
 LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
-_DEFAULT = Demands()
-_MOVE = (
-    ("stroke", _DEFAULT.limits.stroke, "m"),
-    ("velocity", _DEFAULT.limits.velocity, "m/s"),
-    ("acceleration", _DEFAULT.limits.acceleration, "m/s²"),
-    ("jerk", _DEFAULT.limits.jerk, "m/s³"),
-    ("snap", _DEFAULT.limits.snap, "m/s⁴"),
-    ("window", _DEFAULT.window, "m; settled when the error stays within"),
-)
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -54,7 +45,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         samples=options.samples,
         sensor=options.noise,
         disturbance=options.disturbance,
-        limits=Limits(*(getattr(options, name) for name, _, _ in _MOVE[:-1])),
+        limits=move_limits(options),
         window=options.window,
         axis=options.axis - 1,
     )
@@ -107,9 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add("--disturbance", type=positive, default=1.0, metavar="X",
         help="force at every actuator, N/√Hz; default 1")  # fmt: skip
     add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
-    for name, default, unit in _MOVE:
-        add(f"--{name}", type=positive, default=default, metavar="X",
-            help=f"of the move, {unit}; default {default:g}")  # fmt: skip
+    add_move_options(arguments)
     add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
         help=f"for the structured singular value; default {LIMIT:g}")  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])

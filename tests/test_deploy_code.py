@@ -11,6 +11,7 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.c_code import COMPILE, c_files, write_c
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
@@ -91,6 +92,8 @@ def test_the_difference_equation_is_the_state_space() -> None:
     limit = 0.3 * float(np.abs(u).max())
     clipped = difference_equation(Realisation(found.system, found.blocks, limit), e)
     np.testing.assert_array_equal(clipped, np.clip(u, -limit, limit))
+    f = np.random.default_rng(3).normal(size=u.shape)
+    np.testing.assert_array_equal(difference_equation(found, e, f)[0], u[0] + f[0])
 
 
 def build(folder: Path, found: Realisation) -> Path:
@@ -113,7 +116,7 @@ def test_c_equals_python_bit_by_bit(
     plain = of_one_channel(random_controller(5, pairs, reals, inputs))
     e = 1e-6 * np.random.default_rng(7).normal(size=(400, inputs))
     limit = None if share is None else share * float(np.abs(difference_equation(plain, e)).max())
-    found = Realisation(plain.system, plain.blocks, limit)
+    found = limited(Realisation(plain.system, plain.blocks, limit), 500.0)
     program = build(tmp_path, found)
     assert subprocess.run([program], capture_output=True, check=False).returncode == 0
     lines = "\n".join(" ".join(f"{v:.17g}" for v in row) for row in e)

@@ -5,6 +5,7 @@ from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import versions, write_json
+from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop
@@ -18,9 +19,12 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 DESIGN_FILES = ("controller.json", "design.mat")
 
 
-def write_files(folder: Path, run: FinishedRun, found: Deployment, seed: int) -> None:
+def write_files(
+    folder: Path, run: FinishedRun, found: Deployment, seed: int, moved: OnHardware | None = None
+) -> None:
     """deploy.json always; controller and .mat file only of a loop that is stable everywhere."""
-    write_json(folder / "deploy.json", deployment_dict(run, found, seed))
+    machine = {"on_hardware": None if moved is None else hardware_dict(moved)}
+    write_json(folder / "deploy.json", deployment_dict(run, found, seed) | machine)
     if not found.stable:
         return
     write_json(folder / "controller.json", controller_dict(found))
@@ -50,9 +54,13 @@ def controller_dict(found: Deployment) -> dict[str, Any]:
         "rate_hz": found.rate_hz,
         "delay": found.delay,
         "saturation": found.realisation.saturation,
+        "back_calculation": None
+        if found.realisation.back_calculation is None
+        else found.realisation.back_calculation.tolist(),
         "input": "e = r - y",
         "output": "u",
-        "equation": "u[k] = C x[k] + D e[k], x[k+1] = A x[k] + B e[k]",
+        "equation": "v[k] = C x[k] + D e[k], u[k] = v[k] within +-saturation, "
+        "x[k+1] = A x[k] + B e[k] + back_calculation (u[k] - v[k])",
         "units": "SI, time in s",
     }
 

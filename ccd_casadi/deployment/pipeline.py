@@ -7,6 +7,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.closer_models import UNBOUNDED
+from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.channels import Channel, assemble, split
 from ccd_casadi.deployment.discretise import (
     FASTEST,
@@ -210,7 +211,7 @@ def deploy(
         trials, best, rate = _choose(run, timing, loops, family, conversions, progress, attempt)
         delay, period = timing.delay_at(rate), 1.0 / rate
         sampled_controllers = [discretise(K, best.conversion, period, delay) for K in small]
-        realisation = realise(channels, sampled_controllers, saturation)
+        realisation = limited(realise(channels, sampled_controllers, saturation), full.bandwidth)
         held = sampled_plant(run.plant.plant_si(), period, delay)
         sampled = sampled_figures(sensitivity_loop(held, realisation.system))
         others = {item.at: sampled_plant(item.plant.plant_si(), period, delay) for item in dense}
@@ -394,7 +395,8 @@ def _deploy_sections(
         raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
     rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
     delay, period = timing.delay_at(rate), 1.0 / rate
-    realisation = realise([channel], [discretise(K, best.conversion, period, delay)], saturation)
+    single = discretise(K, best.conversion, period, delay)
+    realisation = limited(realise([channel], [single], saturation), full.bandwidth)
     held = sampled_plant(G, period, delay)
     sampled = sampled_figures(sensitivity_loop(held, realisation.system))
     progress("simulation")

@@ -25,12 +25,14 @@ CONDITION = 1e4  # most of the block-diagonalising transformation's entries
 class Realisation:
     """x_{k+1} = A x_k + B e_k, u_k = C x_k + D e_k in SI; A block-diagonal with these `blocks`.
 
-    With a `saturation` in N every u is clipped to ± it; there is no anti-windup.
+    With a `saturation` in N every u is clipped to ± it, and the states are led back by what was
+    cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`).
     """
 
     system: DiscreteStateSpace
     blocks: tuple[int, ...]
     saturation: float | None = None
+    back_calculation: Array | None = None
 
     @property
     def block_entries(self) -> Array:
@@ -75,36 +77,49 @@ def _block_diagonal(K: DiscreteStateSpace) -> tuple[StateSpace, list[int]]:
     return StateSpace(A, B, C, K.D), [int(size) for size in sizes]
 
 
-def difference_equation(realisation: Realisation, errors: Array) -> Array:
-    """u_k (k, m) for errors e_k (k, p), from rest, in exactly the C code's order of operations.
+def difference_equation(
+    realisation: Realisation,
+    errors: Array,
+    forward: Array | None = None,
+    start: Sequence[float] | None = None,
+) -> Array:
+    """u_k (k, m) for errors e_k (k, p) and feedforward f_k (k, m), in the C code's own order.
 
-    Sums start at zero and run over the states, then the inputs, without fused operations: the
-    result equals that of the C code bit by bit.
+    From the state `start`, else from rest. Sums start at zero and run over the states, then the
+    inputs, then the feedforward, without fused operations: the result equals that of the C code
+    bit by bit.
     """
     K = realisation.system
     A, B, C, D = (part.tolist() for part in (K.A, K.B, K.C, K.D))
-    x = [0.0] * len(A)
+    x = [0.0] * len(A) if start is None else list(start)
     limit = realisation.saturation
+    L = None if realisation.back_calculation is None else realisation.back_calculation.tolist()
+    ahead = np.zeros((len(errors), len(C))) if forward is None else np.asarray(forward, float)
     answers = []
-    for e in np.asarray(errors, float).tolist():
-        u = []
-        for row_c, row_d in zip(C, D, strict=True):
+    for e, f in zip(np.asarray(errors, float).tolist(), ahead.tolist(), strict=True):
+        u, cut = [], []
+        for row_c, row_d, extra in zip(C, D, f, strict=True):
             total = 0.0
             for gain, value in zip(row_c, x, strict=True):
                 total += gain * value
             for gain, value in zip(row_d, e, strict=True):
                 total += gain * value
+            total += extra
             u.append(total if limit is None else min(max(total, -limit), limit))
-        following, start = [], 0
+            cut.append(u[-1] - total)
+        following, start_row = [], 0
         for size in realisation.blocks:
-            for i in range(start, start + size):
+            for i in range(start_row, start_row + size):
                 total = 0.0
-                for j in range(start, start + size):
+                for j in range(start_row, start_row + size):
                     total += A[i][j] * x[j]
                 for gain, value in zip(B[i], e, strict=True):
                     total += gain * value
+                if L is not None:
+                    for gain, value in zip(L[i], cut, strict=True):
+                        total += gain * value
                 following.append(total)
-            start += size
+            start_row += size
         x = following
         answers.append(u)
     return np.array(answers).reshape(len(answers), len(C))

@@ -8,6 +8,7 @@ from scipy.signal import cont2discrete
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
+from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
@@ -16,6 +17,7 @@ from ccd_casadi.deployment.words import reason_words
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import (
@@ -41,7 +43,9 @@ SHOWN = 40  # measured points in the plot, and rows in the tables
 PERIODS = 6.0  # of ω_b that the step is shown for
 
 
-def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
+def write_report(
+    path: Path, run: FinishedRun, found: Deployment, moved: OnHardware | None = None
+) -> None:
     """One self-contained page."""
     title = f"Controller of {run.folder.resolve().name}, deployed"
     reason = reason_words(run, found)
@@ -49,6 +53,8 @@ def write_report(path: Path, run: FinishedRun, found: Deployment) -> None:
     sections = [Section("The loop", _loop(run, found)), Section("Figures", _facts(run, found))]
     if found.sampled.stable:
         sections.append(Section("Step of the reference", _step(run, found)))
+    if moved is not None:
+        sections.append(Section("A move on the machine", move_html(moved)))
     sections += [
         Section("Sampling rate", _rates(found)),
         Section("Orders", "\n".join(_orders(item, run) for item in found.orders)),
@@ -329,6 +335,8 @@ def _code(found: Deployment) -> str:
         f"controller.c holds {len(K.system.A)} states, A block-diagonal ({sizes}"
         f"{f', {larger} larger' if larger else ''}). Call controller_step every "
         f"{number(1e6 * K.system.period, 6)} µs. controller_test.c compares it with forces that "
-        "the Python difference equation gave:"
+        "the Python difference equation gave; controller.st is the same as structured text "
+        "(IEC 61131-3). controller_takeover starts without a jump, controller_forward gives the "
+        "feedforward of a setpoint:"
     )
     return paragraph(words) + preformatted(f"{COMPILE}\n./controller_test")

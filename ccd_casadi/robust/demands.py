@@ -1,6 +1,9 @@
-"""What a finished design is put through, in SI: the options of `robustness`."""
+"""What a finished design is put through, in SI: the options of `robustness` and of `deploy`."""
 
+import argparse
 from dataclasses import dataclass, field
+
+from surrogates.options import positive
 
 
 @dataclass(frozen=True)
@@ -30,3 +33,28 @@ class Demands:
     limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
     window: float = 1e-6
     axis: int = 0
+
+
+_DEFAULT = Demands()
+_MOVE = (
+    ("stroke", _DEFAULT.limits.stroke, "m"),
+    ("velocity", _DEFAULT.limits.velocity, "m/s"),
+    ("acceleration", _DEFAULT.limits.acceleration, "m/s²"),
+    ("jerk", _DEFAULT.limits.jerk, "m/s³"),
+    ("snap", _DEFAULT.limits.snap, "m/s⁴"),
+    ("window", _DEFAULT.window, "m; settled when the error stays within"),
+)
+
+
+def add_move_options(arguments: argparse.ArgumentParser) -> None:
+    """--stroke, --velocity, --acceleration, --jerk, --snap and --window."""
+    for name, default, unit in _MOVE:
+        arguments.add_argument(
+            f"--{name}", type=positive, default=default, metavar="X",
+            help=f"of the move, {unit}; default {default:g}",
+        )  # fmt: skip
+
+
+def move_limits(options: argparse.Namespace) -> Limits:
+    """What these options ask for."""
+    return Limits(*(getattr(options, name) for name, _, _ in _MOVE[:-1]))

@@ -35,6 +35,32 @@ class Setpoint:
         """Of the move in s."""
         return float(self.durations.sum())
 
+    def at(self, times: Array) -> Array:
+        """r, ṙ, r̈, r⃛ and r⁗ (5, k) at times in s, at rest before the start and after the end."""
+        ends = np.concatenate([[0.0], np.cumsum(self.durations)])
+        start = np.zeros((len(ends), 4))  # of each interval: r and three derivatives
+        for i, (span, snap) in enumerate(zip(self.durations, self.snaps, strict=True)):
+            start[i + 1] = _advanced(start[i], snap, np.array([span]))[:4, 0]
+        start[-1, 1:] = 0.0  # what rounding left
+        t = np.asarray(times, float)
+        place = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(self.snaps))
+        snaps = np.append(self.snaps, 0.0)
+        snaps = np.where(t < 0.0, 0.0, snaps[place])
+        return _advanced(start[place].T, snaps, np.maximum(t - ends[place], 0.0))
+
+
+def _advanced(state: Array, snap: float | Array, t: Array) -> Array:
+    """r and four derivatives (5, k) a time t after `state` (4, ...), with a constant snap."""
+    r, v, a, j = state
+    rows = (
+        r + t * (v + t * (a / 2 + t * (j / 6 + t * snap / 24))),
+        v + t * (a + t * (j / 2 + t * snap / 6)),
+        a + t * (j + t * snap / 2),
+        j + t * snap,
+        snap + 0.0 * t,
+    )
+    return np.asarray(np.broadcast_arrays(*rows))
+
 
 def setpoint(limits: Limits) -> Setpoint:
     """The shortest symmetric fourth-order move; all limits positive."""

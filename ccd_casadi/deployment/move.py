@@ -1,0 +1,126 @@
+"""A move as the machine makes it: sampled, delayed, saturated, quantised, with a jittering delay.
+
+Every period is cut in `PARTS`; the plant is stepped exactly from one to the next, and the force
+that was computed at kT reaches it at kT + τ_k, rounded up to a part. What is read at kT, and what
+the actuator is told, are multiples of a step where one is given.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.robust.setpoint import Setpoint
+from ccd_casadi.support.arrays import Array
+
+PARTS = 20  # of a period
+TAIL = 3.0  # the machine is watched for this many times the setpoint's duration after its end
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What the electronics do: steps of sensor (unit of y) and force (N), jitter of the delay (s).
+
+    The delay of each sample is uniform within ± `jitter` of the nominal one; `seed` of the draws.
+    """
+
+    sensor_step: float = 0.0
+    force_step: float = 0.0
+    jitter: float = 0.0
+    seed: int = 0
+
+    @property
+    def ideal(self) -> bool:
+        """Whether nothing of it is there."""
+        return not (self.sensor_step or self.force_step or self.jitter)
+
+
+@dataclass(frozen=True)
+class SampledMove:
+    """Times (k,) in s, setpoint (k,), true error (k, p) and applied force (k, m) at the instants.
+
+    `settled`: seconds from the start until the error stays within the window, inf where it does
+    not; `restless`: largest error over the last quarter of the watch, a limit cycle's amplitude;
+    `saturated`: share of the samples at the limit.
+    """
+
+    time: Array
+    position: Array
+    error: Array
+    force: Array
+    settled: float
+    restless: float
+    saturated: float
+
+    @property
+    def peak_error(self) -> float:
+        """Largest error of any output."""
+        return float(np.abs(self.error).max())
+
+
+def move(
+    plant: StateSpace,
+    realisation: Realisation,
+    delay: float,
+    profile: Setpoint,
+    *,
+    axis: int = 0,
+    forward: Array | None = None,
+    window: float = 1e-6,
+    hardware: Hardware | None = None,
+) -> SampledMove:
+    """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None."""
+    hardware = hardware or Hardware()
+    K, T = realisation.system, realisation.system.period
+    n, m, p = len(plant.A), len(K.C), len(plant.C)
+    count = int(np.ceil((1.0 + TAIL) * profile.duration / T))
+    time = np.arange(count, dtype=float) * T
+    wanted = profile.at(time)
+    ahead = np.zeros((count, m))
+    if forward is not None:
+        ahead = np.einsum("kt,km->tm", wanted, forward[:, :, axis])
+    joint = np.zeros((n + m, n + m))
+    joint[:n] = np.hstack([plant.A, plant.B])
+    ahead_by = [expm(joint * (T * i / PARTS))[:n] for i in range(PARTS + 1)]
+    rng = np.random.default_rng(hardware.seed)
+    late = delay + hardware.jitter * rng.uniform(-1.0, 1.0, count)
+    reaches = np.ceil(np.maximum(late, 0.0) / T * PARTS - 1e-9).astype(int)
+    reaches += PARTS * np.arange(count)
+    reaches = np.maximum.accumulate(reaches)  # no force overtakes an earlier one
+    x, z, u_now = np.zeros(n), np.zeros(len(K.A)), np.zeros(m)
+    error, force = np.zeros((count, p)), np.zeros((count, m))
+    limit, gain = realisation.saturation, realisation.back_calculation
+    arriving, clipped = 0, 0
+    for k in range(count):
+        y = plant.C @ x
+        r = np.zeros(p)
+        r[axis] = wanted[0, k]
+        error[k] = r - y
+        e = r - _stepped(y, hardware.sensor_step)
+        v = K.C @ z + K.D @ e + ahead[k]
+        u = v if limit is None else np.clip(v, -limit, limit)
+        z = K.A @ z + K.B @ e
+        if gain is not None:
+            z = z + gain @ (u - v)
+        clipped += bool(np.any(u != v))
+        force[k] = _stepped(u, hardware.force_step)
+        part, end = PARTS * k, PARTS * (k + 1)
+        while part < end:  # from one arrival to the next
+            while arriving <= k and reaches[arriving] <= part:
+                u_now = force[arriving]
+                arriving += 1
+            following = min(end, reaches[arriving]) if arriving <= k else end
+            step = ahead_by[following - part]
+            x = step[:, :n] @ x + step[:, n:] @ u_now
+            part = following
+    outside = np.flatnonzero(np.abs(error).max(axis=1) > window)
+    last = outside[-1] if outside.size else -1
+    settled = np.inf if last == count - 1 else float(time[last + 1])
+    rest = float(np.abs(error[-max(count // 4, 1) :]).max())
+    return SampledMove(time, wanted[0], error, force, settled, rest, clipped / count)
+
+
+def _stepped(value: Array, step: float) -> Array:
+    return np.asarray(step * np.round(value / step)) if step else value

@@ -1,0 +1,119 @@
+"""What the deployed controller does on the machine: a move, feedforward, the limit, electronics.
+
+One move in up to five ways, each beside the one before: the controller alone; with feedforward;
+with the force limited, only clipped; with back-calculation; and with steps of sensor and force and
+a delay that jitters. `least_limit` is the least force, as a share of the peak that the move asks
+for, down to which the limited move ends in its window.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.feedforward import feedforward
+from ccd_casadi.deployment.move import Hardware, SampledMove, move
+from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.robust.demands import Limits
+from ccd_casadi.robust.setpoint import Setpoint, setpoint
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+SHARES = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of the peak force that are tried
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to make the move, in words and as it went."""
+
+    words: str
+    move: SampledMove
+
+
+@dataclass(frozen=True)
+class OnHardware:
+    """The setpoint, the gains of feedforward (5, m, p) or None, the ways; None: no limit was tried.
+
+    `least_limit`: share of the unlimited peak force; NaN where the unlimited move itself does not
+    end in its window.
+    """
+
+    profile: Setpoint
+    window: float
+    forward: Array | None
+    ways: tuple[Way, ...]
+    least_limit: float
+
+
+def on_hardware(
+    plant: StateSpace,
+    realisation: Realisation,
+    delay: float,
+    bandwidth: float,
+    *,
+    limits: Limits,
+    window: float = 1e-6,
+    hardware: Hardware | None = None,
+    progress: Callable[[str], None] = lambda words: None,
+) -> OnHardware:
+    """The move of output 1 on a plant in SI; τ in s, ω_b in rad/s, window in m."""
+    profile, K = setpoint(limits), realisation.system
+    free = replace(realisation, saturation=None, back_calculation=None)
+    try:
+        forward = feedforward(plant, K.period, delay)
+    except UserError:
+        forward = None
+
+    def made(
+        controller: Realisation, ahead: Array | None, electronics: Hardware | None = None
+    ) -> SampledMove:
+        return move(
+            plant, controller, delay, profile, forward=ahead, window=window, hardware=electronics
+        )
+
+    progress("a move")
+    ways = [Way("feedback alone", made(free, None))]
+    if forward is not None:
+        ways.append(Way("with feedforward", made(free, forward)))
+    unlimited = ways[-1].move
+    if realisation.saturation is not None:
+        clipped = replace(realisation, back_calculation=None)
+        words = f"limited to {realisation.saturation:.4g} N, only clipped"
+        ways.append(Way(words, made(clipped, forward)))
+        ways.append(Way("limited, with back-calculation", made(realisation, forward)))
+    if hardware is not None and not hardware.ideal:
+        ways.append(Way("with the electronics", made(realisation, forward, hardware)))
+    progress("least force")
+    peak, least = float(np.abs(unlimited.force).max()), np.nan
+    if np.isfinite(unlimited.settled):
+        least = 1.0
+        for share in SHARES:
+            held = limited(replace(free, saturation=share * peak), bandwidth)
+            if not np.isfinite(made(held, forward).settled):
+                break
+            least = share
+    return OnHardware(profile, window, forward, tuple(ways), least)
+
+
+def hardware_dict(found: OnHardware) -> dict[str, Any]:
+    """For deploy.json; seconds, m and N."""
+    return {
+        "duration": found.profile.duration,
+        "window": found.window,
+        "feedforward": None if found.forward is None else found.forward.tolist(),
+        "least_limit": None if np.isnan(found.least_limit) else found.least_limit,
+        "moves": [
+            {
+                "words": way.words,
+                "settled": None if np.isinf(way.move.settled) else way.move.settled,
+                "peak_error": way.move.peak_error,
+                "last_error": way.move.restless,
+                "peak_force": float(np.abs(way.move.force).max()),
+                "saturated": way.move.saturated,
+            }
+            for way in found.ways
+        ],
+    }
