@@ -115,7 +115,7 @@ def steepest_descent(
     smallest_step: float = 1e-3,
     max_iterations: int = 100,
 ) -> Descent:
-    """Descend from `start`; steps are shares of the box of θ. Sections have but a total gradient."""
+    """Descend from `start`; steps are shares of the box of θ. Sections have a total gradient."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     width = upper - lower
     slope = _cost_gradient(problem)
