@@ -165,6 +165,7 @@ def sections_result(
             for value, count in verified.raced.optima
         ],
         "rounds": verified.rounds,
+        "anchors": [list(kappa) for kappa in sections_of_problem(verified.problem).anchors],
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
         "robust": wide_dict(problem, verified),

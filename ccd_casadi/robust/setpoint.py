@@ -35,6 +35,29 @@ class Setpoint:
         """Of the move in s."""
         return float(self.durations.sum())
 
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Position and acceleration at times (k,) in s, exact; after the move it stays there."""
+        ends = np.cumsum(self.durations)
+        place, rate = np.zeros_like(times), np.zeros_like(times)
+        state, start = np.zeros(4), 0.0  # r, ṙ, r̈, r⃛
+        for end, span, snap in zip(ends, self.durations, self.snaps, strict=True):
+            inside = (times >= start) & (times <= end)
+            for h, where in ((times[inside] - start, inside), (span, None)):
+                r, v, a, j = state
+                moved = (
+                    r + v * h + a * h**2 / 2 + j * h**3 / 6 + snap * h**4 / 24,
+                    v + a * h + j * h**2 / 2 + snap * h**3 / 6,
+                    a + j * h + snap * h**2 / 2,
+                    j + snap * h,
+                )
+                if where is None:
+                    state = np.array(moved)
+                else:
+                    place[where], rate[where] = moved[0], moved[2]
+            start = end
+        place[times > start], rate[times > start] = state[0], 0.0
+        return place, rate
+
 
 def setpoint(limits: Limits) -> Setpoint:
     """The shortest symmetric fourth-order move; all limits positive."""
