@@ -129,7 +129,7 @@ def _read_sections(
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
-    problem = _with_function(folder / "result.json", problem, result)
+    problem = with_function(folder / "result.json", problem, result)
     plant, weights = scaled_plant(problem, theta), problem.weights
     figures = measure(
         plant, controller, weights, gamma=UNBOUNDED, omega_low=problem.inner.omega_low
@@ -139,10 +139,13 @@ def _read_sections(
     )
 
 
-def _with_function(
+def with_function(
     path: Path, problem: CoDesignProblem, result: Mapping[str, Any]
 ) -> CoDesignProblem:
-    """The problem with the anchors and the plant set that the run ended with: its ω_b*(θ)."""
+    """The problem with the anchors and the plant set that a run ended with: its ω_b*(θ).
+
+    Raises UserError where result.json holds others.
+    """
     sections = problem.sections
     assert sections is not None
     if "anchors" not in result:

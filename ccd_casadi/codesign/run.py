@@ -28,7 +28,7 @@ from ccd_casadi.codesign.result import (
     write_json,
 )
 from ccd_casadi.codesign.sections_result import sections_controller, sections_result
-from ccd_casadi.codesign.sections_run import run_sections
+from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
@@ -211,15 +211,26 @@ def _of_sections(
         raise UserError("--surrogate: starts no solve with sections; solve the case without it")
     began, name = perf_counter(), type(formulation).__name__.lower()
     found = run_sections(sampler, formulation, seed)
-    spent: dict[str, Any] = {
-        "syntheses": found.syntheses, "seconds": perf_counter() - began, "seed": seed,
-    }  # fmt: skip
+    return solution_of_sections(
+        sampler.problem, name, found, formulation.tolerance, seed, perf_counter() - began
+    )
+
+
+def solution_of_sections(
+    problem: CoDesignProblem,
+    name: str,
+    found: SectionsRun,
+    tolerance: float,
+    seed: int,
+    seconds: float,
+) -> Solution:
+    """result.json and the objects behind it."""
+    spent: dict[str, Any] = {"syntheses": found.syntheses, "seconds": seconds, "seed": seed}
     if found.verified is None:
         return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
     result = sections_result(
-        sampler.problem, name, found.outcome, found.verified, tolerance=formulation.tolerance,
-        **spent,
-    )  # fmt: skip
+        problem, name, found.outcome, found.verified, tolerance=tolerance, **spent
+    )
     theta = np.array(found.verified.theta)
     quality = surrogate_quality(found.outcome.surrogates, theta, seed)
     result["surrogate_quality"] = clean(quality_dict(quality))
