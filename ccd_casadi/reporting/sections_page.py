@@ -1,5 +1,6 @@
 """The run report of a controller of fixed structure: its sections, and every plant's loop."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -48,7 +49,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
 
 
 def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
-    items = "".join(f"<li>{escape(words)}</li>" for words in _binds(problem, result))
+    items = "".join(f"<li>{escape(words)}</li>" for words in binding_words(problem, result))
     body = (
         table_html(theta_table(problem, result))
         + facts_html(_facts(problem, result))
@@ -58,7 +59,8 @@ def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
     return Section("The design", body)
 
 
-def _binds(problem: CoDesignProblem, result: dict[str, Any]) -> list[str]:
+def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
+    """What holds θ, and what the controller, with what loosening it would gain."""
     over_theta = binding(problem, {**result, "active": []})
     mu = result["controller"]["multipliers"]
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S below ω_b", "S_LOW": "|S| at ω_low",
