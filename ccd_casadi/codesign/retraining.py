@@ -140,7 +140,7 @@ class CoDesignTruth:
             found = conclude_sections(self.sampler, outcome)
             solution = solution_of_sections(
                 self.sampler.problem, self.formulation, found, self.tolerance, self.seed,
-                perf_counter() - began,
+                perf_counter() - began, self.sampler.quiet,
             )  # fmt: skip
         else:
             solution = conclude(

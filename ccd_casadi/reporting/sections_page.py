@@ -43,6 +43,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     return [
         _design(problem, solution.result),
         Section("The controller", _controller(solution.result)),
+        Section("Full order beside it", _beside(problem, solution.result)),
         Section("Closed loop on every plant", gains_html(problem, verified, loops)),
         Section("Nyquist plot and a step of force", nyquist_html(problem, verified, loops)),
     ]
@@ -70,8 +71,64 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
         for name, words in names.items()
         if mu.get(name, 0.0) > 1e-6
     ]
-    ends = [f"{words} of its range" for words in result["controller"]["at_range"]]
+    ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
+    ends = [f"{name} is at the {end} end of its range" for name, _, end in ranges]
     return [*over_theta, *over_kappa, *ends]
+
+
+def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+    """What the structure, robustness, hold and delay cost, by mixed sensitivity at the same θ."""
+    found, sections = result["full_order"], sections_of_problem(problem)
+    model, on_set, sampled = found["on_model"], found["on_set"], sections.sampling is not None
+
+    def hz(value: float | None) -> str:
+        return "none found" if value is None else f"{number(value, 4)} Hz"
+
+    count = result["certificate"]["plants"]
+    rows = [
+        ("the model alone", "sampled" if sampled else "continuous",
+         "–" if sampled else hz(model["bandwidth_hz"]), hz(found["sections_on_model_hz"])),
+    ]  # fmt: skip
+    if sampled:
+        rows.insert(0, ("the model alone", "continuous", hz(model["bandwidth_hz"]), "–"))
+        with_set = "–" if on_set is None else hz(on_set["bandwidth_hz"])
+        rows.append((f"{count} plants of the set", "continuous", with_set,
+                     hz(found["sections_continuous_hz"])))  # fmt: skip
+    own = "–" if sampled or on_set is None else hz(on_set["bandwidth_hz"])
+    rows.append((f"{count} plants of the set", "sampled" if sampled else "continuous", own,
+                 hz(result["bandwidth_hz"])))  # fmt: skip
+    head = ("designed for", "loop", "mixed sensitivity, full order", "sections")
+    words = [f"On the model {_judged_words(model)}"]
+    if on_set is not None:
+        words.append(f"On the set (resonance shifts and damping) {_judged_words(on_set)}")
+    words.append(
+        "Full order keeps S_max and |S| at ω_low as the sections do, and no bound on KS, T, GS or "
+        "the shape. The sections' other rows are ends of climbs from the design, no races: at "
+        "least that is reached."
+    )
+    if found["stacked_norm"] is not None and found["gamma_opt"] is not None:
+        ratio = found["stacked_norm"] / found["gamma_opt"]
+        words.append(
+            f"With the weights of the full-order design on the model no controller at all has a "
+            f"stacked norm ‖[W_S S; W_KS KS; W_T T]‖∞ below γ_opt = {number(found['gamma_opt'])}; "
+            f"the sections, which were not designed for it, have {number(found['stacked_norm'])}, "
+            f"{number(ratio, 3)} times that (continuous loop)."
+        )
+    return table_html(Table(head, tuple(rows))) + "".join(paragraph(text) for text in words)
+
+
+def _judged_words(full: Mapping[str, Any]) -> str:
+    """A full-order design as the judge sees it on the set of the sections."""
+    if full["bandwidth_hz"] is None:
+        return f"full order has {full['words']}."
+    words = f"full order has {number(full['bandwidth_hz'], 4)} Hz, order {full['order']}, "
+    words += f"{full['words']}; judged on the {full['plants']} plants of the set it is "
+    if full["unstable"]:
+        words += f"unstable on {full['unstable']}"
+    else:
+        words += "stable on all"
+    worst = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in full["over"].items())
+    return f"{words}; largest figures over the sections' bounds where it is stable: {worst}."
 
 
 def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
