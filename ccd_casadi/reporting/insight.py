@@ -128,7 +128,8 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
                 theta or ("does not move" if found.determined or swept else "–"),
             )
         )
-    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", "d(θ, ln ω)/dp")
+    moving = "d(θ, ln ω)/dp" if swept else "dθ/dp"
+    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
     return Table(head, tuple(rows))
 
 

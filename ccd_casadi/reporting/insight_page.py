@@ -19,6 +19,7 @@ from ccd_casadi.reporting.insight import (
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
 from ccd_casadi.reporting.page import (
     Section,
+    escape,
     figure_html,
     header,
     number,
@@ -83,9 +84,8 @@ def _limits(run: FinishedRun, rule: str) -> str:
             "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "
             "the bounds above."
         )
-        return "\n".join(paragraph(f"{text[0].upper()}{text[1:]}.") for text in held) + (
-            paragraph(without) + paragraph(rule)
-        )
+        items = "".join(f"<li>{escape(text)}</li>" for text in held)
+        return f"<ul>{items}</ul>" + paragraph(without) + paragraph(rule)
     loop = loop_data(
         run.plant,
         run.controller,

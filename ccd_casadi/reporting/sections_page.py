@@ -16,6 +16,7 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.sections_loops import gains_html, loops_of, nyquist_html
+from ccd_casadi.reporting.sections_move import move_html
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
         Section("Full order beside it", _beside(problem, solution.result)),
         Section("Closed loop on every plant", gains_html(problem, verified, loops)),
         Section("Nyquist plot and a step of force", nyquist_html(problem, verified, loops)),
+        Section("A move", move_html(verified)),
     ]
 
 
@@ -98,9 +100,9 @@ def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     rows.append((f"{count} plants of the set", "sampled" if sampled else "continuous", own,
                  hz(result["bandwidth_hz"])))  # fmt: skip
     head = ("designed for", "loop", "mixed sensitivity, full order", "sections")
-    words = [f"On the model {_judged_words(model)}"]
+    words = [f"Full order on the model: {_judged_words(model)}"]
     if on_set is not None:
-        words.append(f"On the set (resonance shifts and damping) {_judged_words(on_set)}")
+        words.append(f"On the set (resonance shifts and damping): {_judged_words(on_set)}")
     words.append(
         "Full order keeps S_max and |S| at ω_low as the sections do, and no bound on KS, T, GS or "
         "the shape. The sections' other rows are ends of climbs from the design, no races: at "
@@ -120,8 +122,8 @@ def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
 def _judged_words(full: Mapping[str, Any]) -> str:
     """A full-order design as the judge sees it on the set of the sections."""
     if full["bandwidth_hz"] is None:
-        return f"full order has {full['words']}."
-    words = f"full order has {number(full['bandwidth_hz'], 4)} Hz, order {full['order']}, "
+        return f"{full['words']}."
+    words = f"{number(full['bandwidth_hz'], 4)} Hz, order {full['order']}, "
     words += f"{full['words']}; judged on the {full['plants']} plants of the set it is "
     if full["unstable"]:
         words += f"unstable on {full['unstable']}"
