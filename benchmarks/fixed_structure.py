@@ -43,7 +43,9 @@ WEIGHTS = Weights(
 BOUNDS = Bounds(
     S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=8.426, weights=WEIGHTS
 )
-LEVELS = 11  # of the grids of a PID
+LEVELS = 18  # of the grids of a PID
+SHRINK = 0.65  # of a grid from one level to the next
+DENSE = 10  # level from which its frequencies are dense
 SAMPLED = Sampling(10000.0, 100.0)
 
 
@@ -131,11 +133,15 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     """
     structure = Structure(True, 1, 0, 0)
     problem = problem_for([plant], structure, bounds)
-    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 5000)]))
-    v = v[(v >= problem.base[0]) & (v <= problem.base[-1])]
-    G, _ = problem.plants.responses(np.zeros(len(v), int), v)
     weights = bounds.weights or WEIGHTS
-    _, W_KS, W_T = np.abs(weights.responses(v * plant.omega_0))
+
+    def over(count: int) -> tuple[np.ndarray, ...]:
+        """Frequencies, G, |W_KS| and |W_T| there."""
+        v = np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, count)])
+        v = np.unique(v[(v >= problem.base[0]) & (v <= problem.base[-1])])
+        G, _ = problem.plants.responses(np.zeros(len(v), int), v)
+        return v, G, *np.abs(weights.responses(v * plant.omega_0))[1:]
+
     low = np.log(np.array([1e-2, 1e-3, 1e-2, 0.3]))
     high = np.log(np.array([1e1, 1.0, 3.0, 30.0]))
     at_low = np.array([bounds.omega_low / plant.omega_0])
@@ -143,7 +149,10 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     best, centre = -np.inf, 0.5 * (low + high)
     width = 0.5 * (high - low)
     for level in range(LEVELS):
-        counts = (21, 9, 9, 9) if level == 0 else (21, 7, 7, 7)
+        v, G, W_KS, W_T = over(5000 if level >= DENSE else 300)
+        if level == DENSE:
+            best = -np.inf  # sparse frequencies may have missed a peak there
+        counts = (21, 9, 9, 9) if level == 0 else (9, 7, 7, 7)
         axes = [c + w * np.linspace(-1.0, 1.0, count)
                 for c, w, count in zip(centre, width, counts, strict=True)]  # fmt: skip
         points = np.clip(np.array(list(itertools.product(*axes))), *problem.box)
@@ -170,7 +179,7 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
             k = int(np.argmax(value))
             if value[k] > best:
                 best, centre = float(value[k]), part[k]
-        width *= 0.75 if level else 0.35
+        width *= SHRINK if level else 0.35
     if not np.isfinite(best):
         return np.nan
     kappa = structure.in_units(centre, plant.omega_0, plant.force)
