@@ -131,6 +131,7 @@ def test_robustness_is_of_the_loop_as_it_runs(folder: Path) -> None:
     assert as_it_runs(finished).figures.bandwidth != finished.figures.bandwidth
 
 
+@pytest.mark.slow
 def test_insight_draws_the_front_of_the_runs_own_function(folder: Path) -> None:
     out = folder / "insight"
     assert insight_main([str(folder / "run"), "--points", "2", "--out", str(out), *COMMON]) == 0
@@ -168,6 +169,7 @@ def test_responses_against_differences(folder: Path) -> None:
         assert by_name[f"{name} upper"].objective == pytest.approx(J, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_retraining_goes_on_from_the_runs_samples(folder: Path) -> None:
     out = folder / "retrained"
     before = json.loads((folder / "run" / "result.json").read_text())
