@@ -195,11 +195,16 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
             near = gridded(centre, size, FINE)
             found = values(near, there)
             k = int(np.argmax(found))
-            gain, best = found[k] - best, max(best, float(found[k]))
-            if gain > 0.0:
+            if not np.isfinite(found[k]):  # the sparse frequencies had missed a peak
+                size /= SHRINK
+                if size.max() > 2.0:
+                    return np.nan
+                continue
+            if found[k] > best:
                 centre = near[k]
-            if not gain > 1e-4 * best:
+            if not found[k] > best * (1.0 + 1e-4):
                 size *= SHRINK
+            best = max(best, float(found[k]))
     if not np.isfinite(best):
         return np.nan
     kappa = structure.in_units(centre, plant.omega_0, plant.force)
