@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
-from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -42,11 +41,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     case = load_case(options.case)
     problem = problem_of(case)
     plant_of(problem)
-    if problem.sections is not None:
-        raise UserError(
-            f"{options.case}: controller.structure: compare is for mixed sensitivity so far; solve "
-            "the case with --formulation nested, lifted and direct, each with its own --out"
-        )
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)
     with pool(options.scheduler, options.workers, PATIENCE) as workers:

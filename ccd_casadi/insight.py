@@ -18,34 +18,40 @@ def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     import numpy as np
 
-    from ccd_casadi.cases.run_folder import read_run, refuse_sections
+    from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.insight import insight_dict
     from ccd_casadi.codesign.pareto import pareto_front
     from ccd_casadi.codesign.post_optimal import post_optimal
     from ccd_casadi.codesign.result import write_json
+    from ccd_casadi.codesign.sections_insight import sections_front, sections_responses
+    from ccd_casadi.inner_problem.sections_bandwidth import sections_value
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
 
     began = perf_counter()
     done = read_run(options.run)
-    refuse_sections(done, "insight", "report.html of the run shows what binds, with multipliers")
     folder = run_folder(options.run, options.out or options.run)
-    x = np.array([*done.theta, *np.log([done.weights.omega_S, done.weights.omega_T])])
+    theta, tolerance = np.array(done.theta), done.case.outer.tolerance
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(done.folder / "samples.sqlite") as samples,
     ):
         sampler = Sampler(done.problem, samples, workers, quiet=options.quiet)
-        front = pareto_front(
-            sampler,
-            points=options.points,
-            samples=done.case.sampling.lifted_points,
-            tolerance=done.case.outer.tolerance,
-            seed=options.seed,
-            own=x,
-        )
-    responses = post_optimal(done.problem, x, options.quiet)
+        if done.problem.sections is None:
+            x = np.append(theta, np.log([done.weights.omega_S, done.weights.omega_T]))
+            front = pareto_front(
+                sampler, points=options.points, samples=done.case.sampling.lifted_points,
+                tolerance=tolerance, seed=options.seed, own=x,
+            )  # fmt: skip
+            responses = post_optimal(done.problem, x, options.quiet)
+        else:
+            front = sections_front(
+                sampler, own=theta, points=options.points, tolerance=tolerance, seed=options.seed
+            )
+            sample = sampler.bandwidths(theta, "the run's own design")[0]
+            made = sections_value(done.problem, done.theta).design
+            responses = sections_responses(done.problem, sample, made)
     seconds = perf_counter() - began
     found = insight_dict(done, front, responses)
     write_json(folder / "insight.json", found | {"seed": options.seed, "seconds": seconds})

@@ -19,7 +19,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import versions, write_json
-    from ccd_casadi.deployment.given_controller import with_controller
+    from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
     from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
 
     began = perf_counter()
@@ -31,9 +31,9 @@ def command(options: argparse.Namespace) -> ExitCode:
         low, high = options.damping
         raise UserError(f"--damping: is {low:g} {high:g}; give a factor up to 1 and one from 1")
     place = options.out or options.run
-    if options.controller is not None:
-        from ccd_casadi.deployment.given_controller import with_controller
-
+    if options.controller is None:
+        finished = as_it_runs(finished)
+    else:
         finished = with_controller(finished, options.controller)
         if options.out is None:  # the run's own page stays
             place = options.run / f"robustness_{options.controller.stem}"

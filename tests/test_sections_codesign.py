@@ -1,6 +1,5 @@
 """Co-design with a fixed structure: a PID with roll-off climbs in a fraction of a second."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,7 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import (
     judged_corners,
@@ -25,11 +22,8 @@ from ccd_casadi.inner_problem.sections_bandwidth import (
     worst_members,
 )
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
-from ccd_casadi.insight import main as insight_main
-from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 
@@ -137,85 +131,3 @@ def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
     found = solve(case, Direct(starts=1))
     assert found.result["status"] == "infeasible"
     assert found.result["reason"]
-
-
-QUICK = """
-[plant]
-model = "two_mass"
-[theta.m1]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[theta.m2]
-lower = 58.0
-upper = 60.0
-start = 59.0
-unit = "kg"
-[objective]
-w1 = 0.0995
-w2 = -0.9950
-[weights]
-M_S = 2.0
-A_S = 1e-4
-c_K = 1e4
-omega_K_hz = 100.0
-M_K = 2e7
-A_l = 1.0
-A_u = 1e-2
-[inner]
-S_max = 1.75
-S_low = 0.2
-omega_low_hz = 1.0
-omega_S_hz = [10.0, 1800.0]
-omega_T_hz = [25.0, 1000.0]
-[controller]
-structure = "sections"
-biquads = 0
-weighted_level = 8.426
-starts = 4
-[loop]
-rate_hz = 8000.0
-delay_us = 80.0
-[sampling]
-points = 2
-"""
-
-
-def test_commands_on_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    case, run = tmp_path / "quick.toml", tmp_path / "run"
-    case.write_text(QUICK)
-    common = ["--quiet", "--workers", "1"]
-    arguments = [str(case), "--out", str(run), "--workers", "1"]
-    assert solve_main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert "lead: zero" in printed
-    result = json.loads((run / "result.json").read_text())
-    controller = json.loads((run / "controller.json").read_text())
-    assert controller["sections"]["loop"] == {
-        "rate_hz": 8000.0, "delay_us": 80.0, "method": "tustin"
-    }  # fmt: skip
-    assert len(controller["A"]) == result["controller"]["order"] == 4
-    page = (run / "report.html").read_text()
-    assert "Nyquist" in page
-    assert "roll-off" in page
-
-    assert inner_main([str(case), "--theta", "m1=59,m2=59", *common]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["status"] == "verified"
-    assert answer["gamma_opt"] is None
-
-    assert deploy_main([str(run), *common]) == 0
-    deployed = json.loads((run / "deploy" / "deploy.json").read_text())
-    assert (deployed["rate_hz"], deployed["delay"]) == pytest.approx((8000.0, 8e-5))
-    assert deployed["sampled"]["bandwidth_hz"] >= result["bandwidth_hz"] * (1.0 - 1e-6)
-    assert deployed["sampled"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
-
-    assert robustness_main([str(run), "--samples", "5", *common]) == 0
-    assert insight_main([str(run), *common]) == 2
-    assert "controller.structure" in capsys.readouterr().err
-
-    controller["sections"]["kappa"][0] += 3.0  # 20 times the gain
-    (run / "controller.json").write_text(json.dumps(controller))
-    assert deploy_main([str(run), *common]) == 2
-    assert "not certified" in capsys.readouterr().err

@@ -10,10 +10,13 @@ from helpers import few, random_plant
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ccd_casadi.deployment.discretise import Conversion, discretise
+from ccd_casadi.deployment.given_controller import Sampled
+from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.robust.move import mass_feedforward, simulate
+from ccd_casadi.plants.scaling import StateSpace, scale_state_space
+from ccd_casadi.robust.move import mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.setpoint import Limits, Setpoint, setpoint
 from ccd_casadi.robust.signals import closed_loop
 
@@ -131,6 +134,33 @@ def test_a_move_against_python_control() -> None:
     at = move.duration + move.settling
     assert inside[move.time > at].all()
     assert not inside[np.flatnonzero(move.time <= at)[-1]]
+
+
+def test_a_sampled_move_tends_to_the_continuous_one() -> None:
+    """The difference, of hold and delay alone, halves with the period."""
+    plant, controller = rigid_loop(3.0, 3e4, 0.7)
+    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    loop = closed_loop(plant, controller)
+    move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
+    apart = []
+    for rate in (4e3, 8e3):
+        period = 1.0 / rate
+        tustin = Conversion(Discretisation.TUSTIN, False, 100.0)
+        K = Sampled(discretise(controller, tustin, period, 0.5 * period), 0.5 * period)
+        found = simulate_sampled(K, scale_state_space(plant, 1e5), profile, axis=0, forces=None,
+                                 window=1e-7, bandwidth_hz=15.0)  # fmt: skip
+        there = np.interp(found.time, move.time, move.error)[found.time <= move.duration]
+        apart.append(np.abs(found.error[: len(there)] - there).max() / move.peak_error)
+    assert apart[0] < 0.05
+    assert apart[1] == pytest.approx(0.5 * apart[0], rel=0.1)
+
+
+def test_positions_and_accelerations_at_any_time() -> None:
+    profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+    times, states = flown(profile)
+    place, rate = profile.at(np.append(times, 1.0))
+    assert place == pytest.approx(np.append(states[:, 0], 0.01), abs=1e-12)
+    assert rate == pytest.approx(np.append(states[:, 2], 0.0), abs=1e-10)
 
 
 def test_feedforward_of_a_stage_with_several_inputs() -> None:

@@ -7,7 +7,7 @@ checked, and the controller is certified again on the plant that the case file d
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import judged_corners
+from ccd_casadi.inner_problem.sections_bandwidth import judged_corners, with_range
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -41,6 +41,9 @@ class SampledController(Protocol):
 
     def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
         """G (k, p, m) and K (k, m, p) at frequencies (k,) in rad/s."""
+
+    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
+        """Errors (k, p) and all forces (k, m) at the instants, from rest, `forces` fed forward."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,7 @@ def _read_sections(
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
         raise UserError(f"{path}: {words}; solve the case again")
+    problem = with_function(folder / "result.json", problem, result)
     plant, weights = scaled_plant(problem, theta), problem.weights
     figures = measure(
         plant, controller, weights, gamma=UNBOUNDED, omega_low=problem.inner.omega_low
@@ -133,6 +137,34 @@ def _read_sections(
     return FinishedRun(
         folder, case, problem, theta, plant, weights, controller, figures, result, kappa=kappa
     )
+
+
+def with_function(
+    path: Path, problem: CoDesignProblem, result: Mapping[str, Any]
+) -> CoDesignProblem:
+    """The problem with the anchors and the plant set that a run ended with: its ω_b*(θ).
+
+    Raises UserError where result.json holds others.
+    """
+    sections = problem.sections
+    assert sections is not None
+    if "anchors" not in result:
+        return problem  # of an earlier version
+    try:
+        anchors = tuple(tuple(map(float, kappa)) for kappa in result["anchors"])
+        members = tuple(
+            (int(item["option"]), tuple(map(float, item["point"])))
+            for item in result["robust"]["set"]
+        )
+        seed = int(result["seed"])
+    except (KeyError, TypeError, ValueError):
+        words = "anchors, robust.set and seed are not those of a solve; solve the case again"
+        raise UserError(f"{path}: {words}") from None
+    own = len(sections.structure.names)
+    if any(len(kappa) != own for kappa in anchors):
+        raise UserError(f"{path}: anchors: are of another structure; solve the case again")
+    found = replace(sections, anchors=anchors, members=members, seed=seed)
+    return with_range(replace(problem, sections=found))
 
 
 def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:

@@ -13,10 +13,13 @@ from ccd_casadi.codesign.conclusions import conclusions
 from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.codesign.result import clean, figures_dict, versions
 from ccd_casadi.codesign.run import FORMULATIONS, co_design, formulation_of
+from ccd_casadi.codesign.sections_result import active_of, design_dict
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
+from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
@@ -30,7 +33,10 @@ from surrogates import latin_hypercube
 
 @dataclass(frozen=True)
 class Method:
-    """One method's entry: its JSON figures, its path over θ, and J against syntheses spent."""
+    """One method's entry: its JSON figures, its path over θ, and J against syntheses spent.
+
+    `sections` is the design of a fixed structure, of whatever method.
+    """
 
     name: str
     figures: dict[str, Any]
@@ -38,6 +44,7 @@ class Method:
     trace: tuple[TraceEntry, ...]
     solution: Solution | None = None
     descent: Descent | None = None
+    sections: SectionsDesign | None = None
 
 
 @dataclass(frozen=True)
@@ -58,22 +65,41 @@ class Comparison:
 def compare(
     case: Case, problem: CoDesignProblem, folder: Path, workers: Pool, *, seed: int, quiet: bool
 ) -> Comparison:
-    """Run every method, each with a store and a count of its own."""
+    """Run every method, each with a store and a count of its own.
+
+    With a controller of fixed structure the descents and the sequential designs climb from the
+    anchors of the best formulation, whose race counts as theirs too; the descent with K held fixed
+    sweeps weights, which sections do not have, and is left out.
+    """
     began = perf_counter()
     methods = [
         _formulation(case, problem, folder, workers, name, seed, quiet) for name in FORMULATIONS
     ]
     problem = _chosen(problem, methods)
     descents = _descents(case, problem, workers, seed, quiet)
-    for gradient in Gradient:
+    for gradient in gradients_of(problem):
         methods.append(_best_descent(problem, descents, gradient))
     for name, starts in (("sequential", 0), ("sequential_global", 8)):
         methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
 
 
+def gradients_of(problem: CoDesignProblem) -> tuple[Gradient, ...]:
+    """The gradients that a descent can follow."""
+    return tuple(Gradient) if problem.sections is None else (Gradient.TOTAL,)
+
+
 def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
-    """The problem with the design plant of the best formulation, where the case leaves it open."""
+    """The problem with the design plant of the best formulation, where the case leaves it open.
+
+    With sections: with the anchors and the plant set of the best.
+    """
+    raced = [m for m in methods if m.solution is not None and m.solution.sections is not None]
+    if raced:
+        best = min(raced, key=lambda m: m.figures["objective"])
+        assert best.solution is not None
+        assert best.solution.sections is not None
+        return best.solution.sections.problem
     solved = [m for m in methods if m.solution is not None and m.solution.problem is not None]
     if problem.robust is None or problem.robust.design_shift is not None or not solved:
         return problem
@@ -101,7 +127,12 @@ def _formulation(
     if solution.verified is not None:
         path = (*path, solution.verified.theta)
         figures["first_resonance_hz"] = _resonance(problem, solution.verified.theta)
-    return Method(name, figures, path, trace, solution=solution)
+    made = None
+    if solution.sections is not None:
+        path = (*path, solution.sections.theta)
+        figures["first_resonance_hz"] = _resonance(problem, solution.sections.theta)
+        made = solution.sections.design
+    return Method(name, figures, path, trace, solution=solution, sections=made)
 
 
 def _descents(
@@ -116,7 +147,7 @@ def _descents(
         starts += [tuple(float(v) for v in theta) for theta in spread]
     tasks = [
         (problem, start, gradient, step, base.max_iterations)
-        for gradient in Gradient
+        for gradient in gradients_of(problem)
         for start in starts
         for step in base.steps
     ]
@@ -166,7 +197,8 @@ def _best_descent(
         for item in best.iterates
     )
     path = tuple(item.theta for item in best.iterates)
-    return Method(name, clean(figures), path, trace, descent=best)
+    made = best.design if isinstance(best.design, SectionsDesign) else None
+    return Method(name, clean(figures), path, trace, descent=best, sections=made)
 
 
 def _sequential(
@@ -191,31 +223,41 @@ def _sequential(
         if not sample.feasible:
             figures = {"status": "infeasible", "reason": sample.shortfall, "syntheses": spent}
             return Method(name, figures, (hardware.theta,), trace)
-        x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-        design = sampler.design(x)
+        design: Sensitivities | SectionsDesign
+        if problem.sections is None:
+            x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+            design = sampler.design(x)
+        else:
+            design = sections_value(problem, sample.theta).design
     figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
     figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
-    return Method(name, clean(figures), (hardware.theta,), trace)
+    made = design if isinstance(design, SectionsDesign) else None
+    return Method(name, clean(figures), (hardware.theta,), trace, sections=made)
 
 
 def _figures(
     problem: CoDesignProblem,
     theta: tuple[float, ...],
-    design: Sensitivities,
+    design: Sensitivities | SectionsDesign,
     syntheses: int,
     seconds: float,
 ) -> dict[str, Any]:
     """The contract's keys for a design that no formulation made."""
     cost = hardware_cost(plant_of(problem), theta)
-    figures = design.figures
-    feasible = problem.inner.feasible(figures)
+    if isinstance(design, SectionsDesign):
+        own, feasible, bandwidth = design_dict(problem, design), design.certified, design.bandwidth
+        active = active_of(design)
+    else:
+        figures = design.figures
+        own, feasible = figures_dict(figures), problem.inner.feasible(figures)
+        bandwidth, active = figures.bandwidth, list(active_constraints(problem.inner, figures))
     return {
-        **figures_dict(figures),
+        **own,
         "status": "verified" if feasible else "not_verified",
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": cost,
-        "objective": problem.w1 * cost + problem.w2 * figures.bandwidth,
-        "active": list(active_constraints(problem.inner, figures)),
+        "objective": problem.w1 * cost + problem.w2 * bandwidth,
+        "active": active,
         "first_resonance_hz": _resonance(problem, theta),
         "surrogate_bandwidth_hz": None,
         "verification_error": None,
@@ -253,7 +295,7 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
                 }
                 for descent in comparison.descents
             ],
-            "published": PUBLISHED.get(model, {}),
+            "published": {} if comparison.problem.sections else PUBLISHED.get(model, {}),
             "conclusions": conclusions(comparison.problem, _entries(comparison)),
             "seconds": comparison.seconds,
             "seed": seed,

@@ -44,8 +44,10 @@ def _descent(
     gap = run["objective"] - best["objective"]
     ratio = run["syntheses"] / best["syntheses"]
     theta = tuple(run["theta"].values())
-    truth = true_inner(problem, theta)
-    swept_loss = (truth.bandwidth - 2 * np.pi * run["bandwidth_hz"]) * abs(problem.w2)
+    swept_loss = 0.0  # sections are not swept
+    if problem.sections is None:
+        truth = true_inner(problem, theta)
+        swept_loss = (truth.bandwidth - 2 * np.pi * run["bandwidth_hz"]) * abs(problem.w2)
     moved = max(
         abs(a - b) / (high - low)
         for a, b, low, high in zip(
@@ -70,7 +72,12 @@ def _descent(
         f"{gap:.3g} above, after {run['syntheses']} syntheses, {ratio:.0f} times as many; "
         f"all its runs together took {run['syntheses_of_all_runs']}."
     ]
-    if gap > EQUAL * abs(best["objective"]):
+    if gap > EQUAL * abs(best["objective"]) and problem.sections is not None:
+        words.append(
+            f"It stopped because of: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
+            "from the best one."
+        )
+    elif gap > EQUAL * abs(best["objective"]):
         share = min(1.0, max(0.0, swept_loss / gap)) if gap > 0 else 0.0
         words.append(
             f"It stopped because of: {run['stop']}. Of its gap, {100 * share:.0f} % is the inner "

@@ -19,6 +19,13 @@ def natural_hz(run: FinishedRun) -> tuple[float, ...]:
     return tuple(float(w) / HZ for w in modal.natural[~modal.rigid])
 
 
+def bandwidth_of(run: FinishedRun) -> float:
+    """ω_b in rad/s: with sections that of every plant of the set."""
+    if run.problem.sections is None:
+        return run.figures.bandwidth
+    return HZ * float(run.result["bandwidth_hz"])
+
+
 def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict[str, Any]:
     """insight.json: SI, and Hz where a key says so."""
     names = run.problem.names
@@ -28,7 +35,7 @@ def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict
             "hardware_cost": point.hardware_cost,
             "bandwidth_hz": point.bandwidth / HZ,
             "predicted_bandwidth_hz": point.predicted / HZ,
-            "omega_S_hz": point.omega_S / HZ,
+            "omega_S_hz": point.omega_S / HZ,  # NaN with sections
             "omega_T_hz": point.omega_T / HZ,
             "active": list(point.active),
             "efficient": point.efficient,
@@ -48,7 +55,7 @@ def insight_dict(run: FinishedRun, front: Front, responses: PostOptimal) -> dict
         },
         "natural_hz": list(natural),
         "first_resonance_over_bandwidth": (
-            min(natural) * HZ / run.figures.bandwidth if natural else None
+            min(natural) * HZ / bandwidth_of(run) if natural else None
         ),
         "versions": versions(),
     }

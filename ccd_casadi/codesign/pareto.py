@@ -98,7 +98,7 @@ def pareto_front(
     starts = design("sobol", lower, upper, STARTS, seed + 1)
     if own is not None:
         starts = np.vstack([np.clip(own, lower, upper), starts])
-    ends, trades = _ends(program, problem, starts)
+    ends, trades = ends_of(program, problem, starts)
     f_low, f_high = (hardware_cost(plant_of(problem), x[:-2]) for x in ends)
     if own is not None:  # the true optimum may lie beyond what the first surrogates expect
         f_own = hardware_cost(plant_of(problem), own[:-2])
@@ -118,12 +118,12 @@ def pareto_front(
         rounds += 1
         if rounds > 1:
             _move_ends(program, problem, starts, [k for k in todo if k != through], costs, x)
-        x = _walk(program, problem, costs, todo, starts, x)
+        x = walk(program, problem, costs, todo, starts, x)
         learn = []
         inner = sampler.bandwidths(x[todo, :-2], f"verifying round {rounds}")
         for k, sample in zip(todo, inner, strict=True):
             predicted = float(processes[0].predict(x[k][None, :])[0])
-            result[k] = _point(problem, sample, predicted, tolerance)
+            result[k] = front_point(problem, sample, predicted, tolerance)
             if not result[k].verified:
                 learn.append(x[k])
         todo = [k for k in todo if not result[k].verified]
@@ -141,7 +141,7 @@ def pareto_front(
         there = result[through]
         if sample.feasible and not there.bandwidth >= sample.bandwidth:
             promised = float(processes[0].predict(own[None, :])[0])
-            result[through] = _point(problem, sample, promised, tolerance)
+            result[through] = front_point(problem, sample, promised, tolerance)
     for k in range(1, points):
         lighter = [result[i] for i in range(k) if result[i].bandwidth > result[k].bandwidth]
         if lighter:
@@ -150,7 +150,7 @@ def pareto_front(
     kept = sorted(result.values(), key=lambda point: point.hardware_cost)
     while trades and len(kept) > 1 and not kept[-1].bandwidth >= kept[-2].bandwidth:
         kept.pop()  # the fastest design is not there
-    return Front(_efficient(kept), rounds, sampler.syntheses)
+    return Front(efficient(kept), rounds, sampler.syntheses)
 
 
 def _move_ends(
@@ -166,7 +166,7 @@ def _move_ends(
     if not {0, last} & set(todo):
         return
     try:
-        ends, _ = _ends(program, problem, starts)
+        ends, _ = ends_of(program, problem, starts)
     except UserError:
         return
     for k, end in ((0, ends[0]), (last, ends[1])):
@@ -194,14 +194,14 @@ def _solve_again(
     sample = sampler.bandwidths(x[:-2], "from a lighter point")[0]
     if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
         promised = float(processes[0].predict(x[None, :])[0])
-        result[k] = _point(problem, sample, promised, tolerance)
+        result[k] = front_point(problem, sample, promised, tolerance)
 
 
 def _program(problem: CoDesignProblem, processes: tuple[GaussianProcess, ...]) -> NonlinearProgram:
     return lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
 
 
-def _walk(
+def walk(
     program: NonlinearProgram,
     problem: CoDesignProblem,
     costs: Array,
@@ -229,7 +229,7 @@ def _at_cost(program: NonlinearProgram, problem: CoDesignProblem, cost: float) -
     return replace(program, g=ca.vertcat(program.g, f / cost - 1.0), g_lower=lower)
 
 
-def _ends(
+def ends_of(
     program: NonlinearProgram, problem: CoDesignProblem, starts: Array
 ) -> tuple[list[Array], bool]:
     """The lightest and the fastest predicted feasible design; where these are one, the heaviest.
@@ -245,14 +245,16 @@ def _ends(
     except OuterFailure as error:
         words = "no design in the box is predicted to meet the constraints; widen the bounds"
         raise UserError(f"no trade-off: {words} ({error})") from None
-    costs = [hardware_cost(plant_of(problem), x[:-2]) for x in (light, fast, heavy)]
+    count = len(problem.names)
+    costs = [hardware_cost(plant_of(problem), x[:count]) for x in (light, fast, heavy)]
     trades = costs[1] - costs[0] > DOMINATED * (costs[2] - costs[0])
     return [light, fast if trades else heavy], trades
 
 
-def _point(
+def front_point(
     problem: CoDesignProblem, sample: BandwidthSample, predicted: float, tolerance: float
 ) -> FrontPoint:
+    """A true inner problem as a point of the front, and whether it was predicted."""
     error = abs(predicted / sample.bandwidth - 1.0)
     reason = ""
     if not sample.feasible:
@@ -272,7 +274,7 @@ def _point(
     )
 
 
-def _efficient(points: Sequence[FrontPoint]) -> tuple[FrontPoint, ...]:
+def efficient(points: Sequence[FrontPoint]) -> tuple[FrontPoint, ...]:
     """Mark what no other feasible point beats in cost or bandwidth without losing in the other."""
 
     def beaten(point: FrontPoint) -> bool:

@@ -1,7 +1,8 @@
 """The truth of a run folder as `surrogates.retrain` asks for it (entry point "ccd_casadi").
 
 Lifted (and direct): x = (θ, ln ω_S, ln ω_T), y = (ω_b, ln‖S‖∞, ln σ_max(S(jω_low))) with gradients.
-Nested: x = θ, y = ω_b*(θ).
+Nested: x = θ, y = ω_b*(θ). A controller of fixed structure: the same, with gradients where lifted,
+and by the anchors and the plant set that the run ended with.
 """
 
 import json
@@ -17,11 +18,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.run import conclude, rescue, write_run
+from ccd_casadi.codesign.run import conclude, rescue, solution_of_sections, write_run
+from ccd_casadi.codesign.sections_run import conclude_sections, seeded_and_prepared
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -57,14 +60,13 @@ def open_run(
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
-        if problem.sections is not None:
-            words = "retraining is for mixed sensitivity so far; solve goes on from its samples"
-            raise UserError(f"{folder / 'case.toml'}: controller.structure: {words}")
         formulation = _formulation(folder)
         with (
             pool(scheduler, workers, PATIENCE) as evaluators,
             SampleStore(folder / "samples.sqlite") as store,
         ):
+            if problem.sections is not None:
+                problem = _function_of(folder, problem, store, seed, quiet)
             sampler = Sampler(problem, store, evaluators, quiet=quiet)
             yield CoDesignTruth(folder, case, sampler, formulation, write_page, tolerance, seed)
 
@@ -85,8 +87,9 @@ class CoDesignTruth:
         problem = sampler.problem
         self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
         self.write_page = write_page
-        self.nested = formulation == "nested"
-        self.formulation = "nested" if self.nested else "lifted"
+        self.formulation = "nested" if formulation == "nested" else "lifted"
+        self.structured = problem.sections is not None
+        self.nested = self.structured or formulation == "nested"  # x = θ
         self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
         self.outputs = OUTPUTS[:1] if self.nested else OUTPUTS
         self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
@@ -133,13 +136,24 @@ class CoDesignTruth:
             outcome = replace(outcome, message=words)
             if not words:
                 outcome = rescue(self.sampler, outcome, self.seed)
-        solution = conclude(
-            self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
-        )
+        if self.structured:
+            found = conclude_sections(self.sampler, outcome)
+            solution = solution_of_sections(
+                self.sampler.problem, self.formulation, found, self.tolerance, self.seed,
+                perf_counter() - began, self.sampler.quiet,
+            )  # fmt: skip
+        else:
+            solution = conclude(
+                self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
+            )
         result = solution.result
-        verified = solution.verified
         result["syntheses"] = self.spent
-        result["retraining"] = mark | {"x": None if verified is None else verified.x.tolist()}
+        end: Array | None = None
+        if solution.verified is not None:
+            end = solution.verified.x
+        elif solution.sections is not None:
+            end = np.array(solution.sections.theta)
+        result["retraining"] = mark | {"x": None if end is None else end.tolist()}
         write_run(self.folder, self.case, solution)
         self.write_page(self.folder, self.case, self.sampler.problem, solution)
         return str(result["status"])
@@ -156,6 +170,8 @@ class CoDesignTruth:
     def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
         """Where to verify: x with its break frequencies, or the verified design that is by it."""
         problem = self.sampler.problem
+        if self.structured:
+            return x
         if self.nested:
             inner = self.sampler.bandwidths(x, "verifying")[0]
             if not inner.feasible:
@@ -178,8 +194,25 @@ class CoDesignTruth:
         return Observations(X, Y, dY)
 
     def _bandwidths(self, samples: list[BandwidthSample]) -> Observations:
-        X = np.array([s.theta for s in samples]).reshape(-1, len(self.lower))
-        return Observations(X, np.array([[s.bandwidth] for s in samples]).reshape(-1, 1))
+        d = len(self.lower)
+        X = np.array([s.theta for s in samples]).reshape(-1, d)
+        Y = np.array([[s.bandwidth] for s in samples]).reshape(-1, 1)
+        if self.formulation == "nested":
+            return Observations(X, Y)
+        dY = np.array([s.gradient for s in samples]).reshape(-1, 1, d)
+        return Observations(X, Y, dY)
+
+
+def _function_of(
+    folder: Path, problem: CoDesignProblem, store: SampleStore, seed: int, quiet: bool
+) -> CoDesignProblem:
+    """The problem with the run's anchors and plant set, or where it has none those of a race."""
+    path = folder / "result.json"
+    if path.exists():
+        found = with_function(path, problem, read_json(path))
+        if found.sections is not None and found.sections.anchors:
+            return found
+    return seeded_and_prepared(store, problem, seed, quiet)[0]
 
 
 def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.Function]:

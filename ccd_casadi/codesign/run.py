@@ -16,6 +16,7 @@ from ccd_casadi.codesign.box_look import BoxLook, look_over_box, perturbed
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.full_order import full_order_beside
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
@@ -27,8 +28,8 @@ from ccd_casadi.codesign.result import (
     result_dict,
     write_json,
 )
-from ccd_casadi.codesign.sections_result import sections_controller, sections_result
-from ccd_casadi.codesign.sections_run import run_sections
+from ccd_casadi.codesign.sections_result import beside_dict, sections_controller, sections_result
+from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
@@ -211,16 +212,34 @@ def _of_sections(
         raise UserError("--surrogate: starts no solve with sections; solve the case without it")
     began, name = perf_counter(), type(formulation).__name__.lower()
     found = run_sections(sampler, formulation, seed)
-    spent: dict[str, Any] = {
-        "syntheses": found.syntheses, "seconds": perf_counter() - began, "seed": seed,
-    }  # fmt: skip
+    return solution_of_sections(
+        sampler.problem, name, found, formulation.tolerance, seed, perf_counter() - began,
+        sampler.quiet,
+    )  # fmt: skip
+
+
+def solution_of_sections(
+    problem: CoDesignProblem,
+    name: str,
+    found: SectionsRun,
+    tolerance: float,
+    seed: int,
+    seconds: float,
+    quiet: bool = True,
+) -> Solution:
+    """result.json and the objects behind it."""
+    spent: dict[str, Any] = {"syntheses": found.syntheses, "seconds": seconds, "seed": seed}
     if found.verified is None:
         return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
     result = sections_result(
-        sampler.problem, name, found.outcome, found.verified, tolerance=formulation.tolerance,
-        **spent,
-    )  # fmt: skip
-    theta = np.array(found.verified.theta)
+        problem, name, found.outcome, found.verified, tolerance=tolerance, **spent
+    )
+    verified = found.verified
+    with Progress(1, "full order beside it", quiet=quiet) as bar:
+        beside = full_order_beside(verified.problem, verified.theta, verified.design)
+        bar.advance()
+    result["full_order"] = beside_dict(beside)
+    theta = np.array(verified.theta)
     quality = surrogate_quality(found.outcome.surrogates, theta, seed)
     result["surrogate_quality"] = clean(quality_dict(quality))
     return Solution(result, found.outcome, None, quality, sections=found.verified)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.full_order import Beside, FullOrder
 from ccd_casadi.codesign.result import (
     clean,
     controller_dict,
@@ -165,6 +166,7 @@ def sections_result(
             for value, count in verified.raced.optima
         ],
         "rounds": verified.rounds,
+        "anchors": [list(kappa) for kappa in sections_of_problem(verified.problem).anchors],
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
         "robust": wide_dict(problem, verified),
@@ -176,6 +178,28 @@ def sections_result(
         "versions": versions(),
     }
     return clean(result)
+
+
+def beside_dict(beside: Beside) -> dict[str, Any]:
+    """`full_order`: what mixed sensitivity reaches beside the sections, and the stacked norm."""
+
+    def one(found: FullOrder | None) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        return {"bandwidth_hz": found.bandwidth / HZ} | {
+            key: value for key, value in vars(found).items() if key != "bandwidth"
+        }
+
+    return clean(
+        {
+            "on_model": one(beside.on_model),
+            "on_set": one(beside.on_set),
+            "sections_on_model_hz": beside.sections_on_model / HZ,
+            "sections_continuous_hz": beside.sections_continuous / HZ,
+            "stacked_norm": beside.stacked_norm,
+            "gamma_opt": beside.gamma_opt,
+        }
+    )
 
 
 def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:

@@ -37,9 +37,11 @@ from ccd_casadi.inner_problem.sections_bandwidth import (
     with_range,
     worst_members,
 )
+from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.support.arrays import Array
 
 AGAIN = 3  # times that the outer problem is solved at most
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
@@ -92,8 +94,7 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     """Sections' co-design on the sampler's store and workers."""
     quiet = sampler.quiet
     spent = 0
-    problem = _seeded(sampler.problem, seed)
-    problem, first = _prepared(sampler.store, problem, quiet)
+    problem, first = seeded_and_prepared(sampler.store, sampler.problem, seed, quiet)
     spent += 1
     rounds = 0
     while True:
@@ -106,39 +107,63 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
             return SectionsRun(outcome, None, spent + asked.syntheses)
-        best, _ = polish_sections(asked, outcome.x[: len(problem.names)])
-        value = sections_value(problem, best.theta)
-        raced = _raced(sampler.store, problem, best.theta, quiet)
-        better = raced.certified and raced.bandwidth > value.design.bandwidth * (1.0 + BETTER)
-        worst, members = worst_members(
-            problem, best.theta, value.design, 0, _teller("at the end", quiet)
-        )
+        end = _end(asked, outcome.x[: len(problem.names)])
         spent += 1
-        gap = 0.0
-        if raced.certified:
-            gap = raced.bandwidth / value.design.bandwidth - 1.0
-        if not (better or members) or rounds == AGAIN:
+        if not (end.better or end.members) or rounds == AGAIN:
             break
         spent += asked.syntheses
-        kappa = np.array(raced.kappa) if better else value.design.kappa
-        problem = joined(problem, kappa, members)
-    verified = _verified(asked, outcome, best, value.design, raced, gap, worst, rounds)
+        kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
+        problem = joined(problem, kappa, end.members)
     sampler.trace.extend(asked.trace)
-    return SectionsRun(outcome, verified, spent + asked.syntheses)
+    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent + asked.syntheses)
+
+
+def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:
+    """Polish, race and judge the θ that an outcome ends at, on the sampler's anchors and set."""
+    if outcome.x is None:
+        words = "" if sampler.nearest is None else sampler.nearest.shortfall
+        outcome = replace(outcome, message=outcome.message or words)
+        return SectionsRun(outcome, None, sampler.syntheses)
+    end = _end(sampler, outcome.x[: len(sampler.problem.names)])
+    return SectionsRun(outcome, _verified(sampler, outcome, end, 1), sampler.syntheses + 1)
+
+
+@dataclass(frozen=True)
+class _End:
+    """The polished θ with its design, a race there, the worst plant, and those to add."""
+
+    best: BandwidthSample
+    design: SectionsDesign
+    raced: Raced
+    worst: Excess
+    members: tuple[Member, ...]
+
+    @property
+    def gap(self) -> float:
+        """By how much (relative) the race beats the design."""
+        return self.raced.bandwidth / self.design.bandwidth - 1.0 if self.raced.certified else 0.0
+
+    @property
+    def better(self) -> bool:
+        """Whether that is worth another round."""
+        return self.gap > BETTER
+
+
+def _end(asked: Sampler, theta: Array) -> _End:
+    problem, quiet = asked.problem, asked.quiet
+    best, _ = polish_sections(asked, theta)
+    design = sections_value(problem, best.theta).design
+    raced = _raced(asked.store, problem, best.theta, quiet)
+    worst, members = worst_members(problem, best.theta, design, 0, _teller("at the end", quiet))
+    return _End(best, design, raced, worst, members)
 
 
 def _verified(
-    asked: Sampler,
-    outcome: FormulationResult,
-    best: BandwidthSample,
-    made: SectionsDesign,
-    raced: Raced,
-    gap: float,
-    worst: Excess,
-    rounds: int,
+    asked: Sampler, outcome: FormulationResult, end: _End, rounds: int
 ) -> VerifiedSections:
-    problem = asked.problem
+    problem, best, made = asked.problem, end.best, end.design
     assert made.controller is not None
+    worst = end.worst
     wide, checked = judged_widely(problem, best.theta, made.controller, worst)
     predicted = best.bandwidth
     if outcome.surrogates:
@@ -150,8 +175,8 @@ def _verified(
         objective=objective(problem, best),
         hardware_cost=hardware_cost(plant_of(problem), best.theta),
         kkt=sections_kkt(problem, best, TrueBandwidth(asked, "certificate")),
-        race_gap=float(max(gap, 0.0)),
-        raced=raced,
+        race_gap=float(max(end.gap, 0.0)),
+        raced=end.raced,
         wide=wide,
         checked=checked,
         worst=worst,
@@ -178,10 +203,14 @@ def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
     return with_range(replace(problem, sections=replace(sections_of_problem(problem), seed=seed)))
 
 
-def _prepared(
-    store: SampleStore, problem: CoDesignProblem, quiet: bool
+def seeded_and_prepared(
+    store: SampleStore, problem: CoDesignProblem, seed: int, quiet: bool
 ) -> tuple[CoDesignProblem, str]:
-    """Anchors and members, from the store where an earlier run has found them."""
+    """Anchors and members, from the store where an earlier run has found them.
+
+    Second, in words, why there are no anchors; empty where there are.
+    """
+    problem = _seeded(problem, seed)
     key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:

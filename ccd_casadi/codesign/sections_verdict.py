@@ -32,7 +32,8 @@ def _certified(verified: VerifiedSections, constraints: bool) -> Line:
     if not constraints:
         return Line(State.FAILED, "certified, but a constraint on theta is not met", figures)
     count = 0 if made.certificate is None else len(made.certificate.plants)
-    words = f"stable and within every bound on the {count} plants that it was designed on"
+    where = "the model" if count == 1 else f"the {count} plants"
+    words = f"stable and within every bound on {where} that it was designed on"
     return Line(State.PASSED, words, figures)
 
 

@@ -15,6 +15,9 @@ What the paper leaves open, and what is done here: θ is scaled to the unit box;
 -∇J/‖∇J‖∞ with length α, projected on the bounds; α is halved when the step does not improve J,
 and the descent ends when α falls under `smallest_step` of the box, when the projected gradient
 vanishes, or after `max_iterations`. The synthesis, its certificate, S_max and the case are ours.
+
+With a controller of fixed structure nothing is swept: ω_b*(θ) is that of the problem's anchors, and
+its envelope gradient the only one there is.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +27,9 @@ from enum import StrEnum
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import evaluate
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
@@ -48,12 +53,16 @@ class Stop(StrEnum):
     SMALL_STEP = "no step down to the smallest improves J"
     STATIONARY = "the projected gradient vanishes"
     ITERATIONS = "the iteration limit"
-    INFEASIBLE = "no swept design meets S_max and S_low at the start"
+    INFEASIBLE = "no design meets the bounds at the start"
+    NO_GRADIENT = "the controller there is not optimal enough to have a gradient"
 
 
 @dataclass(frozen=True)
 class DescentIterate:
-    """One accepted point: θ, swept optimum (rad/s), J, ∂J/∂θ in the unit box, α, cost so far."""
+    """One accepted point: θ, swept optimum (rad/s), J, ∂J/∂θ in the unit box, α, cost so far.
+
+    ω_S and ω_T are NaN where the controller is of fixed structure.
+    """
 
     theta: tuple[float, ...]
     omega_S: float
@@ -73,7 +82,7 @@ class Descent:
     start: tuple[float, ...]
     first_step: float
     iterates: tuple[DescentIterate, ...]
-    design: Sensitivities | None
+    design: Sensitivities | SectionsDesign | None
     stop: Stop
     syntheses: int
     seconds: float = 0.0
@@ -82,6 +91,19 @@ class Descent:
     def objective(self) -> float:
         """J at the end; infinite where no feasible start was found."""
         return self.iterates[-1].objective if self.iterates else np.inf
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """ω_b (rad/s) of the best design at a θ, dω_b/dθ, and its (ω_S, ω_T), NaN where it has none."""
+
+    design: Sensitivities | SectionsDesign
+    bandwidth: float
+    slope: Array
+    frequencies: tuple[float, float] = (np.nan, np.nan)
+
+
+_Ask = Callable[[Array, tuple[float, float] | None], tuple[_Answer | None, int]]
 
 
 def steepest_descent(
@@ -93,50 +115,81 @@ def steepest_descent(
     smallest_step: float = 1e-3,
     max_iterations: int = 100,
 ) -> Descent:
-    """Descend from `start`; steps are shares of the box of θ."""
+    """Descend from `start`; steps are shares of the box of θ. Sections have a total gradient."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     width = upper - lower
     slope = _cost_gradient(problem)
     spent = 0
 
-    def swept(theta: Array, around: tuple[float, float] | None) -> Sensitivities | None:
+    ask = _swept(problem, gradient) if problem.sections is None else _structured(problem)
+
+    def asked(theta: Array, around: tuple[float, float] | None) -> _Answer | None:
         nonlocal spent
-        found, used = _sweep(problem, theta, around)
+        found, used = ask(theta, around)
         spent += used
         return found
 
     theta = np.array(start, float)
-    design = swept(theta, None)
-    if design is None:
+    answer = asked(theta, None)
+    if answer is None:
         return Descent(gradient, tuple(start), first_step, (), None, Stop.INFEASIBLE, spent)
     step, history = first_step, []
     stop = Stop.ITERATIONS
     for _ in range(max_iterations):
-        bandwidth_slope = (
-            design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
-        )
-        g = (problem.w1 * slope(theta) + problem.w2 * bandwidth_slope) * width
-        history.append(_iterate(problem, theta, design, g, step, spent))
+        g = (problem.w1 * slope(theta) + problem.w2 * answer.slope) * width
+        history.append(_iterate(problem, theta, answer, g, step, spent))
+        if not np.isfinite(g).all():
+            stop = Stop.NO_GRADIENT
+            break
         blocked = ((theta <= lower) & (g > 0.0)) | ((theta >= upper) & (g < 0.0))
         direction = np.where(blocked, 0.0, -g)
         size = float(np.abs(direction).max())
         if size <= 1e-9 * max(float(np.abs(g).max()), 1e-300):
             stop = Stop.STATIONARY
             break
-        figures = design.figures
         accepted = None
         while step >= smallest_step:
             trial = np.clip(theta + step * direction / size * width, lower, upper)
-            found = swept(trial, (figures.omega_S, figures.omega_T))
-            if found is not None and _objective(problem, trial, found) < history[-1].objective:
+            found = asked(trial, answer.frequencies)
+            if (
+                found is not None
+                and _objective(problem, trial, found.bandwidth) < history[-1].objective
+            ):
                 accepted = trial, found
                 break
             step *= 0.5
         if accepted is None:
             stop = Stop.SMALL_STEP
             break
-        theta, design = accepted
-    return Descent(gradient, tuple(start), first_step, tuple(history), design, stop, spent)
+        theta, answer = accepted
+    return Descent(gradient, tuple(start), first_step, tuple(history), answer.design, stop, spent)
+
+
+def _structured(problem: CoDesignProblem) -> _Ask:
+    """ω_b*(θ) of a fixed structure; climbs and races are what it spends."""
+
+    def ask(theta: Array, _: tuple[float, float] | None) -> tuple[_Answer | None, int]:
+        value = sections_value(problem, theta.tolist())
+        if not value.feasible:
+            return None, value.syntheses
+        return _Answer(value.design, value.bandwidth, np.array(value.gradient)), value.syntheses
+
+    return ask
+
+
+def _swept(problem: CoDesignProblem, gradient: Gradient) -> _Ask:
+    """The paper's sweep of (ω_S, ω_T), with the gradient that is asked for."""
+
+    def ask(theta: Array, around: tuple[float, float] | None) -> tuple[_Answer | None, int]:
+        design, spent = _sweep(problem, theta, around)
+        if design is None:
+            return None, spent
+        figures = design.figures
+        slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
+        frequencies = (figures.omega_S, figures.omega_T)
+        return _Answer(design, figures.bandwidth, np.asarray(slope, float), frequencies), spent
+
+    return ask
 
 
 def _sweep(
@@ -178,26 +231,24 @@ def _cost_gradient(problem: CoDesignProblem) -> Callable[[Array], Array]:
     return lambda theta: np.array(function(theta)).ravel()
 
 
-def _objective(problem: CoDesignProblem, theta: Array, design: Sensitivities) -> float:
-    cost = hardware_cost(plant_of(problem), theta)
-    return problem.w1 * cost + problem.w2 * design.figures.bandwidth
+def _objective(problem: CoDesignProblem, theta: Array, bandwidth: float) -> float:
+    return problem.w1 * hardware_cost(plant_of(problem), theta) + problem.w2 * bandwidth
 
 
 def _iterate(
     problem: CoDesignProblem,
     theta: Array,
-    design: Sensitivities,
+    answer: _Answer,
     gradient: Array,
     step: float,
     spent: int,
 ) -> DescentIterate:
-    figures = design.figures
     return DescentIterate(
         theta=tuple(float(v) for v in theta),
-        omega_S=figures.omega_S,
-        omega_T=figures.omega_T,
-        bandwidth=figures.bandwidth,
-        objective=_objective(problem, theta, design),
+        omega_S=answer.frequencies[0],
+        omega_T=answer.frequencies[1],
+        bandwidth=answer.bandwidth,
+        objective=_objective(problem, theta, answer.bandwidth),
         gradient=tuple(float(v) for v in gradient),
         step=step,
         syntheses=spent,

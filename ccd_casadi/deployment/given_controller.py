@@ -21,12 +21,14 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
+from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
+from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -78,6 +80,36 @@ class Sampled:
         """G behind hold and delay, and K."""
         held = sampled_plant(plant.plant_si(), self.period, self.delay)
         return held.response(omega), self.system.response(omega)
+
+    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
+        """Errors and forces from rest, plant and controller advanced one after the other."""
+        G, K = sampled_plant(plant.plant_si(), self.period, self.delay), self.system
+        x, z = np.zeros(len(G.A)), np.zeros(len(K.A))
+        errors, inputs = np.empty_like(references), np.empty_like(forces)
+        for k, (r, ahead) in enumerate(zip(references, forces, strict=True)):
+            errors[k] = e = r - G.C @ x
+            inputs[k] = u = K.C @ z + K.D @ e + ahead
+            z = K.A @ z + K.B @ e
+            x = G.A @ x + G.B @ u
+        return errors, inputs
+
+
+def as_it_runs(run: FinishedRun) -> FinishedRun:
+    """A run whose case has a sampled loop with its controller as it runs there, by Tustin's rule.
+
+    Other runs as they are. `figures` then has ω_b and ‖S‖∞ of the sampled loop.
+    """
+    sections = run.problem.sections
+    if sections is None or sections.sampling is None:
+        return run
+    period, delay = sections.sampling.period, sections.sampling.delay
+    tustin = Conversion(Discretisation.TUSTIN, False, run.figures.sensitivity_peak_frequency)
+    system = discretise(run.controller, tustin, period, delay)
+    sampled = Sampled(system, delay)
+    _, bandwidth, peak, _ = sampled.judge(run.plant)
+    figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
+    K = StateSpace(system.A, system.B, system.C, system.D)
+    return replace(run, controller=K, figures=figures, sampled=sampled)
 
 
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:

@@ -33,6 +33,7 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.published_figures import published_sections
+from ccd_casadi.reporting.sections_loops import compared_html
 from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
@@ -177,6 +178,13 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
         "A descent's syntheses are those of its best run; all runs are in compare.json."
     )
+    if problem.sections is not None:
+        words = (
+            "Each formulation ends with a polish and a KKT certificate on the true problem. A "
+            "synthesis is a climb from the anchors, or a race; the descent and the sequential "
+            "designs climb from the best formulation's anchors. Left out: the descent with K held "
+            "fixed and the landscape over the weights' frequencies, which sections do not have."
+        )
     return f'<div class="scroll">{table_html(Table(head, tuple(rows)))}</div>{paragraph(words)}'
 
 
@@ -190,6 +198,9 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
     problem = comparison.problem
     lifted = comparison.method("lifted")
     processes = () if lifted.solution is None else lifted.solution.outcome.surrogates
+    nested = comparison.method("nested").solution
+    if nested is not None and nested.sections is not None:  # its samples are of its own anchors
+        problem = nested.sections.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, processes, truths)
     walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
@@ -212,6 +223,16 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
 
 def _loops(comparison: Comparison, best: str) -> str:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
+    if comparison.problem.sections is not None:
+        shown = [(name, comparison.method(name)) for name in ("sequential", best)]
+        return compared_html(
+            comparison.problem,
+            {
+                LABELS[name]: (tuple(method.figures["theta"].values()), method.sections)
+                for name, method in shown
+                if method.sections is not None
+            },
+        )
     loops = [
         _loop(comparison.problem, comparison.method(name))
         for name in ("sequential", best)

@@ -7,13 +7,12 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import Loop
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
@@ -101,16 +100,17 @@ def table_front(problem: CoDesignProblem, front: Front) -> Table:
 def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
     """The parameters that the optimum answers to, per unit, in the units of the case file."""
     rows = []
-    lower, upper = lifted_bounds(problem)
+    swept = problem.sections is None
+    lower, upper = lifted_bounds(problem) if swept else box(problem)
     units = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     shown = [factor for _, factor in units]
     labels = [f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, units, strict=True)]
-    labels += ["ln ω_S", "ln ω_T"]
-    sizes = (upper - lower) * np.array([*shown, 1.0, 1.0])
+    labels += ["ln ω_S", "ln ω_T"] if swept else []
+    sizes = (upper - lower) * np.array([*shown, 1.0, 1.0] if swept else shown)
     for item in found.responses:
         name, value, factor, unit = _unit(problem, item.parameter, item.value)
         moved = [abs(item.objective), *np.abs(item.theta), *np.abs(item.ln_omega)]
-        if not np.nanmax(moved) > 0.0:
+        if not max((v for v in moved if np.isfinite(v)), default=0.0) > 0.0:
             continue
         moves = (*(f * v for f, v in zip(shown, item.theta, strict=True)), *item.ln_omega)
         theta = ", ".join(
@@ -125,10 +125,11 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
                 item.objective / factor,
                 item.bandwidth / HZ / factor,
                 item.hardware_cost / factor,
-                theta or "does not move",
+                theta or ("does not move" if found.determined or swept else "–"),
             )
         )
-    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", "d(θ, ln ω)/dp")
+    moving = "d(θ, ln ω)/dp" if swept else "dθ/dp"
+    head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
     return Table(head, tuple(rows))
 
 
@@ -152,7 +153,8 @@ def response_sentences(found: PostOptimal) -> list[str]:
     if not found.determined:
         words.append(
             "The second-order conditions do not determine how the design moves (dependent "
-            "constraints, or no strict minimum), so only dJ*/dp is given."
+            "constraints, no strict minimum, or second derivatives that are not known), so only "
+            "dJ*/dp is given."
         )
     if found.weak:
         words.append(
@@ -161,12 +163,12 @@ def response_sentences(found: PostOptimal) -> list[str]:
     return words
 
 
-def rule_sentence(loop: Loop, natural_hz: Sequence[float]) -> str:
+def rule_sentence(bandwidth_hz: float, natural_hz: Sequence[float]) -> str:
     """The rule of thumb, first resonance 3 to 5 times the bandwidth, against what was achieved."""
     if not natural_hz:
         return "The plant has no flexible mode: the rule of thumb says nothing about it."
     first = min(natural_hz)
-    ratio = first / loop.bandwidth_hz
+    ratio = first / bandwidth_hz
     low, high = RULE
     verdict = (
         f"below the {low:g} to {high:g} that the rule of thumb asks for: the controller works "

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.insight import natural_hz
+from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
@@ -19,6 +19,7 @@ from ccd_casadi.reporting.insight import (
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
 from ccd_casadi.reporting.page import (
     Section,
+    escape,
     figure_html,
     header,
     number,
@@ -26,6 +27,7 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.reporting.sections_page import binding_words
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -41,17 +43,10 @@ def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostO
 
 def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
     """The page's text."""
-    problem, figures = run.problem, run.figures
-    bandwidth_hz = figures.bandwidth / HZ
+    problem = run.problem
+    bandwidth_hz = bandwidth_of(run) / HZ
     cost = float(run.result["hardware_cost"])
-    loop = loop_data(
-        run.plant,
-        run.controller,
-        run.weights,
-        gamma=figures.gamma,
-        bandwidth_hz=bandwidth_hz,
-        omega_low=problem.inner.omega_low,
-    )
+    rule = rule_sentence(bandwidth_hz, natural_hz(run))
     verified = sum(point.verified for point in front.points)
     whole = verified == len(front.points)
     title = f"Insight: {run.case.path.parent.name}"
@@ -62,15 +57,12 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
         f"{verified} of {len(front.points)} points of the front",
         f"around the design of {run.folder.name}/result.json",
         f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
-        f"of {number(cost)}. {rule_sentence(loop, natural_hz(run))}",
+        f"of {number(cost)}. {rule}",
         warned=worst(run.result) is not State.PASSED,
         verdict=verdict_html(run.result),
     )
     drawn = figure_front(problem, front, (cost, bandwidth_hz, "this run's design"))
     words = "\n".join(paragraph(text) for text in response_sentences(responses))
-    limits = "\n".join(
-        paragraph(text) for text in (*limit_sentences(loop), rule_sentence(loop, natural_hz(run)))
-    )
     sections = [
         Section(
             "Weight against bandwidth",
@@ -79,6 +71,28 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
         Section(
             "What the optimum answers to", words + table_html(table_responses(problem, responses))
         ),
-        Section("What limits the bandwidth", limits + table_html(table_limits(loop))),
+        Section("What limits the bandwidth", _limits(run, rule)),
     ]
     return page(title, sections, head)
+
+
+def _limits(run: FinishedRun, rule: str) -> str:
+    """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
+    if run.problem.sections is not None:
+        held = binding_words(run.problem, run.result)
+        without = (
+            "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "
+            "the bounds above."
+        )
+        items = "".join(f"<li>{escape(text)}</li>" for text in held)
+        return f"<ul>{items}</ul>" + paragraph(without) + paragraph(rule)
+    loop = loop_data(
+        run.plant,
+        run.controller,
+        run.weights,
+        gamma=run.figures.gamma,
+        bandwidth_hz=run.figures.bandwidth / HZ,
+        omega_low=run.problem.inner.omega_low,
+    )
+    limits = "\n".join(paragraph(text) for text in (*limit_sentences(loop), rule))
+    return limits + table_html(table_limits(loop))

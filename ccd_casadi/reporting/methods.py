@@ -130,15 +130,18 @@ def caption_histories(descent: Descent) -> str:
 
 def table_histories(problem: CoDesignProblem, descent: Descent) -> Table:
     """One row an iterate."""
-    head = ("iteration", *problem.names, "J", "bandwidth (Hz)", "ω_S (Hz)", "ω_T (Hz)", "syntheses")
+    swept = problem.sections is None
+    head = (
+        "iteration", *problem.names, "J", "bandwidth (Hz)",
+        *(("ω_S (Hz)", "ω_T (Hz)") if swept else ()), "syntheses",
+    )  # fmt: skip
     rows = tuple(
         (
             i,
             *item.theta,
             item.objective,
             item.bandwidth / HZ,
-            item.omega_S / HZ,
-            item.omega_T / HZ,
+            *((item.omega_S / HZ, item.omega_T / HZ) if swept else ()),
             item.syntheses,
         )
         for i, item in enumerate(descent.iterates)

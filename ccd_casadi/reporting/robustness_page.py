@@ -101,7 +101,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         step = f"{1e6 * run.sampled.period:.5g} µs"
         words.append(
             f"A controller in discrete time, a step every {step}, hold and "
-            "delay exact; noise, the structured singular value and moves are of continuous ones."
+            "delay exact at the instants; noise and the structured singular value are of "
+            "continuous ones."
         )
     return words
 

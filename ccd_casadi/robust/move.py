@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from ccd_casadi.cases.run_folder import SampledController
 from ccd_casadi.plants.modal import ModalPlant
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.setpoint import Setpoint
 from ccd_casadi.robust.signals import ClosedLoop
 from ccd_casadi.support.arrays import Array
@@ -57,6 +59,32 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
     wanted = np.eye(len(R))[axis]
     forces = np.linalg.pinv(R) @ wanted if R.size else np.zeros(modal.B.shape[1])
     return forces if np.allclose(R @ forces, wanted, rtol=0.0, atol=1e-6) else None
+
+
+def simulate_sampled(
+    sampled: SampledController, plant: ScaledPlant, profile: Setpoint, *, axis: int,
+    forces: Array | None, window: float, bandwidth_hz: float,
+) -> Move:  # fmt: skip
+    """The same of a controller in discrete time, hold and delay exact, at the instants.
+
+    Setpoint and feedforward are read at the instants too; between them nothing is said.
+    """
+    p, m = plant.C.shape[0], plant.B.shape[1]
+    ahead = np.zeros(m) if forces is None else forces
+    end, tail = profile.duration, TAIL / bandwidth_hz
+    for _ in range(DOUBLINGS):
+        count = int(np.ceil((end + tail) / sampled.period)) + 1
+        time = np.arange(count, dtype=float) * sampled.period
+        wanted = profile.at(time)
+        position, acceleration = wanted[0], wanted[2]
+        references = np.zeros((len(time), p))
+        references[:, axis] = position
+        errors, force = sampled.run(plant, references, np.outer(acceleration, ahead))
+        if np.abs(errors[-SEGMENT:, axis]).max() <= 0.5 * window:
+            break
+        tail *= 2.0
+    signals = (time, position, acceleration, errors[:, axis], force)
+    return _figures(signals, end, window, forces is not None)
 
 
 def simulate(
@@ -105,6 +133,14 @@ def simulate(
     force = (
         X[:, :n] @ loop.C_u.T + np.outer(X[:, n], loop.D_u[:, axis]) + np.outer(X[:, n + 2], ahead)
     )
+    return _figures((time, X[:, n], X[:, n + 2], error, force), end, window, forces is not None)
+
+
+def _figures(
+    signals: tuple[Array, Array, Array, Array, Array], end: float, window: float, feedforward: bool
+) -> Move:
+    """The move's figures of (time, position, acceleration, error, force); it ends at `end`."""
+    time, position, acceleration, error, force = signals
     outside = np.flatnonzero((np.abs(error) > window) & (time >= end))
     settling = 0.0 if not outside.size else float(time[outside[-1]] - end)
     if outside.size and outside[-1] == len(time) - 1:
@@ -119,11 +155,11 @@ def simulate(
 
     return Move(
         time=time,
-        position=X[:, n],
-        acceleration=X[:, n + 2],
+        position=position,
+        acceleration=acceleration,
         error=error,
         force=force,
-        feedforward=forces is not None,
+        feedforward=feedforward,
         duration=end,
         window=window,
         settling=settling,

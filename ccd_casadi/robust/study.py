@@ -8,10 +8,11 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.demands import Demands as Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins, sampled_margins
-from ccd_casadi.robust.move import Move, mass_feedforward, simulate
+from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.perturbed import (
     Judged,
     Line,
@@ -39,8 +40,8 @@ class Study:
     of the plant without its suspension, `moves` the move without and with feedforward.
 
     `structured` is None where no flexible mode is in the loop, and where the bound was not computed
-    within the `overrun` seconds that it was given. Of a controller in discrete time there are no
-    `noise`, no `structured` bound and no `moves`.
+    within the `overrun` seconds that it was given. Of a controller in discrete time there is no
+    `noise` and no `structured` bound.
     """
 
     demands: Demands
@@ -148,6 +149,8 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
     G, K = run.sampled.responses(run.plant, HZ * hz)
     at = run.sampled.responses(run.plant, np.array([run.figures.bandwidth]))[1][0]
+    profile = setpoint(d.limits)
+    free, moves = _moves(run, profile, d)
     return Study(
         demands=d,
         hz=hz,
@@ -161,9 +164,9 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
         box=worst_in_box(run, system, d.shift, d.damping, quiet),
         tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
         structured=None,
-        setpoint=setpoint(d.limits),
-        free=False,
-        moves=(),
+        setpoint=profile,
+        free=free,
+        moves=moves,
     )
 
 
@@ -171,20 +174,29 @@ def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[bool,
     """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
     released = replace(run.problem, suspension=Suspension(0.0, 0.0), robust=None)
     plants = ((True, scaled_plant(released, run.theta)), (False, run.plant))
-    loops = [(free, closed_loop(plant.plant_si(), run.controller)) for free, plant in plants]
-    stable = [item for item in loops if np.linalg.eigvals(item[1].A).real.max() < 0.0]
-    free, loop = stable[0]  # a run that could be read is stable on the suspended plant
+    # a run that could be read is stable on the suspended plant
+    free, plant = next(item for item in plants if not item[0] or _stable(run, item[1]))
     modal = modal_plant(system_of(run), released.suspension)
     ahead = mass_feedforward(modal, demands.axis)
     ways = (None,) if ahead is None else (None, ahead)
-    made = [
-        simulate(
-            loop, profile, axis=demands.axis, forces=forces, window=demands.window,
-            bandwidth_hz=run.figures.bandwidth / HZ,
-        )
-        for forces in ways
-    ]  # fmt: skip
+    hz, axis, window = run.figures.bandwidth / HZ, demands.axis, demands.window
+    made = []
+    for forces in ways:
+        if run.sampled is None:
+            loop = closed_loop(plant.plant_si(), run.controller)
+            made.append(simulate(loop, profile, axis=axis, forces=forces, window=window,
+                                 bandwidth_hz=hz))  # fmt: skip
+        else:
+            made.append(simulate_sampled(run.sampled, plant, profile, axis=axis, forces=forces,
+                                         window=window, bandwidth_hz=hz))  # fmt: skip
     return free, tuple(made)
+
+
+def _stable(run: FinishedRun, plant: ScaledPlant) -> bool:
+    if run.sampled is not None:
+        return run.sampled.judge(plant)[0]
+    loop = closed_loop(plant.plant_si(), run.controller)
+    return bool(np.linalg.eigvals(loop.A).real.max() < 0.0)
 
 
 def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:

@@ -1,0 +1,85 @@
+"""A controller of fixed structure for plants that exist: no θ, no case file, one call."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import design
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.design import Progress, SectionsDesign
+from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.synthesis.interchange import from_control, plant_from_control
+
+SLOWEST = 10.0  # ω₀ over ω_low/S_low, the bandwidth that S of slope one needs at least
+
+
+def synthesise_sections(
+    plants: Any,
+    structure: Structure,
+    bounds: Bounds,
+    *,
+    sampling: Sampling | None = None,
+    M_K: float | None = None,
+    starts: int = 24,
+    seed: int = 0,
+    initial: Sequence[Any] = (),
+    progress: Progress | None = None,
+) -> SectionsDesign:
+    """max ω_b over the parameters of a structure, with every bound on every plant of a set.
+
+        max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω_low)| <= S_low,
+                        |S(jω)| <= min(1, shape ω/ω_b)/√2 for ω <= ω_b,
+                        |W_KS KS|, |W_T T| <= weighted_level, |GS| <= compliance_max
+
+    `plants`: one or several, SISO, force (N) to displacement (m): `control.StateSpace`,
+    `control.TransferFunction`, or `ScaledPlant` as `scaled_plant` gives it. They have to be stable:
+    give a free mass the slow suspension that it has, if only of its cables. With `sampling` hold
+    and delay are exact. `M_K` (N/m) sets the scale of control systems; without it that of
+    `bounds.weights`, or where there are none ω₀ = 10 ω_low/S_low. `initial`: controllers, or
+    parameters κ of an earlier design, that race beside `starts` others.
+
+    The `outcome` says how it ended, `controller` is K(s) in SI (e = r - y to force). Raises
+    UserError for a system that is no continuous one, PlantError for one that cannot be a plant.
+
+    >>> import control
+    >>> import ccd_casadi as ccd
+    >>> plant = control.tf([1.0], [2.0, 12.0, 800.0])  # 2 kg on 800 N/m
+    >>> bounds = ccd.Bounds(S_max=1.8, S_low=0.1, omega_low=5.0, shape=1.1, compliance_max=1e-4)
+    >>> structure = ccd.Structure(lead=1, biquads=0, roll_off=1)
+    >>> light = control.tf([1.0], [1.8, 12.0, 800.0])
+    >>> sampling = ccd.Sampling(rate_hz=2000.0, delay_us=250.0)
+    >>> design = ccd.synthesise_sections([plant, light], structure, bounds, sampling=sampling,
+    ...                                  starts=4)
+    >>> design.certified, design.certificate.words
+    (True, 'stable and within every bound on 2 plants')
+    """
+    given = [plants] if not isinstance(plants, list | tuple) else list(plants)
+    scale = M_K if bounds.weights is None else bounds.weights.M_K
+    if M_K is not None and bounds.weights is not None and M_K != bounds.weights.M_K:
+        raise UserError(f"M_K is {M_K:g}, that of the weights {bounds.weights.M_K:g}; give one")
+    scaled = []
+    for system in given:
+        if not isinstance(system, ScaledPlant):
+            scale = _scale(system, bounds) if scale is None else scale
+            system = plant_from_control(system, scale)
+        scaled.append(system)
+    begun = [
+        item if isinstance(item, StateSpace | np.ndarray) else from_control(item)[0]
+        for item in initial
+    ]
+    return design.synthesise_sections(
+        scaled, structure, bounds, sampling=sampling, starts=starts, seed=seed, initial=begun,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _scale(system: Any, bounds: Bounds) -> float:
+    """M_K (N/m) that puts ω₀ a decade above the least bandwidth that the bounds ask for."""
+    space, _ = from_control(system)
+    inertial = float(np.linalg.norm(space.C @ space.A @ space.B, 2))
+    omega_0 = SLOWEST * bounds.omega_low / bounds.S_low
+    return omega_0**2 / inertial if inertial > 0.0 else 1.0

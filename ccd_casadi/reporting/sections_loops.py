@@ -1,0 +1,154 @@
+"""Figures of the loops that a controller of fixed structure closes on every plant of its set."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.reporting.force_step import force_step
+from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, figure_html, number
+from ccd_casadi.reporting.svg import BLUE, CYCLE, GREEN, GREY, ORANGE
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.sections_run import VerifiedSections
+
+POINTS = 700
+ROWS = 40  # of the tables
+SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
+STEPS = 200  # points of it
+
+
+@dataclass(frozen=True)
+class Loops:
+    """S, KS (N/m), T and L of every plant (rows) over Hz."""
+
+    hz: Array
+    S: np.ndarray
+    KS: np.ndarray
+    T: np.ndarray
+    L: np.ndarray
+
+
+def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Loops:
+    """The loops of all plants of the set at θ, hold and delay exact where they are sampled."""
+    sampling = sections_of_problem(problem).sampling
+    inside = problem_for(
+        plants_of(problem, theta),
+        made.structure,
+        bounds_of(problem),
+        sampling,
+        made.frequencies,
+    )
+    P = inside.plants
+    low = 0.2 * problem.inner.omega_low
+    high = 20.0 * float(np.abs(P.poles).max()) * P.omega_0
+    if sampling is not None:
+        high = min(high, 0.98 * np.pi / sampling.period)
+    near = np.abs(P.poles.imag) + np.abs(P.poles.real) * np.linspace(-12, 12, 97)[:, None, None]
+    omega = np.concatenate([np.geomspace(low, high, POINTS), near.ravel() * P.omega_0])
+    omega = np.unique(omega[(omega >= low) & (omega <= high)])
+    v = P.variable(omega / P.omega_0)
+    which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
+    kappa = in_problem_units(inside, made.kappa)
+    tau = float(np.log(made.bandwidth / P.omega_0))
+    found = evaluate(inside, kappa, tau, which, grid, order=0)
+    L = 1.0 / found.S - 1.0
+    return Loops(omega / HZ, found.S, found.K * P.force * found.S, 1.0 - found.S, L)
+
+
+def compared_html(
+    problem: CoDesignProblem, designs: Mapping[str, tuple[Sequence[float], SectionsDesign]]
+) -> str:
+    """|S| of several designs, each the largest on the plants of the set at its θ."""
+    found = {name: loops_of(problem, theta, made) for name, (theta, made) in designs.items()}
+    inner = problem.inner
+    curves, tables, words = [], [], []
+    for i, (name, loops) in enumerate(found.items()):
+        top, hz = np.abs(loops.S).max(axis=0), designs[name][1].bandwidth / HZ
+        curves.append(Curve(loops.hz, top, name, CYCLE[i % len(CYCLE)]))
+        words.append(f"{name}: ω_b = {hz:.2f} Hz, ‖S‖∞ = {top.max():.3f}")
+        rows = np.unique(np.linspace(0, len(top) - 1, ROWS).astype(int))
+        tables.append(Table((f"Hz, {name}", "|S| largest"), tuple(
+            (float(loops.hz[k]), float(top[k])) for k in rows)))  # fmt: skip
+    levels = (
+        Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
+        Level(2**-0.5, "-3 dB", colour=GREY),
+    )
+    panel = Panel("frequency (Hz)", "largest |S| (–)", tuple(curves), levels=levels, log_x=True,
+                  log_y=True, legend="lower right")  # fmt: skip
+    svg = figure_lines([[panel]], key="sections-compared", heights=(3.6,),
+                       title="Largest S on the plants of the set, several designs")  # fmt: skip
+    return figure_html(svg, f"The largest on the plants of the set. {'; '.join(words)}.", *tables)
+
+
+def gains_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops) -> str:
+    inner, bandwidth = problem.inner, verified.design.bandwidth / HZ
+    x = (float(loops.hz[0]), float(loops.hz[-1]))
+
+    def panel(label: str, gains: np.ndarray, levels: Sequence[Level]) -> Panel:
+        size = np.abs(gains)
+        band = Band(loops.hz, size.min(axis=0), size.max(axis=0), "all plants")
+        curve = Curve(loops.hz, size[0], "the model")
+        return Panel("frequency (Hz)", label, (curve,), (band,), levels=tuple(levels), log_x=True,
+                     log_y=True, x_range=x, legend="lower right")  # fmt: skip
+
+    at = Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz", True)
+    S = panel("|S| (–)", loops.S, (Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
+              Level(2**-0.5, "-3 dB", colour=GREY), at))  # fmt: skip
+    KS, T = panel("|KS| (N/m)", loops.KS, (at,)), panel("|T| (–)", loops.T, (at,))
+    svg = figure_lines([[S], [KS, T]], key="sections-loop", heights=(3.4, 2.6),
+                       title="S, KS and T of every plant of the set over frequency")  # fmt: skip
+    rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
+    table = Table(
+        ("Hz", "|S| model", "|S| least", "|S| largest", "|KS| largest N/m", "|T| largest"),
+        tuple(
+            (float(loops.hz[i]), float(abs(loops.S[0, i])), float(np.abs(loops.S[:, i]).min()),
+             float(np.abs(loops.S[:, i]).max()), float(np.abs(loops.KS[:, i]).max()),
+             float(np.abs(loops.T[:, i]).max()))
+            for i in sorted(set(rows))
+        ),
+    )  # fmt: skip
+    return figure_html(svg, f"The band spans {len(loops.S)} plants of the set.", table)
+
+
+def nyquist_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops) -> str:
+    S_max = problem.inner.S_max
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    disk = -1.0 + np.exp(1j * angle) / S_max
+    curves = [Curve(line.real, line.imag, colour=GREEN if i else BLUE, width=1.0 if i else 1.5)
+              for i, line in reversed(list(enumerate(loops.L)))]  # fmt: skip
+    curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
+    nyquist = Panel("Re L", "Im L", tuple(curves), x_range=(-3.0, 1.0), y_range=(-1.75, 1.75),
+                    legend="upper right")  # fmt: skip
+    certificate = verified.design.certificate
+    assert certificate is not None
+    assert verified.design.controller is not None
+    sampling = sections_of_problem(verified.problem).sampling
+    slow = min(-plant.stability for plant in certificate.plants)
+    if sampling is not None:
+        slow = -float(np.log1p(-slow)) / sampling.period
+    times = np.geomspace(0.02 / verified.design.bandwidth, SETTLED / slow, STEPS)
+    plants = plants_of(verified.problem, verified.theta)
+    steps = [force_step(p, verified.design.controller, sampling, times) for p in plants]
+    t = steps[0][0]
+    y = 1e6 * np.array([step[1] for step in steps])
+    step = Panel("time (ms)", "y after a step of 1 N (µm)", (Curve(1e3 * t, y[0], "the model"),),
+                 (Band(1e3 * t, y.min(axis=0), y.max(axis=0), "all plants"),), log_x=True,
+                 legend="upper left")  # fmt: skip
+    svg = figure_lines([[nyquist, step]], key="sections-nyquist", heights=(3.9,),
+                       title="Nyquist plot of every plant, and a step of force")  # fmt: skip
+    rows = np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
+    table = Table(("ms", "µm model", "µm least", "µm largest"), tuple(
+        (1e3 * float(t[i]), float(y[0, i]), float(y[:, i].min()), float(y[:, i].max()))
+        for i in rows))  # fmt: skip
+    words = "L = GK of every plant stays outside the disk of S_max around -1. "
+    return figure_html(svg, words + "The step of force acts at the actuator.", table)

@@ -1,0 +1,230 @@
+"""Every command on one run with a controller of fixed structure: a PID, sampled."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import problem
+
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.full_order import stacked_norm
+from ccd_casadi.codesign.sections_insight import sections_responses
+from ccd_casadi.compare import main as compare_main
+from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.deployment.given_controller import as_it_runs
+from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.inner import main as inner_main
+from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.insight import main as insight_main
+from ccd_casadi.robustness import main as robustness_main
+from ccd_casadi.sampling.sampler import BandwidthSample
+from ccd_casadi.solve import main as solve_main
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import synthesise
+from surrogates.retrain import main as retrain_main
+
+COMMON = ["--quiet", "--workers", "1"]
+
+QUICK = """
+[plant]
+model = "two_mass"
+[theta.m1]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[theta.m2]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[objective]
+w1 = 0.0995
+w2 = -0.9950
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 2e7
+A_l = 1.0
+A_u = 1e-2
+[inner]
+S_max = 1.75
+S_low = 0.2
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1800.0]
+omega_T_hz = [25.0, 1000.0]
+[controller]
+structure = "sections"
+biquads = 0
+weighted_level = 8.426
+starts = 4
+[loop]
+rate_hz = 8000.0
+delay_us = 80.0
+[sampling]
+points = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """quick.toml and its run; what a test writes goes elsewhere."""
+    place = tmp_path_factory.mktemp("sections")
+    (place / "quick.toml").write_text(QUICK)
+    assert solve_main([str(place / "quick.toml"), "--out", str(place / "run"), *COMMON]) == 0
+    return place
+
+
+def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
+    run = folder / "run"
+    result = json.loads((run / "result.json").read_text())
+    controller = json.loads((run / "controller.json").read_text())
+    assert controller["sections"]["loop"] == {
+        "rate_hz": 8000.0, "delay_us": 80.0, "method": "tustin"
+    }  # fmt: skip
+    assert len(controller["A"]) == result["controller"]["order"] == 4
+    page = (run / "report.html").read_text()
+    for words in ("Nyquist", "roll-off", "Full order beside it", "mass feedforward"):
+        assert words in page
+    beside = result["full_order"]
+    assert beside["stacked_norm"] >= beside["gamma_opt"] * (1.0 - 1e-6)
+    # more plants, or hold and delay, can only cost: the climbs start from the design itself
+    for easier in ("sections_on_model_hz", "sections_continuous_hz"):
+        assert beside[easier] >= result["bandwidth_hz"] * (1.0 - 1e-3)
+
+
+def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert inner_main([str(folder / "quick.toml"), "--theta", "m1=59,m2=59", *COMMON]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "verified"
+    assert answer["gamma_opt"] is None
+
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert deploy_main([str(folder / "run"), "--out", str(folder / "deploy"), *COMMON]) == 0
+    deployed = json.loads((folder / "deploy" / "deploy.json").read_text())
+    assert (deployed["rate_hz"], deployed["delay"]) == pytest.approx((8000.0, 8e-5))
+    assert deployed["sampled"]["bandwidth_hz"] >= result["bandwidth_hz"] * (1.0 - 1e-6)
+    assert deployed["sampled"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+
+
+def test_robustness_is_of_the_loop_as_it_runs(folder: Path) -> None:
+    """Of the sampled one, and as deploy has it."""
+    run, out = folder / "run", folder / "robustness"
+    assert robustness_main([str(run), "--samples", "3", "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "robustness.json").read_text())
+    assert found["period"] == pytest.approx(1.0 / 8000.0)
+    assert found["survives"]
+    assert found["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+    assert len(found["move"]["runs"]) == 2
+    without, ahead = found["move"]["runs"]
+    assert ahead["peak_error"] < without["peak_error"]
+    finished = read_run(run)
+    assert as_it_runs(finished).figures.bandwidth != finished.figures.bandwidth
+
+
+@pytest.mark.slow
+def test_insight_draws_the_front_of_the_runs_own_function(folder: Path) -> None:
+    out = folder / "insight"
+    assert insight_main([str(folder / "run"), "--points", "2", "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "insight.json").read_text())
+    result = json.loads((folder / "run" / "result.json").read_text())
+    points = found["front"]["points"]
+    assert all(point["status"] == "verified" for point in points)
+    fastest = max(point["bandwidth_hz"] for point in points)
+    assert fastest == pytest.approx(result["bandwidth_hz"], rel=1e-3)
+    assert "S_max" in (out / "insight.html").read_text()
+
+
+def test_responses_against_differences(folder: Path) -> None:
+    """dω_b*/dS_max, and dJ*/dp at a θ whose bounds hold it, by two other designs."""
+    run = read_run(folder / "run")
+    made = sections_value(run.problem, run.theta)
+    sample = BandwidthSample(
+        run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
+    )
+    found = sections_responses(run.problem, sample, made.design)
+    by_name = {item.parameter: item for item in found.responses}
+    h = 1e-3
+    ends = []
+    for sign in (1.0, -1.0):
+        inner = replace(run.problem.inner, S_max=run.problem.inner.S_max + sign * h)
+        ends.append(sections_value(replace(run.problem, inner=inner), run.theta).bandwidth)
+    slope = (ends[0] - ends[1]) / (2.0 * h)
+    assert found.determined
+    assert by_name["S_max"].bandwidth == pytest.approx(slope, rel=1e-3)
+    assert by_name["S_max"].objective == pytest.approx(run.problem.w2 * slope, rel=1e-3)
+    for name, value in zip(run.problem.names, run.theta, strict=True):
+        assert value == 60.0
+        i = run.problem.names.index(name)
+        J = run.problem.w1 + run.problem.w2 * made.gradient[i]
+        assert by_name[f"{name} upper"].objective == pytest.approx(J, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_retraining_goes_on_from_the_runs_samples(folder: Path) -> None:
+    out = folder / "retrained"
+    before = json.loads((folder / "run" / "result.json").read_text())
+    assert retrain_main([str(folder / "run"), "--out", str(out), "--budget", "6", *COMMON]) == 0
+    after = json.loads((out / "result.json").read_text())
+    assert after["status"] == "verified"
+    assert after["objective"] == pytest.approx(before["objective"], rel=1e-3)
+    assert after["anchors"] == before["anchors"]
+    assert "Nyquist" in (out / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_compare_sets_the_methods_side_by_side(folder: Path) -> None:
+    case = folder / "compared.toml"
+    case.write_text(QUICK + "[baseline]\nstarts = 1\nsteps = [0.1]\nfirst_resonance_hz = 150.0\n")
+    out = folder / "compared"
+    assert compare_main([str(case), "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "compare.json").read_text())
+    methods, best = found["methods"], found["conclusions"]["best_objective"]
+    assert "steepest_descent" not in methods
+    for name in ("nested", "lifted", "direct", "steepest_descent_total"):
+        assert methods[name]["status"] == "verified"
+        assert methods[name]["objective"] == pytest.approx(best, rel=1e-3)
+    assert methods["sequential"]["objective"] >= best
+    assert "Left out" in (out / "report.html").read_text()
+
+
+def test_no_structure_has_a_stacked_norm_below_gamma_opt() -> None:
+    """γ_opt is a bound for every stabilising controller; some at random, of order 6."""
+    rng, structure, case = np.random.default_rng(3), Structure(biquads=1), problem()
+    weights = case.weights.at(600.0 * HZ, 40.0 * HZ)
+    bounds = Bounds(S_max=2.0, S_low=0.1, omega_low=HZ)
+    for theta in ((55.0, 55.0), (70.0, 58.0)):
+        plant = scaled_plant(case, theta)
+        least = synthesise(plant, weights, omega_low=HZ).figures.gamma_opt
+        inside = problem_for([plant], structure, bounds)
+        draws = np.exp(rng.uniform(-3.0, -0.5, 40))
+        stable = kept(inside, at_random(inside, draws, rng))
+        assert len(stable) > 3
+        for kappa in stable:
+            K = state_space(structure, structure.in_units(kappa, plant.omega_0, plant.force))
+            assert stacked_norm(plant, K, weights) >= least * (1.0 - 1e-6)
+
+
+def test_a_changed_controller_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changed = folder / "changed"
+    shutil.copytree(folder / "run", changed)
+    controller = json.loads((changed / "controller.json").read_text())
+    controller["sections"]["kappa"][0] += 3.0  # 20 times the gain
+    (changed / "controller.json").write_text(json.dumps(controller))
+    assert deploy_main([str(changed), *COMMON]) == 2
+    assert "not certified" in capsys.readouterr().err
+    result = json.loads((changed / "result.json").read_text())
+    result["anchors"][0].append(0.0)
+    (changed / "result.json").write_text(json.dumps(result))
+    shutil.copy(folder / "run" / "controller.json", changed / "controller.json")
+    assert insight_main([str(changed), *COMMON]) == 2
+    assert "anchors" in capsys.readouterr().err
