@@ -43,10 +43,7 @@ WEIGHTS = Weights(
 BOUNDS = Bounds(
     S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=8.426, weights=WEIGHTS
 )
-COARSE = (33, 11, 11, 11)  # of a PID's grid over gain, integrator, zero and pole
-FINE = (9, 5, 5, 5)  # of the grids around its best point
-SHRINK = 0.6  # of these where they find nothing better
-FINEST = 1e-3  # in logarithms
+LEVELS = 11  # of the grids of a PID
 SAMPLED = Sampling(10000.0, 100.0)
 
 
@@ -134,27 +131,26 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
     """
     structure = Structure(True, 1, 0, 0)
     problem = problem_for([plant], structure, bounds)
+    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 5000)]))
+    v = v[(v >= problem.base[0]) & (v <= problem.base[-1])]
+    G, _ = problem.plants.responses(np.zeros(len(v), int), v)
     weights = bounds.weights or WEIGHTS
-
-    def over(count: int) -> tuple[np.ndarray, ...]:
-        """Frequencies, G, |W_KS| and |W_T| there."""
-        v = np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, count)])
-        v = np.unique(v[(v >= problem.base[0]) & (v <= problem.base[-1])])
-        G, _ = problem.plants.responses(np.zeros(len(v), int), v)
-        return v, G, *np.abs(weights.responses(v * plant.omega_0))[1:]
-
+    _, W_KS, W_T = np.abs(weights.responses(v * plant.omega_0))
     low = np.log(np.array([1e-2, 1e-3, 1e-2, 0.3]))
     high = np.log(np.array([1e1, 1.0, 3.0, 30.0]))
     at_low = np.array([bounds.omega_low / plant.omega_0])
     G_low, _ = problem.plants.responses(np.zeros(1, int), at_low)
-
-    def values(points: np.ndarray, there: tuple[np.ndarray, ...]) -> np.ndarray:
-        """ω_b over ω₀ of every point, interpolated between frequencies; -inf outside a bound."""
-        v, G, W_KS, W_T = there
-        found = np.full(len(points), -np.inf)
-        inside = np.flatnonzero(stable(closed_loops(problem.plants, structure, points)).all(1))
-        for some in np.array_split(inside, max(1, len(inside) // 500)):
-            part = points[some]
+    best, centre = -np.inf, 0.5 * (low + high)
+    width = 0.5 * (high - low)
+    for level in range(LEVELS):
+        counts = (21, 9, 9, 9) if level == 0 else (21, 7, 7, 7)
+        axes = [c + w * np.linspace(-1.0, 1.0, count)
+                for c, w, count in zip(centre, width, counts, strict=True)]  # fmt: skip
+        points = np.clip(np.array(list(itertools.product(*axes))), *problem.box)
+        for part in np.array_split(points, max(1, len(points) // 2000)):
+            part = part[stable(closed_loops(problem.plants, structure, part)).all(1)]
+            if not len(part):
+                continue
             K = response(structure, part.T[:, :, None], 1j * v[None])
             S = np.abs(1.0 / (1.0 + G * K))
             good = S.max(1) <= bounds.S_max
@@ -168,43 +164,13 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
             good &= np.abs(1.0 / (1.0 + G_low * K_low))[:, 0] <= bounds.S_low
             # ω_b: the last ω up to which room >= ω, room the least shape ω/(√2|S|) so far
             room = np.minimum.accumulate((bounds.shape or np.inf) * v / (np.sqrt(2.0) * S), axis=1)
-            spare = np.minimum(np.log(np.sqrt(0.5) / S), np.log(room / v))
-            fails = spare < 0.0
-            good &= fails.any(1) & ~fails[:, 0]
-            rows, after = np.arange(len(part)), np.maximum(np.argmax(fails, axis=1), 1)
-            a, b = spare[rows, after - 1], spare[rows, after]
-            x = np.log(v[after - 1]) + a / (a - b) * np.log(v[after] / v[after - 1])
-            found[some] = np.where(good, np.exp(x), -np.inf)
-        return found
-
-    def gridded(centre: np.ndarray, width: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
-        axes = [c + w * np.linspace(-1.0, 1.0, count)
-                for c, w, count in zip(centre, width, counts, strict=True)]  # fmt: skip
-        return np.clip(np.array(list(itertools.product(*axes))), *problem.box)
-
-    centre, width = 0.5 * (low + high), 0.5 * (high - low)
-    points, sparse = gridded(centre, width, COARSE), over(300)
-    coarse = values(points, sparse)
-    best, width = -np.inf, 2.0 * width / np.array(COARSE)
-    for level, there in enumerate((sparse, over(5000))):
-        if level == 0:
-            centre = points[int(np.argmax(coarse))]
-        size = width.copy() if level == 0 else 8.0 * FINEST * np.ones(4)
-        best = -np.inf  # sparse frequencies may have missed a peak
-        while size.max() > FINEST:
-            near = gridded(centre, size, FINE)
-            found = values(near, there)
-            k = int(np.argmax(found))
-            if not np.isfinite(found[k]):  # the sparse frequencies had missed a peak
-                size /= SHRINK
-                if size.max() > 2.0:
-                    return np.nan
-                continue
-            if found[k] > best:
-                centre = near[k]
-            if not found[k] > best * (1.0 + 1e-4):
-                size *= SHRINK
-            best = max(best, float(found[k]))
+            fine = (np.sqrt(0.5) >= S) & (room >= v)
+            last = np.where(fine.all(1), len(v) - 1, np.argmin(fine, axis=1) - 1)
+            value = np.where(good & (last >= 0), v[last], -np.inf)
+            k = int(np.argmax(value))
+            if value[k] > best:
+                best, centre = float(value[k]), part[k]
+        width *= 0.75 if level else 0.35
     if not np.isfinite(best):
         return np.nan
     kappa = structure.in_units(centre, plant.omega_0, plant.force)
