@@ -97,12 +97,28 @@ def rounding_error(frame, t, d1):
 
 
 @compiled
+def undecided(frame, t, f, slope, d1, gamma_jw):
+    """How far above γ_jω, relative, γ_X may yet lie where f > 0 at t, a hair above; 0: nowhere.
+
+    At γ_jω f begins like a square root, so that from t down to there it falls by no more than
+    twice what its tangent says; rounding moves it by as much as it moves a root.
+    """
+    size = 2.0 * (t + d1**2)
+    hair = (t - (gamma_jw**2 - d1**2)) / size
+    left = rounding_error(frame, t, d1)
+    if slope > 0.0 and f > slope * size * (left + 2.0 * hair):
+        return 0.0
+    return left + hair
+
+
+@compiled
 def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
     """γ_opt = max(γ_X, γ_jω) by safeguarded steps on f; at most 60 Schur forms.
 
     `guess` starts the iteration (0: none), `noise` is the level's. Returns γ_opt, whether γ_jω
     limits, the number of Schur forms, whether it closed to the relative `tolerance` in γ, and
-    the relative error that rounding and search may have left (infinite where it is not known).
+    the relative error that rounding and search may have left (infinite where it is not known),
+    γ_jω taken as exact: see `bound_error`.
     """
     # γ_jω itself puts eigenvalues on the axis: the test is made a hair above it.
     t_jw = max(gamma_jw**2 * (1 + 1e-7) - d1**2, 1e-12 * d1**2)
@@ -114,7 +130,8 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
         f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t, noise)
         if ok and f > 0.0:
             if t <= t_jw:
-                return gamma_jw, True, forms, True, tolerance
+                left = undecided(frame, t, f, slope, d1, gamma_jw)
+                return gamma_jw, True, forms, True, max(tolerance, left)
             t_high = min(t_high, t)
         else:
             t_low = max(t_low, t)
