@@ -54,6 +54,7 @@ _STYLE: Any = {
     "legend.framealpha": 0.9,
     "legend.edgecolor": "#dddddd",
     "legend.fancybox": False,
+    "axes.titley": 1.0,  # where it is by itself, but not measured to be placed
     "figure.facecolor": "none",
     "savefig.facecolor": "none",
 }
