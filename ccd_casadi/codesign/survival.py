@@ -12,6 +12,7 @@ The `robustness` command looks closer; this is what no verdict should be without
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -223,5 +224,4 @@ def _margins(loop: _Loop, controller: _ControllerResponse, omega: Array) -> list
         S = np.linalg.inv(np.eye(L.shape[1]) + L)
         return np.asarray(1.0 / S[:, i, i] - 1.0)
 
-    inputs = range(loop.B.shape[1])
-    return [classical_margins(lambda w, i=i: broken(i, w), omega) for i in inputs]
+    return [classical_margins(partial(broken, i), omega) for i in range(loop.B.shape[1])]

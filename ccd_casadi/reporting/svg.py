@@ -149,14 +149,15 @@ def _minor_ticks(axis: Any, low: float, high: float) -> None:
     from matplotlib.markers import TICKDOWN, TICKLEFT
     from matplotlib.ticker import LogLocator
 
-    values = LogLocator(subs="auto", numticks=12).tick_values(low, high)
+    values = np.asarray(LogLocator(subs="auto", numticks=12).tick_values(low, high))
     values = values[(values > low) & (values < high)]
     edge = np.zeros_like(values)
     horizontal = axis.axis_name == "x"
     axes = axis.axes
+    marker: Any = TICKDOWN if horizontal else TICKLEFT
     line = Line2D(
         values if horizontal else edge, edge if horizontal else values, linestyle="none",
-        marker=TICKDOWN if horizontal else TICKLEFT, markersize=2.0, markeredgewidth=0.4,
+        marker=marker, markersize=2.0, markeredgewidth=0.4,
         markeredgecolor="#000000", clip_on=False, zorder=2.01,
         transform=axes.get_xaxis_transform() if horizontal else axes.get_yaxis_transform(),
     )  # fmt: skip
