@@ -41,7 +41,7 @@ def classical_margins(
 
     >>> found = classical_margins(lambda w: 4.0 / (1j * w + 1.0) ** 3, np.geomspace(0.1, 10.0, 50))
     >>> round(found.gain_up, 9), round(found.crossover, 6), round(found.phase_deg, 4)
-    (2.0, 1.233203, 27.1353)
+    (2.0, 1.232819, 27.1416)
     """
     L = response(omega)
     real = response(_crossings(lambda w: response(w).imag, L.imag, omega)).real
