@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.progress import Progress
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -167,9 +166,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"run folder    {folder}")
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    with Progress(1, "drawing the report", quiet=options.quiet) as bar:
-        write_report(folder, resolved(case, solution), solution.problem or problem, solution)
-        bar.advance()
+    plant_case, solved = resolved(case, solution), solution.problem or problem
+    write_report(folder, plant_case, solved, solution, quiet=options.quiet)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code

@@ -41,7 +41,6 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.progress import Progress
 from surrogates import design, save
 from surrogates.files import write_whole
 
@@ -266,11 +265,7 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(sampler, outcome.x) if verified is None else verified
-    with Progress(
-        1, "judging the surrogates", quiet=sampler.quiet or not outcome.surrogates
-    ) as bar:
-        quality = surrogate_quality(outcome.surrogates, verified.x, seed)
-        bar.advance()
+    quality = surrogate_quality(outcome.surrogates, verified.x, seed, quiet=sampler.quiet)
     result = result_dict(
         sampler.problem,
         formulation,
