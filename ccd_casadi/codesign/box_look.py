@@ -32,7 +32,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
-LOCAL_STARTS = 8  # local solves at most
+POINTS_A_START = 4  # points looked at for every local solve: each costs as much as an inner problem
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
@@ -91,7 +91,7 @@ def look_over_box(
     values = np.array([_objective(problem, sample) for sample in feasible])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best = None, J
-    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))
+    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
     for sample in starts:
         begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
         end = descend(problem, quantities, begin)
@@ -241,7 +241,7 @@ def _starts(
         near = np.argsort(away)[1 : lower.size + 2]
         if np.abs(unit[i] - here).max() > SAME:
             (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
-    return (lowest + others)[:LOCAL_STARTS]
+    return lowest + others
 
 
 def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
