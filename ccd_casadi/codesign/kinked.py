@@ -26,7 +26,7 @@ INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is
 FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
 SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
-FLATTEST = 0.05  # the least it comes down to, where a shelf turns out to be straight
+FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
 SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
 
@@ -130,8 +130,8 @@ def _merit(point: _Point, rho: float) -> float:
 def _bend(here: _Point, there: _Point, bend: float) -> float:
     """How far a shelf may depart from its slope, ln per (share of the box)², after a step.
 
-    Twice what was seen, but at least half of what was feared before; four times that where a shelf
-    was passed.
+    Twice what was seen, but at least a quarter of what was feared before; four times what was feared
+    where a shelf was passed.
     """
     d = there.z - here.z
     size = float(np.abs(d).max())
@@ -143,7 +143,7 @@ def _bend(here: _Point, there: _Point, bend: float) -> float:
                 return min(4.0 * bend, SHELF)
             if same is not None:
                 seen.append(abs(there.g[same] - value - float(row @ d)) / size**2)
-    return max(0.5 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
+    return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
 
 
 def _step(
