@@ -48,11 +48,26 @@ def summary(solution: "Solution") -> str:
         f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
         f"binding       {', '.join(result['active']) or 'nothing'}",
+        *design_plant_lines(result.get("robust") or {}),
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
+    """Which plant of a robust set the controller is made on, and what came of the others."""
+    if "design_at" not in robust:
+        return []
+    others = [
+        f"{name}: {item['status'].replace('_', ' ')}"
+        + (f", J {item['objective']:.6g}" if item.get("objective") is not None else "")
+        for name, item in robust.get("tried", {}).items()
+        if name != robust["design_at"]
+    ]
+    beside = f" ({'; '.join(others)})" if others else ""
+    return [f"design plant  {robust['design_at']}{beside}"]
 
 
 def sections_summary(result: Mapping[str, Any]) -> str:

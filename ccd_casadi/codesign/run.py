@@ -45,6 +45,7 @@ from surrogates import design, save
 from surrogates.files import write_whole
 
 Formulation = Nested | Lifted | Direct
+MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -149,13 +150,17 @@ def _with_look(
         len(outcome.iterates) <= rounds
         and _prediction_error(outcome, verified) > formulation.tolerance
     ):
-        x = verified.x if look.x is None else look.x
-        outcome = _resumed(sampler, formulation, outcome, x, seed)
-        again = [verify(sampler, end) for end in _distinct(x, outcome.x)]
-        verified = _best([verified, *again], formulation.tolerance)
+        x, again = verified.x, formulation
+        if look.x is not None:
+            x = look.x
+            if not isinstance(formulation, Direct):
+                again = replace(formulation, max_refinements=min(rounds, MOVED_ROUNDS))
+        outcome = _resumed(sampler, again, outcome, x, seed)
+        ends = [verify(sampler, end) for end in _distinct(x, outcome.x)]
+        verified = _best([verified, *ends], formulation.tolerance)
     if verified.kkt.stationarity > KKT_LEVEL:
-        ends = perturbed(sampler, verified.x, seed)
-        verified = _best([verified, *(verify(sampler, end) for end in ends)], formulation.tolerance)
+        ends = [verify(sampler, end) for end in perturbed(sampler, verified.x, seed)]
+        verified = _best([verified, *ends], formulation.tolerance)
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
 
 
@@ -179,7 +184,7 @@ def _resumed(
             sampler, formulation, seed=seed, given=given, incumbent=new[0] if new else None
         )
     if found.x is None:
-        return replace(outcome, x=x)
+        return replace(outcome, x=x, surrogates=found.surrogates or outcome.surrogates)
     return replace(found, iterates=(*outcome.iterates, *found.iterates))
 
 
