@@ -235,7 +235,8 @@ def _starts(
     lower, upper = box(problem)
     unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
     here = (theta - lower) / (upper - lower)
-    lowest, others = [], []
+    lowest: list[BandwidthSample] = []
+    others: list[BandwidthSample] = []
     for i in np.argsort(values):
         away = np.abs(unit - unit[i]).max(axis=1)
         near = np.argsort(away)[1 : lower.size + 2]

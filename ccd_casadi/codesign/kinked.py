@@ -130,8 +130,8 @@ def _merit(point: _Point, rho: float) -> float:
 def _bend(here: _Point, there: _Point, bend: float) -> float:
     """How far a shelf may depart from its slope, ln per (share of the box)², after a step.
 
-    Twice what was seen, but at least a quarter of what was feared before; four times what was feared
-    where a shelf was passed.
+    Twice what was seen, but at least a quarter of what was feared before; four times what was
+    feared where a shelf was passed.
     """
     d = there.z - here.z
     size = float(np.abs(d).max())

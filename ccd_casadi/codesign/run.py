@@ -41,6 +41,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.progress import Progress
 from surrogates import design, save
 from surrogates.files import write_whole
 
