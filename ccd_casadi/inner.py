@@ -92,6 +92,7 @@ def _sections(
     """A full race of a fixed structure at θ, worst plants added, and the judge over the box."""
     import numpy as np
 
+    from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_result import active_of, design_dict, sections_controller
     from ccd_casadi.inner_problem.sections_bandwidth import (
@@ -127,6 +128,7 @@ def _sections(
             "worst_excess": float(np.expm1(worst.value)),
         },
         "syntheses": 1,
+        **budget_entry(asked, theta, made.controller),
     }
     if options.out is not None:
         folder = run_folder(options.case, options.out)
@@ -138,6 +140,7 @@ def _sections(
 def _design(
     problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
 ) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
+    from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import clean, controller_dict, figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.inner_problem.sweep import active_constraints
@@ -165,6 +168,7 @@ def _design(
             for omega, gain in local_peaks(plant, made.controller)
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
+        **budget_entry(problem, theta, made.controller),
     }
     code = ExitCode.DONE if figures.certified else ExitCode.NOT_VERIFIED
     return code, answer, controller_dict(made.controller)

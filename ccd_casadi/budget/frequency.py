@@ -20,6 +20,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 LOWEST, HIGHEST = 1e-9, 1e4  # of what is white: over the slowest and the fastest pole
+PER_DECADE = 6  # panels at least, so that a curve is drawn through their ends
 FLANKS = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # in half widths of a root
 
 
@@ -150,7 +151,7 @@ def panels(loop: Loop, source: Source) -> Array:
     else:
         low, high = corners[0], corners[-1]
     near = np.abs(roots.imag)[:, None] + np.abs(roots.real)[:, None] * FLANKS
-    steps = np.geomspace(low, high, 2 + int(3 * np.log10(high / low)))
+    steps = np.geomspace(low, high, 2 + int(PER_DECADE * np.log10(high / low)))
     joint = np.concatenate([[low, high], steps, corners, sizes, near.ravel()])
     joint = np.unique(joint[(joint >= low) & (joint <= high)])
     apart = np.concatenate([[True], np.diff(joint) > 1e-9 * joint[1:]])

@@ -3,12 +3,15 @@
     MA = (1/τ)∫ e dt,   σ²_MA = ∫ S_e sinc²(fτ) df,   σ²_MSD = ∫ S_e (1 - sinc²(fτ)) df
 
 with sinc x = sin(πx)/(πx): what of the error is an offset during an exposure, and what blurs it.
-(Butler 2011.) In state space, R(t) = C e^{At} P C',
+In state space, R(t) = C e^{At} P C',
 
     σ²_MA = (2/τ²) ∫₀^τ (τ - t) R(t) dt = C F P C',    F = 2 (e^{Aτ} - 1 - Aτ)/(Aτ)²
 
-and sampled over N = round(τ/T) samples F = (1/N²)(N + 2 Σ_{j=1}^{N-1} (N - j) (1 + A)^j), with
-the gain |sin(πfNT)/(N sin(πfT))|² for sinc². Both F are computed from a block matrix, without an inverse.
+and sampled over N = round(τ/T) samples
+
+    F = (N + 2 Σ_{j=1}^{N-1} (N - j) (1 + A)^j)/N²,    |sin(πfNT)/(N sin(πfT))|² for sinc².
+
+Both F are computed from a block matrix, without an inverse.
 """
 
 import numpy as np

@@ -35,7 +35,7 @@ class Source:
 
     `path` (m, c, k) in kg, N s/m, N/m carries floor motion to a force; with `of_acceleration` the
     floor's spectrum is one of its acceleration, in (m/s²)²/Hz. Raises ValueError for floor motion
-    that reaches nothing, and for a shaped setpoint or floor that does not fall off.
+    that reaches nothing, a filter that is not proper, and a shaped setpoint that does not fall off.
     """
 
     name: str
@@ -50,13 +50,19 @@ class Source:
             raise ValueError("floor motion needs a mass, a damping or a stiffness it acts through")
         if not isinstance(self.spectrum, ShapedSpectrum):
             return
-        if floor:
-            if self.of_acceleration and any(self.path[1:]):
-                words = "a filter of the floor's acceleration acts through a mass only"
-                raise ValueError(f"{words}; give its displacement, or a table")
-            self.shaping()
+        if self.of_acceleration and any(self.path[1:]):
+            words = "a filter of the floor's acceleration acts through a mass only"
+            raise ValueError(f"{words}; give its displacement, or a table")
+        self.shaping()
         if self.kind is Kind.SETPOINT and self.spectrum.relative_degree < 1:
             raise ValueError("the spectrum of a setpoint has to fall off; give poles_hz")
+
+    @property
+    def unit(self) -> str:
+        """Of the square root of the spectrum's integral."""
+        if self.kind is Kind.FORCE:
+            return "N"
+        return "m/s^2" if self.of_acceleration else "m"
 
     @property
     def shaped(self) -> bool:

@@ -10,6 +10,7 @@ the one-sided density 1/Hz, so of intensity ½.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
 from scipy.signal import tf2ss
 
 from ccd_casadi.plants.scaling import StateSpace
@@ -46,6 +47,14 @@ class TabulatedSpectrum:
         inside = (hz >= self.hz[0]) & (hz <= self.hz[-1])
         return np.where(inside, np.exp(np.interp(x, np.log(self.hz), np.log(self.density))), 0.0)
 
+    def rms(self) -> float:
+        """The root of ∫ S df, each straight line between two points in closed form."""
+        f, S = np.array(self.hz), np.array(self.density)
+        beta = np.diff(np.log(S)) / np.diff(np.log(f)) + 1.0
+        x = beta * np.diff(np.log(f))
+        grown = np.where(np.abs(x) < 1e-8, 1.0 + 0.5 * x, np.expm1(x) / np.where(x == 0.0, 1.0, x))
+        return float(np.sqrt((S[:-1] * f[:-1] * np.diff(np.log(f)) * grown).sum()))
+
 
 @dataclass(frozen=True)
 class ShapedSpectrum:
@@ -76,6 +85,14 @@ class ShapedSpectrum:
         s = 2j * np.pi * np.asarray(hz, float)
         top, bottom = _polynomial(self.zeros, 1.0), _polynomial(self.poles, 1.0)
         return np.asarray(self.level * np.abs(np.polyval(top, s) / np.polyval(bottom, s)) ** 2)
+
+    def rms(self) -> float | None:
+        """The root of ∫ S df; None where it is infinite."""
+        if self.relative_degree < 1:
+            return None
+        f = self.filter()
+        P = solve_continuous_lyapunov(f.A, -0.5 * f.B @ f.B.T)
+        return float(np.sqrt((f.C @ P @ f.C.T)[0, 0]))
 
     def filter(self, path: tuple[float, ...] = (1.0,)) -> StateSpace:
         """The shaping filter times a polynomial in s, highest power first; time in s.

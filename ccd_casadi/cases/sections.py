@@ -23,6 +23,7 @@ from ccd_casadi.cases.checks import (
     number,
     points,
     steps,
+    tables,
 )
 
 
@@ -158,6 +159,20 @@ class LoopSection:
 
 
 @dataclass(frozen=True)
+class BudgetSection:
+    """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
+
+    Each kind is one table or several of them; their keys are checked in `budget`.
+    """
+
+    window_ms: float | None = _key(POSITIVE, None)
+    force: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    floor_motion: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    sensor_noise: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    setpoint: tuple[Mapping[str, Any], ...] = _key(tables, ())
+
+
+@dataclass(frozen=True)
 class SamplingSection:
     """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
 
@@ -221,6 +236,7 @@ class Case:
     robust: RobustSection
     controller: ControllerSection
     loop: LoopSection
+    budget: BudgetSection
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
@@ -235,6 +251,7 @@ SECTIONS: dict[str, type] = {
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,
+    "budget": BudgetSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,
