@@ -102,6 +102,7 @@ def _sections(
         with_range,
         worst_members,
     )
+    from ccd_casadi.inner_problem.sections_error import least_error_at
 
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)
@@ -111,6 +112,22 @@ def _sections(
         answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
         _print(answer, (), options, began)
         return ExitCode.INFEASIBLE
+    if sections.minimise == "rms_error":
+        if made.bandwidth < sections.bandwidth_least:
+            words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
+            words += f", inner.bandwidth_least_hz asks for {sections.bandwidth_least / HZ:.4g} Hz"
+            answer = head | {"status": "infeasible", "reason": words, "syntheses": 1}
+            _print(answer, (), options, began)
+            return ExitCode.INFEASIBLE
+        fastest = made.bandwidth
+        asked, least = least_error_at(asked, theta, made, tell)
+        made = least.design
+        head["least_error"] = {
+            "error_rms_of_set": least.error,
+            "error_rms_at_largest_bandwidth": least.first_error,
+            "largest_bandwidth_hz": fastest / HZ,
+            "steps": least.steps,
+        }
     worst = worst_members(asked, theta, made)[0]
     assert made.controller is not None
     wide, checked = judged_widely(asked, theta, made.controller, worst)

@@ -15,9 +15,10 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.budget_result import budget_entry, budget_lines
 from ccd_casadi.codesign.result import clean
-from ccd_casadi.inner_problem.problem import true_design
+from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import synthesise
 
 BUDGET = """
 [budget]
@@ -105,7 +106,8 @@ def test_mistakes_are_one_line_with_a_remedy(tmp_path: Path, text: str, words: s
 
 def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> None:
     problem = problem_of(written(tmp_path))
-    made = true_design(problem, (55.0, 55.0), 72.0 * HZ, 150.0 * HZ)
+    weights = problem.weights.at(72.0 * HZ, 150.0 * HZ)
+    made = synthesise(scaled_plant(problem, (55.0, 55.0)), weights, omega_low=HZ)
     found = budget_entry(problem, (55.0, 55.0), made.controller)
     budget = json.loads(json.dumps(clean(found), allow_nan=False))["budget"]
     shares = [item["share"] for item in budget["sources"]]

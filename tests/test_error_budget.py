@@ -20,7 +20,8 @@ from ccd_casadi.budget import (
 from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.budget.evaluation import variances
 from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
-from ccd_casadi.budget.loops import Hold, Process, noise_of_a_period, process
+from ccd_casadi.budget.holding import Hold, noise_of_a_period
+from ccd_casadi.budget.loops import Process, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space, state_spaces

@@ -17,11 +17,11 @@ from ccd_casadi.budget.evaluation import is_stable
 from ccd_casadi.budget.frequency import (
     Loop,
     integrated,
-    response,
     responses,
     sampled_plant,
 )
-from ccd_casadi.budget.loops import Process, process, tustin
+from ccd_casadi.budget.holding import tustin
+from ccd_casadi.budget.loops import Disturbed, Process, closed, disturbed
 from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
@@ -73,10 +73,11 @@ def rms_error_slope(found: VarianceSlopes) -> tuple[float, Array]:
 def _of_filter(
     loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
 ) -> tuple[Array, Array]:
-    model = process(loop.G, loop.K, source, loop.hold)
+    plant = disturbed(loop.G, source, loop.hold)
+    model = closed(plant, loop.K)
     scale = model.scales()
     model = model.transformed(scale)
-    moved = [_moved(loop, source, change).transformed(scale) for change in changes]
+    moved = [_moved(loop, plant, source, change).transformed(scale) for change in changes]
     P = covariance(model.A, model.noise, sampled=model.sampled)
     steps = [(d.A.imag / STEP, d.noise.imag / STEP) for d in moved]
     C, F, V = model.C, model.F, model.V
@@ -108,11 +109,11 @@ def _of_filter(
     return value, np.array([d_error, d_average, d_force])
 
 
-def _moved(loop: Loop, source: Source, change: Change) -> Process:
+def _moved(loop: Loop, plant: Disturbed, source: Source, change: Change) -> Process:
     """The process a step along the imaginary axis away."""
-    G = _stepped(loop.G, change.plant)
-    K = _stepped(loop.K, change.controller)
-    return process(G, K, source, loop.hold)
+    if change.plant is not None:
+        plant = disturbed(_stepped(loop.G, change.plant), source, loop.hold)
+    return closed(plant, _stepped(loop.K, change.controller))
 
 
 def _stepped(system: StateSpace, change: StateSpace | None) -> StateSpace:
@@ -138,9 +139,10 @@ def _of_table(
     density = source.density(hz) * weights
     error, force = ((np.abs(H) ** 2).sum((1, 2)) for H in (H_e, H_u))
     value = np.array([density @ error, (density * averaging) @ error, density @ force])
-    gradient = np.empty((3, len(changes)))
+    gradient = np.zeros((3, len(changes)))
+    moving = _ResponseChanges(loop, hz)
     for i, change in enumerate(changes):
-        dG, dK, dfree = _response_changes(loop, change, hz)
+        dG, dK, dfree = moving.of(change)
         dS = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
         if source.kind in (Kind.FORCE, Kind.FLOOR_MOTION):
             d_e = -dS @ at.free - at.S @ dfree
@@ -155,28 +157,35 @@ def _of_table(
     return value, gradient
 
 
-def _response_changes(loop: Loop, change: Change, hz: Array) -> tuple[Any, Any, Any]:
-    """dG and dK as in the loop, and d of the disturbed G."""
-    s = loop.variable(hz)
-    G, K = _stepped(loop.G, change.plant), _stepped(loop.K, change.controller)
-    hold = loop.hold
-    if hold is None:
-        dG = _response_change(G, s)
-        return dG, _response_change(K, s), dG
-    dG = _response_change(sampled_plant(G, hold), s)
-    free = _response_change(G, 1j * HZ * hz)
-    return dG, _response_change(tustin(K, hold.period), s), free
+class _ResponseChanges:
+    """dG and dK as in the loop, and d of the disturbed G, at frequencies in Hz.
 
+    d(C X) = C R dA X + dC X + C R dB + dD,   R = (s - A)⁻¹,  X = R B
+    """
 
-def _response_change(system: StateSpace, s: np.ndarray) -> np.ndarray:
-    """d(C (s - A)⁻¹ B + D), its changes in the imaginary parts over the step."""
-    A, B, C = (np.real(part) for part in (system.A, system.B, system.C))
-    dA, dB, dC, dD = (np.imag(part) / STEP for part in (system.A, system.B, system.C, system.D))
-    zero = np.zeros((0, 0))
-    if not len(A):
-        return response(StateSpace(zero, B, C, dD), s)
-    n = len(A)
-    joint = StateSpace(
-        np.block([[A, dA], [np.zeros((n, n)), A]]), np.vstack([dB, B]), np.hstack([C, dC]), dD
-    )
-    return response(joint, s)
+    def __init__(self, loop: Loop, hz: Array) -> None:
+        self.loop, self.hz = loop, hz
+        self.s = loop.variable(hz)
+        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def of(self, change: Change) -> tuple[Any, Any, Any]:
+        hold = self.loop.hold
+        dG = dK = dfree = np.zeros((len(self.hz), 1, 1))
+        if change.plant is not None:
+            G = _stepped(self.loop.G, change.plant)
+            dfree = self._change("free", G, 1j * HZ * self.hz)
+            dG = dfree if hold is None else self._change("G", sampled_plant(G, hold), self.s)
+        if change.controller is not None:
+            K = _stepped(self.loop.K, change.controller)
+            dK = self._change("K", K if hold is None else tustin(K, hold.period), self.s)
+        return dG, dK, dfree
+
+    def _change(self, name: str, system: StateSpace, s: np.ndarray) -> np.ndarray:
+        """By the imaginary parts of a system's matrices over the step."""
+        A, B, C = (np.real(part) for part in (system.A, system.B, system.C))
+        dA, dB, dC, dD = (np.imag(part) / STEP for part in (system.A, system.B, system.C, system.D))
+        if name not in self.known:
+            R = np.linalg.inv(s[:, None, None] * np.eye(len(A)) - A)
+            self.known[name] = (R @ B, C @ R)
+        X, Y = self.known[name]
+        return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)

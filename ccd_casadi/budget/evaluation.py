@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
-from ccd_casadi.budget.loops import Hold, process
+from ccd_casadi.budget.holding import Hold
+from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.lyapunov import covariance
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.budget.sources import ErrorBudget, Source

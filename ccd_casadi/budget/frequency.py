@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.loops import Hold, held, process, tustin
+from ccd_casadi.budget.holding import Hold, held, tustin
+from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.quadrature import Integral, integrate
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.plants.scaling import StateSpace

@@ -4,44 +4,30 @@
     e = C x,   u = F x + v
 
 x holds the plant, the controller, the source's filter, and of a sampled loop the forces that are
-under way. Sampled, the plant runs behind a hold and a delay with what disturbs it in continuous
-time; its share of Q is
-
-    ∫₀ᵀ e^{As} W W' e^{A's}/2 ds      (Van Loan 1978, of T/2ᵏ, then doubled k times)
-
-and e is the error at the samples. White sensor noise is that of the samples: its density counts up
-to half the rate. The controller is converted by Tustin's rule without prewarping. A sampled loop is
-kept as its change over a period: slow poles would lose their digits next to 1.
-
-Everything is analytic in the matrices of plant and controller, so that a step along the imaginary
-axis gives derivatives to rounding (Squire and Trapp 1998).
+under way (`holding`). Sampled, e is the error at the samples, and white sensor noise that of the
+samples: its density counts up to half the rate. The controller is converted by Tustin's rule
+without prewarping. Everything is analytic in the matrices of plant and controller.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import expm, matrix_balance
+from scipy.linalg import matrix_balance
 
+from ccd_casadi.budget.holding import (
+    Hold,
+    Matrix,
+    held,
+    noise_of_a_period,
+    over,
+    stacked,
+    tustin,
+    tustin_change,
+)
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.plants.scaling import StateSpace
 
-INSTANT = 1e-9  # share of a period that counts as none
-Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis
-
-
-@dataclass(frozen=True)
-class Hold:
-    """A sampled loop: period T and delay from measurement to force in s."""
-
-    period: float
-    delay: float = 0.0
-
-    @property
-    def parts(self) -> tuple[int, float]:
-        """Whole periods of the delay, and the rest in s."""
-        whole = int(np.floor(self.delay / self.period + INSTANT))
-        return whole, max(self.delay - whole * self.period, 0.0)
+FORCES = (Kind.FORCE, Kind.FLOOR_MOTION)
 
 
 @dataclass(frozen=True)
@@ -89,151 +75,107 @@ class Process:
         return self.transformed(self.scales())
 
 
-def process(G: StateSpace, K: StateSpace, source: Source, hold: Hold | None) -> Process:
-    """The loop of a plant without feedthrough (SI) and a controller (e in, u out) under a source.
+@dataclass(frozen=True)
+class Disturbed:
+    """A plant with a source: all of its process that no controller changes.
+
+    `system` is the plant with the filter of a force among its states, `filter` that of noise or
+    setpoint. Sampled: `change` and `gains` of `system` over a period and `noise` (Q) of it, and
+    the same of the filter; without a hold those are empty.
+    """
+
+    kind: Kind
+    hold: Hold | None
+    system: StateSpace
+    filter: StateSpace
+    change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    gains: tuple[Matrix, ...] = ()
+    noise: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    filter_change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+def disturbed(G: StateSpace, source: Source, hold: Hold | None) -> Disturbed:
+    """A plant without feedthrough (SI) under a source of white noise through a filter.
 
     Raises ValueError for a tabulated source, which has no state space.
     """
     if not source.shaped:
         raise ValueError("a tabulated source has no state space")
-    channels = G.B.shape[1] if _is_force(source) else len(G.C)
-    own, each = source.shaping(), np.eye(channels)
-    shape = StateSpace(*(np.asarray(np.kron(each, getattr(own, name)), float) for name in "ABCD"))
+    is_force = source.kind in FORCES
+    own, each = source.shaping(), np.eye(G.B.shape[1] if is_force else len(G.C))
+    f = StateSpace(*(np.asarray(np.kron(each, getattr(own, name)), float) for name in "ABCD"))
     if hold is None:
-        return _continuous(G, K, shape, source.kind)
-    return _sampled(G, K, shape, source.kind, hold)
+        return Disturbed(source.kind, None, G, f)
+    T = hold.period
+    if not is_force:
+        change, gains = held(G.A, G.B, hold)
+        return Disturbed(source.kind, hold, G, f, change, tuple(gains),
+                         noise_of_a_period(f.A, f.B, T), over(f.A, T)[0])  # fmt: skip
+    n, nf = len(G.A), len(f.A)
+    A = stacked([[G.A, G.B @ f.C], [np.zeros((nf, n)), f.A]])
+    B = np.vstack([G.B, np.zeros((nf, G.B.shape[1]))])
+    C = np.hstack([G.C, np.zeros((len(G.C), nf))])
+    change, gains = held(A, B, hold)
+    noise = noise_of_a_period(A, np.vstack([G.B @ f.D, f.B]), T)
+    return Disturbed(source.kind, hold, StateSpace(A, B, C, G.D), f, change, tuple(gains), noise)
 
 
-def _is_force(source: Source) -> bool:
-    return source.kind in (Kind.FORCE, Kind.FLOOR_MOTION)
+def process(G: StateSpace, K: StateSpace, source: Source, hold: Hold | None) -> Process:
+    """The loop of a plant without feedthrough (SI), a controller (e in, u out) and a source."""
+    return closed(disturbed(G, source, hold), K)
 
 
-def _continuous(G: StateSpace, K: StateSpace, f: StateSpace, kind: Kind) -> Process:
+def closed(plant: Disturbed, K: StateSpace) -> Process:
+    """The process of a disturbed plant with a controller around it."""
+    return _continuous(plant, K) if plant.hold is None else _sampled(plant, K, plant.hold)
+
+
+def _continuous(plant: Disturbed, K: StateSpace) -> Process:
+    G, f, kind = plant.system, plant.filter, plant.kind
     n, nk, nf = len(G.A), len(K.A), len(f.A)
-    loop = _stack([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-    force = np.hstack([-K.D @ G.C, K.C])
+    m = G.B.shape[1]
+    loop = stacked([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
     C = np.hstack([-G.C, np.zeros((len(G.C), nk + nf))])
-    if kind in (Kind.FORCE, Kind.FLOOR_MOTION):
-        enters, direct = (
-            np.vstack([G.B, np.zeros((nk, len(G.B.T)))]),
-            np.zeros((len(K.C), len(G.B.T))),
-        )
+    if kind in FORCES:
+        enters, direct = np.vstack([G.B, np.zeros((nk, m))]), np.zeros((len(K.C), m))
     else:
         sign = -1.0 if kind is Kind.SENSOR_NOISE else 1.0
         enters, direct = sign * np.vstack([G.B @ K.D, K.B]), sign * K.D
         if kind is Kind.SETPOINT:
             C = np.hstack([C[:, : n + nk], f.C])
-    A = _stack([[loop, enters @ f.C], [np.zeros((nf, n + nk)), f.A]])
+    A = stacked([[loop, enters @ f.C], [np.zeros((nf, n + nk)), f.A]])
     W = np.vstack([enters @ f.D, f.B])
-    F = np.hstack([force, direct @ f.C])
-    white = direct @ f.D
+    F = np.hstack([-K.D @ G.C, K.C, direct @ f.C])
     return Process(A, 0.5 * W @ W.T, C, F, np.zeros((len(A), 0)), np.zeros((len(F), 0)),
                    infinite_error=kind is Kind.SETPOINT and bool(np.any(f.D)),
-                   infinite_force=bool(np.any(white)))  # fmt: skip
+                   infinite_force=bool(np.any(direct @ f.D)))  # fmt: skip
 
 
-def _sampled(G: StateSpace, K: StateSpace, f: StateSpace, kind: Kind, hold: Hold) -> Process:
-    A, B, C = G.A, G.B, G.C
-    W = np.zeros((len(A), 1))
-    disturbed = kind in (Kind.FORCE, Kind.FLOOR_MOTION)
-    if disturbed:
-        A = _stack([[A, B @ f.C], [np.zeros((len(f.A), len(A))), f.A]])
-        W = np.vstack([B @ f.D, f.B])
-        B = np.vstack([B, np.zeros((len(f.A), B.shape[1]))])
-        C = np.hstack([C, np.zeros((len(C), len(f.A)))])
-    change, gains = held(A, B, hold)
+def _sampled(plant: Disturbed, K: StateSpace, hold: Hold) -> Process:
+    B, C, f, gains = plant.system.B, plant.system.C, plant.filter, plant.gains
     k, k_change = tustin(K, hold.period), tustin_change(K, hold.period)
-    m, n, nk = B.shape[1], len(A), len(k.A)
-    nf = 0 if disturbed else len(f.A)
+    own = plant.kind not in FORCES  # whether the filter stands beside the plant
+    m, n, nk, nf = B.shape[1], len(B), len(k.A), len(f.A) if own else 0
     kept = len(gains) - 1
     size = n + nk + nf + kept * m
-    one = np.eye(size)
-    x, c, z, old = np.split(one, np.cumsum([n, nk, nf]))
-    e = -C @ x
-    sign = -1.0 if kind is Kind.SENSOR_NOISE else 1.0
-    if not disturbed:
-        e = e + sign * f.C @ z
+    x, c, z, old = np.split(np.eye(size), np.cumsum([n, nk, nf]))
+    sign = -1.0 if plant.kind is Kind.SENSOR_NOISE else 1.0
+    e = -C @ x + sign * f.C @ z if own else -C @ x
     u = k.C @ c + k.D @ e
     forces = [u, *np.split(old, kept)] if kept else [u]
-    rows = [change @ x + sum(g @ force for g, force in zip(gains, forces, strict=True))]
+    rows = [plant.change @ x + sum(g @ force for g, force in zip(gains, forces, strict=True))]
     rows.append(k_change @ c + k.B @ e)
-    Q = np.zeros((size, size))
-    error, E, V = -C @ x, np.zeros((size, 0)), np.zeros((m, 0))
-    if disturbed:
-        Q = x.T @ noise_of_a_period(A, W, hold.period) @ x
-    else:
-        rows.append(held(f.A, np.zeros((nf, 1)), Hold(hold.period))[0] @ z)
-        Q = z.T @ noise_of_a_period(f.A, f.B, hold.period) @ z
-        if kind is Kind.SETPOINT:
-            error = e
+    driven = z if own else x
+    E, V = np.zeros((size, 0)), np.zeros((m, 0))
+    if own:
+        rows.append(plant.filter_change @ z)
         # The white part, of variance density times half the rate, enters by way of e alone.
         white = sign * f.D / np.sqrt(2.0 * hold.period)
-        by = [gains[0] @ k.D @ white, k.B @ white, np.zeros((nf, white.shape[1]))]
-        if kept:
-            by += [k.D @ white, np.zeros(((kept - 1) * m, white.shape[1]))]
-        E = np.vstack(by)
         V = k.D @ white
+        E = np.vstack([gains[0] @ V, k.B @ white, np.zeros((nf, white.shape[1])),
+                       np.eye(kept * m, m) @ V])  # fmt: skip
     if kept:
         rows.append(np.vstack(forces[:kept]) - old)
+    error = e if plant.kind is Kind.SETPOINT else -C @ x
+    Q = driven.T @ plant.noise @ driven
     return Process(np.vstack(rows), Q, error, u, E, V, sampled=True)
-
-
-def held(A: Matrix, B: Matrix, hold: Hold) -> tuple[Matrix, list[Matrix]]:
-    """x_{k+1} = Φ x_k + Σ Γ_i u_{k-i} behind hold and delay: Φ - 1, and all Γ_i."""
-    n, m = B.shape
-    whole, rest = hold.parts
-    late, late_in = _over(A, hold.period - rest)
-    gains = [np.zeros((n, m))] * whole + [late_in @ B]
-    if rest == 0.0:
-        return late, gains
-    early, early_in = _over(A, rest)
-    moved = early_in + late @ early_in
-    return late + early + late @ early, [*gains, moved @ B]
-
-
-def _over(A: Matrix, h: float) -> tuple[Matrix, Matrix]:
-    """e^{Ah} - 1 = A∫ and ∫₀ʰ e^{As} ds, to the digits of A h."""
-    n = len(A)
-    joint = _stack([[A * h, h * np.eye(n)], [np.zeros((n, 2 * n))]])
-    integral = expm(joint)[:n, n:] if n else A
-    return A @ integral, integral
-
-
-def noise_of_a_period(A: Matrix, W: Matrix, T: float) -> Matrix:
-    """∫₀ᵀ e^{As} W W'/2 e^{A's} ds by Van Loan's exponential of a short step and doublings.
-
-    The exponential holds e^{-Ah}, so the step is short; Q(2h) = Q(h) + Φ(h) Q(h) Φ(h)' adds no
-    error of cancellation.
-    """
-    n = len(A)
-    if n == 0:
-        return np.zeros((0, 0))
-    doublings = max(0, int(np.ceil(np.log2(max(np.abs(A).sum(0).max() * T, 1e-300)))))
-    h = T / 2.0**doublings
-    whole = expm(h * _stack([[-A, 0.5 * W @ W.T], [np.zeros((n, n)), A.T]]))
-    moved = whole[n:, n:].T
-    Q = moved @ whole[:n, n:]
-    for _ in range(doublings):
-        Q, moved = Q + moved @ Q @ moved.T, moved @ moved
-    return 0.5 * (Q + Q.T)
-
-
-def tustin(K: StateSpace, T: float) -> StateSpace:
-    """K at z by s = (2/T)(z - 1)/(z + 1)."""
-    one = np.eye(len(K.A))
-    inverse = np.linalg.inv(one - 0.5 * T * K.A)
-    return StateSpace(
-        inverse @ (one + 0.5 * T * K.A),
-        T * inverse @ K.B,
-        K.C @ inverse,
-        K.D + 0.5 * T * K.C @ inverse @ K.B,
-    )
-
-
-def tustin_change(K: StateSpace, T: float) -> Matrix:
-    """A of `tustin` less 1."""
-    return T * np.linalg.solve(np.eye(len(K.A)) - 0.5 * T * K.A, K.A)
-
-
-def _stack(blocks: list[list[Matrix]]) -> Matrix:
-    return np.vstack([np.hstack(row) for row in blocks])

@@ -76,7 +76,11 @@ class WeightsSection:
 
 @dataclass(frozen=True)
 class InnerSection:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
+
+    With sections: `minimise` what, "bandwidth" (its negative) or the "rms_error" of [budget], that
+    at a bandwidth of `bandwidth_least_hz` or more.
+    """
 
     S_max: float = _key(
         number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral")
@@ -92,6 +96,8 @@ class InnerSection:
     method: str = _key(choice("search", "sweep"), "search")
     shape: float | None = _key(number(1.0, 10.0, "give 1 to 10", closed=True), None)
     compliance_max: float | None = _key(POSITIVE, None)
+    minimise: str = _key(choice("bandwidth", "rms_error"), "bandwidth")
+    bandwidth_least_hz: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.derivatives import variance_slopes
 from ccd_casadi.budget.frequency import Loop
-from ccd_casadi.budget.loops import Hold
+from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import plants_of
