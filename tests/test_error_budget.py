@@ -201,20 +201,26 @@ def test_rms_equals_a_simulation_within_its_statistical_error(sampling: Sampling
         assert error < 0.2 * found.error
 
 
-def simulated(model: Process, count: int, seed: int) -> tuple[float, float]:
+def simulated(model: Process, count: int, seed: int, parts: int = 50) -> tuple[float, float]:
     """Mean of e² over a run of the process in its eigenvectors, and its standard error."""
     rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(0.5 * (model.noise + model.noise.T))
-    noise = rng.normal(size=(count, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     moved = model.A + np.eye(len(model.A))
-    values, vectors = np.linalg.eigh(_settled(moved, model.noise))
-    start = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=len(values)))
+    noise = rng.normal(size=(count, len(moved))) @ _root(model.noise).T
+    start = _root(_settled(moved, model.noise)) @ rng.normal(size=len(moved))
     poles, V = np.linalg.eig(moved)
-    parts, first, out = noise @ np.linalg.inv(V).T, np.linalg.solve(V, start), model.C[0] @ V
+    driven, first, out = noise @ np.linalg.inv(V).T, np.linalg.solve(V, start), model.C[0] @ V
     e = sum(c * lfilter([0.0, 1.0], [1.0, -p], part, zi=[x])[0]
-            for c, p, part, x in zip(out, poles, parts.T, first, strict=True))  # fmt: skip
-    batches = (e.real**2).reshape(50, -1).mean(1)
-    return float(batches.mean()), float(batches.std(ddof=1) / np.sqrt(50.0))
+            for c, p, part, x in zip(out, poles, driven.T, first, strict=True))  # fmt: skip
+    batches = (e.real**2).reshape(parts, -1).mean(1)
+    return float(batches.mean()), float(batches.std(ddof=1) / np.sqrt(parts))
+
+
+def _root(Q: Array) -> Array:
+    """R with R R' = Q, by the correlations: states of small noise keep their digits."""
+    size = np.sqrt(np.diag(Q))
+    size[size == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(Q / size / size[:, None])
+    return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def test_moving_average_and_deviation_share_the_variance() -> None:
