@@ -12,7 +12,6 @@ A little is paid for bandwidth, so that ω_b is what the bounds leave free at th
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 from scipy.optimize import nnls
 
@@ -23,6 +22,7 @@ from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
+from ccd_casadi.fixed_structure.descent import Point, descend
 from ccd_casadi.fixed_structure.design import (
     Progress,
     SectionsDesign,
@@ -30,7 +30,7 @@ from ccd_casadi.fixed_structure.design import (
     in_problem_units,
     problem_for,
 )
-from ccd_casadi.fixed_structure.figures import Assessment, Constraints, Curve, Problem, assess
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -39,13 +39,6 @@ from ccd_casadi.support.units import HZ
 
 STEP = 1e-30  # of κ along the imaginary axis
 REWARD = 1e-3  # of ln ω_b in ln e
-PENALTIES = (20.0, 200.0, 2000.0)  # the next one where a bound is left passed
-FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.2, 1.0, 1e-7
-LEAST_GAIN = 1e-9
-FLAT = 1e-4  # least curvature
-CONVEXIFYING = 10.0
-MOST = 200  # steps
-ROWS = 300
 ACTIVE = 1e-5
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
@@ -94,19 +87,6 @@ class LeastError:
     steps: int
 
 
-@dataclass(frozen=True)
-class _Point:
-    kappa: Array
-    tau: float
-    assessment: Assessment
-    value: float
-    slope: Array
-
-    def merit(self, penalty: float) -> float:
-        """To be made small."""
-        return self.value - REWARD * self.tau + penalty * self.assessment.violation
-
-
 def least_error(
     plants: Sequence[ScaledPlant],
     bounds: Bounds,
@@ -127,6 +107,7 @@ def least_error(
     goal = RmsError(
         tuple(p.plant_si() for p in plants), design.structure, replace(budget, window=None), hold
     )
+    model = _OnPlants(problem, goal)
     w0 = problem.plants.omega_0
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
     tell = progress or (lambda words: None)
@@ -138,16 +119,11 @@ def least_error(
     for bandwidth, kappa in [own, *others]:
         if bandwidth < least_bandwidth:
             continue
-        start = _point(problem, goal, in_problem_units(problem, np.array(kappa)),
-                       float(np.log(bandwidth / w0)))  # fmt: skip
+        start = model.at(in_problem_units(problem, np.array(kappa)), float(np.log(bandwidth / w0)))
         if not np.isfinite(start.value):
             continue
-        end = start
-        for penalty in PENALTIES:
-            end, count = _descend(problem, goal, end, floor, penalty)
-            steps += count
-            if end.assessment.violation <= problem.margin:
-                break
+        end, count = descend(model, start, problem.box, floor, REWARD, problem.margin)
+        steps += count
         made = _judged(problem, plants, sampling, end, design, floor)
         error = float(np.exp(end.value))
         tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
@@ -157,131 +133,38 @@ def least_error(
     return replace(best, steps=steps)
 
 
-def _point(problem: Problem, goal: RmsError, kappa: Array, tau: float) -> _Point:
-    kappa = np.clip(kappa, *problem.box)
-    found = assess(problem, kappa, tau)
-    value, slope = np.inf, np.zeros(len(kappa))
-    if found.stable:
-        P = problem.plants
-        value, slope = goal.at(problem.structure.in_units(kappa, P.omega_0, P.force))
-    return _Point(kappa, tau, found, value, slope)
+@dataclass(frozen=True)
+class _OnPlants:
+    """The problem as `descent` sees it."""
 
+    problem: Problem
+    goal: RmsError
 
-def _descend(
-    problem: Problem, goal: RmsError, start: _Point, floor: float, penalty: float
-) -> tuple[_Point, int]:
-    """Steps until they help no longer."""
-    point, radius, steps = start, FIRST_RADIUS, 0
-    n = len(start.kappa)
-    curvature = np.eye(n)
-    for turn in range(1, MOST + 1):
-        steps = turn
-        rows = _rows(point.assessment, radius)
-        hessian = FLAT * np.eye(n + 1)
-        hessian[:n, :n] += curvature
-        found = _programme(problem, point, rows, rows.value, hessian, radius, floor, penalty)
-        if found is None:
-            break
-        mu = np.where(found[2] > 1e-7 * penalty, found[2], 0.0)
-        hessian += lagrangian_hessian(problem, point.kappa, point.tau, rows, mu)
-        active = np.column_stack([rows.to_kappa, rows.to_tau])[mu > 0.0]
-        values, vectors = np.linalg.eigh(hessian + CONVEXIFYING * active.T @ active)
-        convex = (vectors * np.maximum(values, FLAT)) @ vectors.T
-        found = _programme(problem, point, rows, rows.value, convex, radius, floor, penalty)
-        if found is None or found[1] <= LEAST_GAIN:
-            break
-        change, predicted, _ = found
-        trial = _point(problem, goal, point.kappa + change[:n], point.tau + float(change[n]))
-        gained = point.merit(penalty) - trial.merit(penalty)
-        if gained < 0.7 * predicted and trial.assessment.stable:
-            again = _rows(trial.assessment, radius)
-            back = again.to_kappa @ change[:n] + again.to_tau * change[n]
-            other = _programme(
-                problem, point, again, again.value - back, convex, radius, floor, penalty
-            )
-            if other is not None:
-                corrected = _point(problem, goal, point.kappa + other[0][:n],
-                                   point.tau + float(other[0][n]))  # fmt: skip
-                if point.merit(penalty) - corrected.merit(penalty) > gained:
-                    trial, gained = corrected, point.merit(penalty) - corrected.merit(penalty)
-        if trial.assessment.stable:
-            curvature = _updated(curvature, trial.kappa - point.kappa, trial.slope - point.slope)
-        size = float(np.abs(change).max())
-        if gained > 0.0:
-            point = trial
-        if gained > 0.7 * predicted:
-            radius = min(max(radius, 2.0 * size), LARGEST_RADIUS)
-        elif gained < 0.2 * predicted:
-            radius = (0.5 if gained > 0.0 else 0.3) * min(radius, size)
-        if radius < LEAST_RADIUS:
-            break
-    return point, steps
+    def at(self, kappa: Array, tau: float) -> Point:
+        kappa = np.clip(kappa, *self.problem.box)
+        found = assess(self.problem, kappa, tau)
+        if not found.stable:
+            return Point(kappa, tau, np.inf, np.inf, np.zeros(len(kappa)), None)
+        assert found.peaks is not None
+        assert found.near is not None
+        P = self.problem.plants
+        value, slope = self.goal.at(self.problem.structure.in_units(kappa, P.omega_0, P.force))
+        parts = (found.peaks, found.near)
+        rows = Constraints(*(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")
+        ))  # fmt: skip
+        return Point(kappa, tau, found.violation, value, slope, rows)
 
-
-def _updated(B: Array, s: Array, y: Array) -> Array:
-    """BFGS, damped so that it stays positive (Powell 1978)."""
-    Bs = B @ s
-    sBs = float(s @ Bs)
-    if not sBs > 1e-20:
-        return B
-    sy = float(s @ y)
-    share = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
-    r = share * y + (1.0 - share) * Bs
-    return np.asarray(B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(s @ r))
-
-
-def _rows(found: Assessment, radius: float) -> Constraints:
-    """The peaks, and the grid values that a step of this size may lift over their bounds."""
-    assert found.peaks is not None
-    assert found.near is not None
-    parts = (found.peaks, found.near)
-    joint = Constraints(*(
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")
-    ))  # fmt: skip
-    slack = joint.value + radius * (np.abs(joint.to_kappa).sum(1) + np.abs(joint.to_tau))
-    chosen = np.flatnonzero(slack > 0.0)
-    return joint.only(chosen[np.argsort(-slack[chosen], kind="stable")[:ROWS]])
-
-
-def _programme(
-    problem: Problem,
-    point: _Point,
-    rows: Constraints,
-    value: Array,
-    hessian: Array,
-    radius: float,
-    floor: float,
-    penalty: float,
-) -> tuple[Array, float, Array] | None:
-    """(d, δ), what it gains in merit by the model, and the rows' multipliers."""
-    n, m = len(point.kappa), len(rows.v)
-    A = np.column_stack([rows.to_kappa, rows.to_tau, -np.ones(m)])
-    H = np.zeros((n + 2, n + 2))
-    H[: n + 1, : n + 1], H[n + 1, n + 1] = hessian, FLAT
-    cost = np.concatenate([point.slope, [-REWARD, penalty]])
-    low, high = np.full(n + 2, -radius), np.full(n + 2, radius)
-    low[:n] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
-    high[:n] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
-    low[n] = min(max(floor - point.tau, -radius), 0.0)
-    low[n + 1], high[n + 1] = 0.0, 1e4
-    shapes = {"h": ca.Sparsity.dense(n + 2, n + 2), "a": ca.Sparsity.dense(m, n + 2)}
-    for name, options in (("daqp", {}), ("ipqp", {"print_iter": False, "print_header": False,
-                                                  "print_info": False})):  # fmt: skip
-        solver = ca.conic("programme", name, shapes, {"error_on_fail": False, **options})
-        found = solver(h=H, g=cost, a=A, lba=-np.inf, uba=-value, lbx=low, ubx=high)
-        x = np.array(found["x"]).ravel()
-        if solver.stats()["success"] and (A @ x + value).max(initial=-1.0) <= 1e-7:
-            gain = -float(found["cost"]) + penalty * point.assessment.violation
-            return x[: n + 1], gain, np.maximum(np.array(found["lam_a"]).ravel(), 0.0)
-    return None
+    def hessian(self, point: Point, rows: Constraints, mu: Array) -> Array:
+        return lagrangian_hessian(self.problem, point.kappa, point.tau, rows, mu)
 
 
 def _judged(
     problem: Problem,
     plants: Sequence[ScaledPlant],
     sampling: Sampling | None,
-    end: _Point,
+    end: Point,
     design: SectionsDesign,
     floor: float,
 ) -> SectionsDesign:
@@ -290,9 +173,8 @@ def _judged(
     kappa = structure.in_units(end.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
     judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
-    peaks = end.assessment.peaks
-    assert peaks is not None
-    active = peaks.only(np.abs(peaks.value) <= ACTIVE)
+    assert end.rows is not None
+    active = end.rows.only(np.abs(end.rows.value) <= ACTIVE)
     n = len(end.kappa)
     columns, names = [np.column_stack([active.to_kappa, active.to_tau])], []
     for i, name in enumerate(structure.names):

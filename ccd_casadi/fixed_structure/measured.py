@@ -2,9 +2,9 @@
 
 Bounds are looked at on every line. Between two lines L = GK is taken to lie within r of the chord,
 
-    r = h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
+    r = 2 h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
 
-the error of linear interpolation, where L bends between two lines no more than around them. A
+twice the error of linear interpolation, where L bends between two lines as around them. A
 resonance that fits between two lines is not seen. With it |S| <= 1/(distance of -1 to the chord
 less r).
 
@@ -12,10 +12,10 @@ Stability is the winding of 1 + GK. Over all ω > 0 its angle grows by
 
     Δ = (π/2)(q + 2P - 2Z)
 
-with Z poles of the closed loop and P of GK in the right half plane, q of GK at 0 (counted so are
-stable ones far below the first line, where |L| >> 1). P is given. Z is sure under assumptions
-written out in `words`: below the first line 1 + GK goes on as (jω)^-q, above the last line |L|
-stays below 1, and between the lines L lies within r of the chords, which do not touch -1.
+with Z poles of the closed loop and P of GK in the right half plane, and q of GK at 0. P is given.
+The angle below the first line is that of the known K and of a G that is taken to go on as its first
+lines rise, c (jω)^-n: stable poles far below, where |GK| >> 1, count as poles at 0. Above the last
+line |GK| is taken to stay below 1. What of this the data can show is looked at: `sure`.
 """
 
 import csv
@@ -33,7 +33,9 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
 HALF_POWER = 2.0**-0.5
-GAP = np.pi / 4.0  # of the angle at the first line to its asymptote, above which Z is not sure
+GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
+BELOW = 3  # decades that K is followed below the first line
+SAFETY = 2.0  # on the error of interpolation
 LARGE, SMALL = 2.0, 0.5  # |L| at the first line at least, at the last at most
 FIGURES = ("S_peak", "S_peak_frequency", "S_between", "S_low", "bandwidth", "KS", "T", "GS",
            "weighted_KS", "weighted_T")  # fmt: skip
@@ -163,6 +165,39 @@ def controller_response(K: StateSpace, hz: Array, period: float | None = None) -
     return np.asarray((K.C @ np.linalg.solve(whole, K.B + 0j) + K.D)[:, 0, 0])
 
 
+@dataclass(frozen=True)
+class Extended:
+    """A measured response with G as c (jω)^-n on further lines below; `first` of the measured ones.
+
+    `gap`: the angle between G there and its asymptote.
+    """
+
+    hz: Array
+    G: np.ndarray
+    first: int
+    poles_at_zero: int
+    gap: float
+
+
+def extended(measured: MeasuredResponse, poles_at_zero: int | None = None) -> Extended:
+    """Three decades further down; n by the slope of |G| at its first lines where none is given."""
+    hz, G = measured.hz, measured.G
+    n = poles_at_zero
+    if n is None:
+        many = max(3, int(np.searchsorted(hz, 1.5 * hz[0])))
+        x, y = np.log(hz[:many]), np.log(np.abs(G[:many]))
+        n = max(0, round(-float(np.polyfit(x, y, 1)[0])))
+    angle = float(np.angle(G[0]))
+    asymptotes = -0.5 * np.pi * n + np.pi * np.arange(-4, 5)
+    nearest = float(asymptotes[np.argmin(np.abs(angle - asymptotes))])
+    below = np.geomspace(10.0**-BELOW * hz[0], hz[0], 25 * BELOW + 1)[:-1]
+    turned = np.clip(1.0 + np.log10(below / hz[0]), 0.0, 1.0)  # within the last decade
+    phase = nearest + turned * (angle - nearest)
+    G_below = np.abs(G[0]) * (below / hz[0]) ** -n * np.exp(1j * phase)
+    return Extended(np.append(below, hz), np.append(G_below, G), len(below), n,
+                    abs(angle - nearest))  # fmt: skip
+
+
 def judge(
     measured: MeasuredResponse,
     K: StateSpace,
@@ -176,33 +211,27 @@ def judge(
     """The figures of an SI controller (e in, u out) on the lines.
 
     `period` in s: K is sampled, and G was measured as the controller sees it, hold and delay in it.
-    `unstable_poles`: P of G. `poles_at_zero`: q of L; by default by the slope of |L| at its first
-    lines. `integrator`: the shape counts from 0 on, else from ω_low.
+    `unstable_poles` and `poles_at_zero` of G; the latter by default by the slope of its first
+    lines. `integrator` of K: then the shape counts from 0 on, else from ω_low.
     """
     if period is not None and measured.hz[-1] > 0.5 / period:
         raise UserError("the lines reach beyond half the sampling rate; drop those above")
-    k = controller_response(K, measured.hz, period)
-    return judge_values(measured, k, bounds, unstable_poles=unstable_poles,
-                        poles_at_zero=poles_at_zero, integrator=integrator)  # fmt: skip
-
-
-def judge_values(
-    measured: MeasuredResponse,
-    k: np.ndarray,
-    bounds: Bounds,
-    *,
-    unstable_poles: int = 0,
-    poles_at_zero: int | None = None,
-    integrator: bool = True,
-) -> MeasuredFigures:
-    """`judge` of a controller's values (k,) at the lines."""
-    hz, G = measured.hz, measured.G
-    L = G * k
-    S = 1.0 / (1.0 + L)
-    Z, sure, words = winding(hz, L, unstable_poles, poles_at_zero)
+    whole = extended(measured, poles_at_zero)
+    k = controller_response(K, whole.hz, period)
+    Z, doubts = winding(whole, whole.G * k, unstable_poles, int(integrator))
+    head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
+    assumed = (
+        f"{head} by the winding of 1 + GK, with {unstable_poles} unstable poles of G, and G as "
+        f"(jω)^-{whole.poles_at_zero} below {measured.hz[0]:.4g} Hz and |GK| < 1 above "
+        f"{measured.hz[-1]:.4g} Hz"
+    )
+    words, sure = "; ".join([assumed, *doubts]), not doubts
     if Z != 0:
         none = dict.fromkeys(FIGURES, np.nan)
         return MeasuredFigures(False, sure, Z, words=words, **none)
+    hz, G, k = measured.hz, measured.G, k[whole.first :]
+    L = G * k
+    S = 1.0 / (1.0 + L)
     omega = HZ * hz
     KS, T = np.nan, np.nan
     if bounds.weights is not None:
@@ -210,14 +239,23 @@ def judge_values(
         KS, T = float(np.abs(W_KS * k * S).max()), float(np.abs(W_T * L * S).max())
     ln_S = np.log(np.abs(S))
     at = int(np.argmax(ln_S))
+    between = clearances(hz, L)
     return MeasuredFigures(
-        True, sure, 0, float(np.abs(S[at])), float(omega[at]),
-        float((1.0 / np.maximum(clearances(hz, L), 1e-300)).max()),
-        float(np.exp(np.interp(np.log(bounds.omega_low), np.log(omega), ln_S))),
-        _bandwidth(omega, ln_S, bounds, integrator),
-        float(np.abs(k * S).max()), float(np.abs(L * S).max()), float(np.abs(G * S).max()),
-        KS, T, words,
-    )  # fmt: skip
+        stable=True,
+        sure=sure,
+        right_half_plane=0,
+        S_peak=float(np.abs(S[at])),
+        S_peak_frequency=float(omega[at]),
+        S_between=float(1.0 / between.min()) if (between > 0.0).all() else np.inf,
+        S_low=float(np.exp(np.interp(np.log(bounds.omega_low), np.log(omega), ln_S))),
+        bandwidth=_bandwidth(omega, ln_S, bounds, integrator),
+        KS=float(np.abs(k * S).max()),
+        T=float(np.abs(L * S).max()),
+        GS=float(np.abs(G * S).max()),
+        weighted_KS=KS,
+        weighted_T=T,
+        words=words,
+    )
 
 
 def clearances(hz: Array, L: np.ndarray) -> Array:
@@ -236,38 +274,32 @@ def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
     around = np.concatenate([second[:1], second, second[-1:]])  # at each line
     wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
     each = np.maximum(around, wider)
-    return np.asarray(np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
+    return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
 
 
 def winding(
-    hz: Array, L: np.ndarray, unstable_poles: int = 0, poles_at_zero: int | None = None
-) -> tuple[int, bool, str]:
-    """Z, whether the data show the assumptions to hold, and these in words."""
+    whole: Extended, L: np.ndarray, unstable_poles: int = 0, integrators: int = 0
+) -> tuple[int, list[str]]:
+    """Z of L = GK (with `integrators` of K) on the extended lines, and what the data leave open."""
     F = 1.0 + L
-    q = poles_at_zero
-    if q is None:
-        many = max(3, int(np.searchsorted(hz, 1.5 * hz[0])))
-        q = max(0, round(-float(np.polyfit(np.log(hz[:many]), np.log(np.abs(L[:many])), 1)[0])))
+    q = whole.poles_at_zero + integrators
     begins = float(np.angle(F[0]))
-    ends = -0.5 * np.pi * q + np.pi * np.arange(-4, 5)
-    gap = float(np.min(np.abs(begins - ends)))
-    first = float(ends[np.argmin(np.abs(begins - ends))])
-    grown = (begins - first) + float(np.angle(F[1:] / F[:-1]).sum()) - float(np.angle(F[-1]))
+    asymptotes = -0.5 * np.pi * q + np.pi * np.arange(-4, 5)
+    first = float(asymptotes[np.argmin(np.abs(begins - asymptotes))])
+    grown = begins - first + float(np.angle(F[1:] / F[:-1]).sum() - np.angle(F[-1]))
     Z = round(unstable_poles + 0.5 * q - grown / np.pi)
-    near = int((clearances(hz, L) <= 0.0).sum())
+    hz, measured = whole.hz[whole.first :], L[whole.first :]
+    near = int((clearances(hz, measured) <= 0.0).sum())
     doubts = []
-    if gap > GAP or (q > 0 and abs(L[0]) < LARGE):
-        doubts.append(f"the first line, {hz[0]:.4g} Hz, does not reach where GK is (jω)^-{q}")
-    if abs(L[-1]) > SMALL:
-        doubts.append(f"the last line, {hz[-1]:.4g} Hz, does not reach where |GK| is small")
+    if whole.gap > GAP:
+        doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
+    if q > 0 and abs(measured[0]) < LARGE:
+        doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large")
+    if abs(measured[-1]) > SMALL:
+        doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
     if near:
         doubts.append(f"between {near} pairs of lines GK may pass -1")
-    head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
-    assumed = (
-        f"{head} by the winding of 1 + GK, with {unstable_poles} unstable poles of G and GK as "
-        f"(jω)^-{q} below the first line"
-    )
-    return Z, not doubts, "; ".join([assumed, *doubts])
+    return Z, doubts
 
 
 def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
