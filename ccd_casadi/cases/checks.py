@@ -2,7 +2,7 @@
 to give instead."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 Check = Callable[[Any], str | None]
@@ -85,6 +85,12 @@ def factors(value: Any) -> str | None:
 def files(value: Any) -> str | None:
     good = isinstance(value, list | tuple) and all(isinstance(v, str) and v for v in value)
     return None if good else f"is {shown(value)}; give a list of file names in quotes"
+
+
+def tables(value: Any) -> str | None:
+    several = value if isinstance(value, list | tuple) else [value]
+    good = all(isinstance(item, Mapping) for item in several)
+    return None if good else f"is {shown(value)}; write a table, or several in double brackets"
 
 
 def rows(width: int) -> Check:

@@ -6,11 +6,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.budget import Kind
 from ccd_casadi.cases.sections import ControllerSection, InnerSection, LoopSection, RobustSection
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.units import HZ
 
 SHAPE = 1.1  # of sections, where the case gives none
 MOST_PLANTS = 24  # option sets
@@ -19,7 +21,7 @@ _OF_SECTIONS = {
     "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
     "robust": ("mode_shift", "gain", "plants"),
-    "inner": ("shape", "compliance_max"),
+    "inner": ("shape", "compliance_max", "minimise", "bandwidth_least_hz"),
 }
 _OF_H_INFINITY = {
     "robust": ("shifts", "design_at"),
@@ -44,6 +46,14 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
                 raise fail(f"{name}.{item.name}", remedy)
     if not structured:
         return
+    inner, budget = sections["inner"], sections["budget"]
+    of_error = inner.minimise == "rms_error"
+    if of_error and not any(getattr(budget, kind.value) for kind in Kind):
+        words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
+        raise fail("inner.minimise", f"{words} or another")
+    if inner.bandwidth_least_hz is not None and not of_error:
+        words = 'has an effect with inner.minimise = "rms_error" only; drop it'
+        raise fail("inner.bandwidth_least_hz", words)
     if loop.delay_us and loop.rate_hz is None:
         words = "a delay needs a sampled loop, whose poles decide its stability; give loop.rate_hz"
         raise fail("loop.delay_us", words)
@@ -113,4 +123,6 @@ def sections_problem(
             options,
         ),
         starts=controller.starts,
+        minimise=inner.minimise,
+        bandwidth_least=HZ * (inner.bandwidth_least_hz or 0.0),
     )

@@ -23,6 +23,7 @@ from ccd_casadi.cases.checks import (
     number,
     points,
     steps,
+    tables,
 )
 
 
@@ -75,7 +76,11 @@ class WeightsSection:
 
 @dataclass(frozen=True)
 class InnerSection:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
+
+    With sections: `minimise` what, "bandwidth" (its negative) or the "rms_error" of [budget], that
+    at a bandwidth of `bandwidth_least_hz` or more.
+    """
 
     S_max: float = _key(
         number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral")
@@ -91,6 +96,8 @@ class InnerSection:
     method: str = _key(choice("search", "sweep"), "search")
     shape: float | None = _key(number(1.0, 10.0, "give 1 to 10", closed=True), None)
     compliance_max: float | None = _key(POSITIVE, None)
+    minimise: str = _key(choice("bandwidth", "rms_error"), "bandwidth")
+    bandwidth_least_hz: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)
@@ -158,6 +165,20 @@ class LoopSection:
 
 
 @dataclass(frozen=True)
+class BudgetSection:
+    """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
+
+    Each kind is one table or several of them; their keys are checked in `budget`.
+    """
+
+    window_ms: float | None = _key(POSITIVE, None)
+    force: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    floor_motion: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    sensor_noise: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    setpoint: tuple[Mapping[str, Any], ...] = _key(tables, ())
+
+
+@dataclass(frozen=True)
 class SamplingSection:
     """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
 
@@ -221,6 +242,7 @@ class Case:
     robust: RobustSection
     controller: ControllerSection
     loop: LoopSection
+    budget: BudgetSection
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
@@ -235,6 +257,7 @@ SECTIONS: dict[str, type] = {
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,
+    "budget": BudgetSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
@@ -129,6 +130,7 @@ class CoDesignProblem:
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
     robust: RobustSet | None = None
     sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
+    budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
