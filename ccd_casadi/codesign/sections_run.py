@@ -25,12 +25,14 @@ from ccd_casadi.codesign.sections_truth import (
     solve_direct_sections,
 )
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import (
     joined,
     judged_widely,
     prepared,
+    proof_of,
     race,
     sections_of_problem,
     sections_value,
@@ -42,6 +44,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 AGAIN = 3  # times that the outer problem is solved at most
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
@@ -62,8 +65,9 @@ class VerifiedSections:
     """The design of a run at θ, and what was found out about it.
 
     `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
-    `worst` the worst plant that was found. `race_gap`: by how much (relative) the race at the end
-    beats the design. `predicted` is what the surrogate says at θ, rad/s.
+    `proof` is for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much
+    (relative) the race at the end beats the design. `predicted` is what the surrogate says at θ,
+    rad/s.
     """
 
     problem: CoDesignProblem
@@ -76,6 +80,7 @@ class VerifiedSections:
     raced: Raced
     wide: Certificate
     checked: int
+    proof: Proof
     worst: Excess
     predicted: float
     rounds: int
@@ -94,7 +99,9 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     """Sections' co-design on the sampler's store and workers."""
     quiet = sampler.quiet
     spent = 0
-    problem, first = seeded_and_prepared(sampler.store, sampler.problem, seed, quiet)
+    problem, first = seeded_and_prepared(
+        sampler.store, sampler.problem, seed, quiet, sampler.workers
+    )
     spent += 1
     rounds = 0
     while True:
@@ -153,7 +160,7 @@ def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
     best, _ = polish_sections(asked, theta)
     design = sections_value(problem, best.theta).design
-    raced = _raced(asked.store, problem, best.theta, quiet)
+    raced = _raced(asked.store, problem, best.theta, quiet, asked.workers)
     worst, members = worst_members(problem, best.theta, design, 0, _teller("at the end", quiet))
     return _End(best, design, raced, worst, members)
 
@@ -164,7 +171,7 @@ def _verified(
     problem, best, made = asked.problem, end.best, end.design
     assert made.controller is not None
     worst = end.worst
-    wide, checked = judged_widely(problem, best.theta, made.controller, worst)
+    wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
     predicted = best.bandwidth
     if outcome.surrogates:
         predicted = float(outcome.surrogates[0].predict(np.array(best.theta)[None, :])[0])
@@ -179,6 +186,7 @@ def _verified(
         raced=end.raced,
         wide=wide,
         checked=checked,
+        proof=proof_of(problem, best.theta, made),
         worst=worst,
         predicted=predicted,
         rounds=rounds,
@@ -204,7 +212,11 @@ def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
 
 
 def seeded_and_prepared(
-    store: SampleStore, problem: CoDesignProblem, seed: int, quiet: bool
+    store: SampleStore,
+    problem: CoDesignProblem,
+    seed: int,
+    quiet: bool,
+    workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, str]:
     """Anchors and members, from the store where an earlier run has found them.
 
@@ -214,7 +226,7 @@ def seeded_and_prepared(
     key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:
-        found, made = prepared(problem, _teller("race at the start", quiet))
+        found, made = prepared(problem, _teller("race at the start", quiet), workers)
         sections = sections_of_problem(found)
         known = {
             "anchors": [list(a) for a in sections.anchors],
@@ -234,14 +246,18 @@ def seeded_and_prepared(
 
 
 def _raced(
-    store: SampleStore, problem: CoDesignProblem, theta: tuple[float, ...], quiet: bool
+    store: SampleStore,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    quiet: bool,
+    workers: Pool | None = None,
 ) -> Raced:
     """A full race at θ, from the store where it was run before."""
     owner = problem_hash({"race": problem_hash(problem.identity())})
     key = sample_key(owner, theta, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:
-        made = race(problem, theta, _teller("race at the end", quiet))
+        made = race(problem, theta, _teller("race at the end", quiet), workers)
         known = {
             "certified": made.certified,
             "bandwidth": float(made.bandwidth) if made.certified else 0.0,

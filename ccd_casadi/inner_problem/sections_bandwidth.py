@@ -19,13 +19,16 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
+from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
+from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 MOST_ANCHORS = 3
 DISTINCT = 0.1  # relative: local optima further below the best are no anchors
@@ -118,7 +121,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
     sections = sections_of_problem(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = [np.array(kappa) for kappa in sections.anchors]
+    initial = warm_starts(problem, plants, bounds)
     made: SectionsDesign | None = None
     spent = 0
     if initial:
@@ -153,7 +156,10 @@ def valued(
 
 
 def race(
-    problem: CoDesignProblem, theta: Sequence[float], progress: Progress | None = None
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    progress: Progress | None = None,
+    workers: Pool | None = None,
 ) -> SectionsDesign:
     """A full race at θ: the problem's starts, and its anchors beside them."""
     sections = sections_of_problem(problem)
@@ -161,7 +167,7 @@ def race(
         plants_of(problem, theta), sections.structure, bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
         initial=[np.array(kappa) for kappa in sections.anchors],
-        frequencies=sections.frequencies, progress=progress,
+        frequencies=sections.frequencies, progress=progress, workers=workers,
     )  # fmt: skip
 
 
@@ -184,7 +190,9 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
 
 
 def prepared(
-    problem: CoDesignProblem, progress: Progress | None = None
+    problem: CoDesignProblem,
+    progress: Progress | None = None,
+    workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     """The problem with anchors and members: a full race at its start θ, worst plants added.
 
@@ -195,7 +203,7 @@ def prepared(
     uncertain = uncertain_plant(problem, problem.start)
     members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
     problem = _with(problem, members=members)
-    made = race(problem, problem.start, progress)
+    made = race(problem, problem.start, progress, workers)
     if not made.certified:
         return problem, made
     anchors = _anchors(made)
@@ -265,7 +273,11 @@ def worst_members(
 
 
 def judged_widely(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace, worst: Excess
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    controller: StateSpace,
+    worst: Excess,
+    workers: Pool | None = None,
 ) -> tuple[Certificate, int]:
     """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
 
@@ -275,7 +287,16 @@ def judged_widely(
     points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
     if not uncertain.names:
         points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
-    return _judged(problem, uncertain.plants(points), controller), len(points)
+    return _judged(problem, uncertain.plants(points), controller, workers), len(points)
+
+
+def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:
+    """Branch and bound over the whole box of plants at θ."""
+    sections = sections_of_problem(problem)
+    return prove(
+        uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
+        bounds_of(problem), sections.sampling,
+    )  # fmt: skip
 
 
 def judged_corners(
@@ -287,7 +308,10 @@ def judged_corners(
 
 
 def _judged(
-    problem: CoDesignProblem, plants: Sequence[ScaledPlant], controller: StateSpace
+    problem: CoDesignProblem,
+    plants: Sequence[ScaledPlant],
+    controller: StateSpace,
+    workers: Pool | None = None,
 ) -> Certificate:
     sections, bounds = sections_of_problem(problem), bounds_of(problem)
     loose = replace(
@@ -298,7 +322,9 @@ def _judged(
         compliance_max=_times(bounds.compliance_max),
     )
     integrator = sections.structure.integrator
-    return certify(plants, controller, loose, sections.sampling, integrator=integrator)
+    return certify(
+        plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
+    )
 
 
 def _times(value: float | None) -> float | None:
