@@ -38,6 +38,7 @@ class ProofOutcome(StrEnum):
     REFUTED = "a plant of the box passes a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     TOO_MANY_PARAMETERS = "more than four uncertain parameters"
+    SEVERAL_CHANNELS = "the plant has several inputs or outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
 
 
@@ -109,6 +110,8 @@ def prove(
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
+    if any(system.B.shape[1] != 1 or system.C.shape[0] != 1 for system in uncertain.options):
+        return without(ProofOutcome.SEVERAL_CHANNELS)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)
     models = [uncertain.plant(uncertain.nominal, i) for i in range(len(uncertain.options))]
