@@ -51,7 +51,7 @@ def _bound_slope(A, B, C, w, ω):
 
 
 def squared_weight_rates(w, ω):
-    """d|W|²/dω of W1, W2, W3: |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c|W|²)/(c ω² + d)."""
+    """d|W|²/dω of W1, W2, W3: (a ω² + b)/(c ω² + d) has the slope 2ω (a - c|W|²)/(c ω² + d)."""
     M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
     W1, W2, W3 = squared_weights(w, ω)
     return (

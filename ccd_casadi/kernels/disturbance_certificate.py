@@ -9,7 +9,7 @@ nor the spectral factor. Plain NumPy around compiled responses and eigenvalues.
 import numpy as np
 
 from ccd_casadi.kernels.closed_loop import loop_matrices
-from ccd_casadi.kernels.frequency import prepare, responses
+from ccd_casadi.kernels.frequency import responses
 from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
 from ccd_casadi.kernels.sensitivity import axis_frequencies
 
