@@ -27,6 +27,7 @@ from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.pullback import squared_weight_slopes
 
 EDGE = 0.95  # squared: a peak of the bound below this share of the highest is not refined
+AT_REST = np.concatenate([[0.0], np.geomspace(1e-9, 5e-6, 8)])  # over ω₀: where W1 is largest
 ZOOMS, POINTS = 4, 17  # each narrows the bracket of a peak to an eighth
 
 
@@ -98,7 +99,8 @@ def bound_terms(W1, effort, sigma, delta):
 
 def _bounds(G, w, delta, omega):
     """γ_jω² (2, k) along the directions of the largest and least gain of G."""
-    sigma = np.linalg.svd(responses(G, omega), compute_uv=False)
+    g = responses(G, omega)
+    sigma = np.abs(g[:, 0]) if g.shape[1:] == (1, 1) else np.linalg.svd(g, compute_uv=False)
     p, m = G[2].shape[0], G[1].shape[1]
     ends = np.array([sigma[:, 0], sigma[:, -1] if m >= p else np.zeros(omega.size)])
     W1, W2, W3 = squared_weights(w, omega)
@@ -108,7 +110,8 @@ def _bounds(G, w, delta, omega):
 def disturbance_bound(A, B, C, w, delta, grid):
     """γ_jω, the ω over ω₀ where it is attained, and whether along the least gain (else largest)."""
     G = prepare(A, B, C)
-    values = _bounds(G, w, delta, grid)
+    grid = np.concatenate([AT_REST, grid])
+    values = np.nan_to_num(_bounds(G, w, delta, grid), nan=0.0)  # a pole at 0
     top, at = values.max(), np.unravel_index(int(values.argmax()), values.shape)
     best = float(top), float(grid[at[1]]), bool(at[0])
     inner = values[:, 1:-1]
@@ -116,7 +119,7 @@ def disturbance_bound(A, B, C, w, delta, grid):
     for branch, i in zip(*np.nonzero(peaks), strict=True):
         low, high = grid[i], grid[i + 2]
         for _ in range(ZOOMS):
-            trial = np.geomspace(low, high, POINTS)
+            trial = np.linspace(low, high, POINTS)
             found = _bounds(G, w, delta, trial)[branch]
             k = int(np.clip(found.argmax(), 1, POINTS - 2))
             low, high = trial[k - 1], trial[k + 1]

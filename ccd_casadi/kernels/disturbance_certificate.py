@@ -43,7 +43,7 @@ def four_block_norm(G, K, Dk, w, delta, grid):
     for i in np.flatnonzero(peaks):
         low, high = grid[i], grid[i + 2]
         for _ in range(ZOOMS):
-            trial = np.geomspace(low, high, POINTS)
+            trial = np.linspace(low, high, POINTS)
             found = four_block_gains(G, K, Dk, w, delta, trial)
             k = int(np.clip(found.argmax(), 1, POINTS - 2))
             low, high = trial[k - 1], trial[k + 1]

@@ -30,7 +30,8 @@ class Sensitivities:
 
     `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt.
     `to_theta` (4, n_θ) per unit of θ; `to_weights` maps a weight's name to the derivatives (4,)
-    to its logarithm; `disturbance` is among them where it is given. `fixed_controller` (n_θ) is dω_b/dθ with K held fixed.
+    to its logarithm, W_d as `disturbance` where it is given. `fixed_controller` (n_θ) is dω_b/dθ
+    with K held fixed.
     `simple` tells whether σ_max is a simple singular value at the three frequencies; where it is
     not, the gradient is one of several one-sided ones.
     """
