@@ -28,7 +28,13 @@ from ccd_casadi.cases.checks import (
     too_large,
 )
 from ccd_casadi.cases.diagnosis import Severity, diagnose
-from ccd_casadi.cases.kinds import check_kind, read_options, require_scalar, sections_problem
+from ccd_casadi.cases.kinds import (
+    check_kind,
+    disturbance_of,
+    read_options,
+    require_scalar,
+    sections_problem,
+)
 from ccd_casadi.cases.sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import with_options
@@ -378,6 +384,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             A_l=w.A_l,
             A_u=w.A_u,
             omega_T=HZ * inner.omega_T_hz[0],
+            disturbance=disturbance_of(case.controller, w),
         ),
         inner=InnerProblem(
             S_max=inner.S_max,

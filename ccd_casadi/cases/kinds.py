@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
-from ccd_casadi.cases.sections import ControllerSection, InnerSection, LoopSection, RobustSection
+from ccd_casadi.cases.sections import (
+    ControllerSection,
+    InnerSection,
+    LoopSection,
+    RobustSection,
+    WeightsSection,
+)
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.plants.plant import Plant
@@ -15,7 +21,9 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
 
 SHAPE = 1.1  # of sections, where the case gives none
+DISTURBANCE = 10.0  # W_d over M_K, where the case gives none
 MOST_PLANTS = 24  # option sets
+WITH_DISTURBANCE = "h_infinity_disturbance"
 # Keys that only one kind looks at, by section.
 _OF_SECTIONS = {
     "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
@@ -39,6 +47,9 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
         else (_OF_SECTIONS, 'has an effect with controller.structure = "sections" only; drop it, '
               "or choose that structure")
     )  # fmt: skip
+    if controller.structure != WITH_DISTURBANCE and sections["weights"].disturbance is not None:
+        words = f'has an effect with controller.structure = "{WITH_DISTURBANCE}" only; drop it, '
+        raise fail("weights.disturbance", words + "or choose that structure")
     for name, keys in other.items():
         table = sections[name]
         for item in fields(table):
@@ -65,6 +76,13 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
         raise fail("controller.roll_off", words)
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
+
+
+def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> float:
+    """W_d in force over displacement; 0 where the kind has none."""
+    if controller.structure != WITH_DISTURBANCE:
+        return 0.0
+    return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
 
 
 def read_options(path: Path) -> dict[str, Any]:

@@ -63,7 +63,11 @@ class ObjectiveSection:
 
 @dataclass(frozen=True)
 class WeightsSection:
-    """[weights] of the paper's Table 1; M_K in force over displacement."""
+    """[weights] of the paper's Table 1; M_K in force over displacement.
+
+    `disturbance` W_d, of the same unit, with "h_infinity_disturbance": so much force weighs as
+    much as a reference of one unit of length. Default: ten times M_K.
+    """
 
     M_S: float = _key(POSITIVE)
     A_S: float = _key(FRACTION)
@@ -72,6 +76,7 @@ class WeightsSection:
     M_K: float = _key(POSITIVE)
     A_l: float = _key(POSITIVE)
     A_u: float = _key(FRACTION)
+    disturbance: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)
@@ -137,14 +142,15 @@ class RobustSection:
 
 @dataclass(frozen=True)
 class ControllerSection:
-    """[controller]: "h_infinity", of full order by mixed sensitivity, or "sections".
+    """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
+    of full order with an input disturbance beside the reference, or "sections".
 
     The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
     of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
     The search starts at `starts` places.
     """
 
-    structure: str = _key(choice("h_infinity", "sections"), "h_infinity")
+    structure: str = _key(choice("h_infinity", "h_infinity_disturbance", "sections"), "h_infinity")
     integrator: bool = _key(flag, True)
     lead: int = _key(count(0), 1)
     biquads: int = _key(count(0), 2)
