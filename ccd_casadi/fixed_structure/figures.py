@@ -386,28 +386,30 @@ def _closed(
     if not len(start):
         return start, np.zeros(0, bool)
 
-    def slope(x: Array) -> Array:
-        loops = evaluate(problem, kappa, tau, which, np.exp(x), order=1)
+    def slope(x: Array, of: np.ndarray) -> Array:
+        loops = evaluate(problem, kappa, tau, which[of], np.exp(x), order=1)
         out = np.empty(len(x))
-        for code in np.unique(curve):
-            chosen = curve == code
+        for code in np.unique(curve[of]):
+            chosen = curve[of] == code
             out[chosen] = loops.slopes[Curve(code)][chosen]
         return out
 
+    every = np.arange(len(start))
     middle = np.log(start)
-    f = slope(middle)
+    f = slope(middle, every)
     other = np.where(f > 0.0, np.log(high), np.log(low))
-    g = slope(other)
+    g = slope(other, every)
     a, fa, b, fb = middle.copy(), f.copy(), other, g
     inside = (fa * fb < 0.0) & np.isfinite(fa) & np.isfinite(fb)
+    left = np.flatnonzero(inside)
     for _ in range(CLOSINGS):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = b - fb * (b - a) / (fb - fa)
-        x = np.where(inside & np.isfinite(x), x, b)
-        fx = slope(x)
-        opposite = fx * fb < 0.0
-        a, fa = np.where(opposite, b, a), np.where(opposite, fb, 0.5 * fa)
-        b, fb = x, fx
-        if not inside.any() or np.abs(np.where(inside, fx, 0.0)).max() < 1e-9:
+        if not len(left):
             break
+        A, FA, B, FB = a[left], fa[left], b[left], fb[left]
+        x = B - FB * (B - A) / (FB - FA)
+        fx = slope(x, left)
+        opposite = fx * FB < 0.0
+        a[left], fa[left] = np.where(opposite, B, A), np.where(opposite, FB, 0.5 * FA)
+        b[left], fb[left] = x, fx
+        left = left[np.abs(fx) >= 1e-9]
     return np.exp(np.where(inside, b, middle)), inside

@@ -12,6 +12,7 @@ Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eig, expm
@@ -90,6 +91,13 @@ class PlantSet:
     C: Array
     D: Array
 
+    @cached_property
+    def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of hold and delay: d (P,), and a mode's two moments and e^{pT}, (P, n)."""
+        assert self.period is not None
+        d, late, early = _moments(self.poles, self.period, self.delay)
+        return np.full(len(self.poles), d), late, early, np.exp(self.poles * self.period)
+
     def frequency(self, v: Array) -> Array:
         """ω of v, both over ω₀."""
         if self.period is None:
@@ -113,9 +121,9 @@ class PlantSet:
             G = (r * terms).sum(-1)
             return G, -(r * terms * terms).sum(-1) * 1j * v
         T = self.period
-        d, late, early = _moments(p, T, self.delay)
+        d, late, early, grown = (part[which] for part in self.held)
         z = np.exp(s * T)
-        gap = np.exp(p * T) * np.expm1((s - p) * T)
+        gap = grown * np.expm1((s - p) * T)
         value = r * (late + early / z) / gap
         slope = r * early / (z * gap) + value * z / gap
         shift = np.exp(-1j * omega * T * d)

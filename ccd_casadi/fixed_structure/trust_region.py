@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
+from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.figures import Assessment, Constraints, Problem, assess
 from ccd_casadi.support.arrays import Array
 
@@ -26,6 +26,10 @@ PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth s
 ROWS = (64, 128, 256, 400)  # sizes of programmes, so that few solvers are made
 FLAT = 1e-4  # least curvature, which leaves a linear programme one
 ENOUGH = 0.7  # of the predicted gain: with it a model is trusted further
+STEADY = 3  # steps at one radius, each of a middling gain, after which a larger one is tried
+WIDER = 10.0
+PROGRAMMES = 6  # around each other, for one step
+SETTLED = 1e-2  # of the radius: a step that moves less from one programme to the next
 KEPT = 1e-7  # by how much a programme's answer may miss its own rows
 # The dual active-set method is fast, the interior-point method misses nothing.
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -59,12 +63,12 @@ class Ascent:
 
 @dataclass(frozen=True)
 class Step:
-    """p = (d, δ), the gain of merit that the model predicts, the rows and their multipliers."""
+    """p = (d, δ), the gain of merit that the model predicts, and that it would have with straight
+    rows; the Lagrangian's curvature there."""
 
     change: Array
     predicted: float
-    rows: Constraints
-    multipliers: Array
+    straight: float
     hessian: Array
 
 
@@ -79,12 +83,15 @@ def ascend(
     penalty: float = PENALTY,
 ) -> Ascent:
     """Climb from a start whose loops are stable; ends where steps no longer help."""
-    point, evaluations = start, 0
+    point, evaluations, steady = start, 0, 0
     for _ in range(iterations):
         step = best_step(problem, point, radius, penalty)
-        if step is None or step.predicted <= least_gain:
+        if step is None or step.straight <= least_gain or radius < least_radius:
             break
-        trial = _moved(problem, point, step)
+        if step.predicted <= least_gain:  # so curved that the model finds nothing as far as this
+            radius *= 0.3
+            continue
+        trial = _moved(problem, point, step.change)
         evaluations += 1
         gained = trial.merit(penalty) - point.merit(penalty)
         if gained < ENOUGH * step.predicted and trial.assessment.stable:
@@ -98,83 +105,111 @@ def ascend(
         size = float(np.abs(step.change).max())
         if gained > 0.0:
             point = trial
+        steady += 1
         if gained > ENOUGH * step.predicted:
-            radius = min(max(radius, 2.0 * size), LARGEST_RADIUS)
+            radius, steady = min(max(radius, 1.4 * size), LARGEST_RADIUS), 0
         elif gained < 0.2 * step.predicted:
-            radius = (0.5 if gained > 0.0 else 0.3) * min(radius, size)
+            radius, steady = (0.5 if gained > 0.0 else 0.3) * min(radius, size), 0
+        elif steady == STEADY:
+            # What a small step gains less than predicted may be a violation so small that the
+            # linear rows overshoot it, whatever the radius: it is the gain that asks for more.
+            radius, steady = min(WIDER * radius, LARGEST_RADIUS), 0
         if radius < least_radius:
             break
     return Ascent(point, radius, evaluations)
 
 
-def _moved(problem: Problem, point: Point, step: Step) -> Point:
-    kappa = np.clip(point.kappa + step.change[:-1], *problem.box)
-    tau = point.tau + float(step.change[-1])
+def _moved(problem: Problem, point: Point, change: Array) -> Point:
+    kappa = np.clip(point.kappa + change[:-1], *problem.box)
+    tau = point.tau + float(change[-1])
     return Point(kappa, tau, assess(problem, kappa, tau))
 
 
 def best_step(
     problem: Problem, point: Point, radius: float, penalty: float = PENALTY
 ) -> Step | None:
-    """The step of the quadratic model; None where its programme has no answer."""
-    rows = _rows(point.assessment, radius)
-    flat = FLAT * np.eye(len(point.kappa) + 1)
-    linear = _programme(problem, point, rows, rows.value, flat, radius, penalty)
-    if linear is None:
-        return None
-    mu = np.where(linear.multipliers > 1e-7 * penalty, linear.multipliers, 0.0)
-    hessian = lagrangian_hessian(problem, point.kappa, point.tau, rows, mu)
-    active = np.column_stack([rows.to_kappa, rows.to_tau])[mu > 0.0]
-    values, vectors = np.linalg.eigh(hessian + CONVEXIFYING * active.T @ active)
-    convex = (vectors * np.maximum(values, FLAT)) @ vectors.T
-    return _programme(problem, point, rows, rows.value, convex, radius, penalty) or linear
+    """The best step that the model knows; None where its programme has no answer.
+
+    Of those peaks that hold the step the model is quadratic, of the other rows linear:
+    programmes around the step before, each with the curvature of what holds it, until it stays.
+    """
+    rows, peaks = _rows(point.assessment, radius)
+    n, m = len(point.kappa) + 1, len(rows.v)
+    slopes = np.column_stack([rows.to_kappa, rows.to_tau])
+    curved, known = np.zeros((m, n, n)), np.zeros(m, bool)
+    violation = point.assessment.violation
+    at, value, convex, p = slopes, rows.value, FLAT * np.eye(n), np.zeros(n)
+    best: Step | None = None
+    for turn in range(PROGRAMMES):
+        found = _programme(problem, point, at, value, convex, p, radius, penalty)
+        if found is None:
+            break
+        if turn == 0:
+            level = float((rows.value + slopes @ found[0]).max(initial=0.0))
+            straight = float(found[0][-1]) + penalty * (violation - level)
+        moved = float(np.abs(found[0] - p).max())
+        p, mu = found
+        holds = mu > 1e-7 * penalty
+        fresh = holds & peaks & ~known
+        curved[fresh] = hessians(problem, point.kappa, point.tau, rows.only(fresh))
+        known |= fresh
+        bend = curved @ p
+        at, value = slopes + bend, rows.value - 0.5 * bend @ p
+        level = float((value + at @ p).max(initial=0.0))
+        gain = float(p[-1]) + penalty * (violation - level)
+        hessian = np.einsum("m,mij->ij", np.where(holds, mu, 0.0), curved)
+        lam, vectors = np.linalg.eigh(hessian + CONVEXIFYING * at[holds].T @ at[holds])
+        convex = (vectors * np.maximum(lam, FLAT)) @ vectors.T
+        if best is None or gain > best.predicted:
+            best = Step(p, gain, straight, convex)
+        if not fresh.any() and moved < SETTLED * radius:
+            break
+    return best
 
 
 def _corrected(
     problem: Problem, point: Point, step: Step, trial: Point, radius: float, penalty: float
-) -> Step | None:
+) -> Array | None:
     """The second-order correction: the same model with the constraints as they are at the trial."""
-    rows = _rows(trial.assessment, radius)
-    back = rows.to_kappa @ step.change[:-1] + rows.to_tau * step.change[-1]
-    value = rows.value - back
-    return _programme(problem, point, rows, value, step.hessian, radius, penalty)
+    rows, _ = _rows(trial.assessment, radius)
+    slopes = np.column_stack([rows.to_kappa, rows.to_tau])
+    value = rows.value - slopes @ step.change
+    found = _programme(problem, point, slopes, value, step.hessian, step.change, radius, penalty)
+    return None if found is None else found[0]
 
 
 def _programme(
     problem: Problem,
     point: Point,
-    rows: Constraints,
+    slopes: Array,
     value: Array,
     hessian: Array,
+    centre: Array,
     radius: float,
     penalty: float,
-) -> Step | None:
-    n, m = len(point.kappa), len(rows.v)
+) -> tuple[Array, Array] | None:
+    """p and the multipliers of the rows value + slopes·p <= σ; H acts on p less the centre."""
+    m, n = slopes.shape
     size = next(size for size in ROWS if size >= m)
-    A = np.zeros((size, n + 2))
-    A[:m, :n], A[:m, n], A[:m, n + 1] = rows.to_kappa, rows.to_tau, -1.0
+    A = np.zeros((size, n + 1))
+    A[:m, :n], A[:m, n] = slopes, -1.0
     upper = np.ones(size)
     upper[:m] = -value
-    H = np.zeros((n + 2, n + 2))
-    H[: n + 1, : n + 1], H[n + 1, n + 1] = hessian, FLAT
-    cost = np.zeros(n + 2)
-    cost[n], cost[n + 1] = -1.0, penalty
-    low, high = np.full(n + 2, -radius), np.full(n + 2, radius)
-    low[:n] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
-    high[:n] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
-    violation = point.assessment.violation
-    low[n + 1], high[n + 1] = 0.0, 1e4
+    H = np.zeros((n + 1, n + 1))
+    H[:n, :n], H[n, n] = hessian, FLAT
+    cost = np.concatenate([-hessian @ centre, [penalty]])
+    cost[n - 1] -= 1.0
+    low, high = np.full(n + 1, -radius), np.full(n + 1, radius)
+    low[: n - 1] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
+    high[: n - 1] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
+    low[n], high[n] = 0.0, 1e4
     for name in ("daqp", "ipqp"):
-        solver = _solver(name, n + 2, size)
+        solver = _solver(name, n + 1, size)
         found = solver(h=H, g=cost, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
         x = np.array(found["x"]).ravel()
         if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
-            break
-    else:
-        return None
-    predicted = -float(found["cost"]) + penalty * violation
-    mu = np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
-    return Step(x[: n + 1], predicted, rows, mu, hessian)
+            return x[:n], np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
+    return None
 
 
 @lru_cache(maxsize=64)
@@ -183,8 +218,9 @@ def _solver(name: str, n: int, rows: int) -> ca.Function:
     return ca.conic("programme", name, shapes, {"error_on_fail": False, **OPTIONS[name]})
 
 
-def _rows(found: Assessment, radius: float) -> Constraints:
-    """The constraints that a step of this size may meet, the highest where they are too many."""
+def _rows(found: Assessment, radius: float) -> tuple[Constraints, np.ndarray]:
+    """The constraints that a step of this size may meet, the highest where they are too many;
+    and which of them are peaks."""
     assert found.peaks is not None
     assert found.near is not None
     parts = (found.peaks, found.near)
@@ -199,4 +235,4 @@ def _rows(found: Assessment, radius: float) -> Constraints:
     chosen = np.flatnonzero(slack > 0.0)
     if len(chosen) > ROWS[-1]:
         chosen = chosen[np.argsort(-slack[chosen])[: ROWS[-1]]]
-    return joint.only(chosen)
+    return joint.only(chosen), chosen < len(found.peaks.v)
