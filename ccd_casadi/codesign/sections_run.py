@@ -42,6 +42,7 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 AGAIN = 3  # times that the outer problem is solved at most
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
@@ -94,7 +95,9 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     """Sections' co-design on the sampler's store and workers."""
     quiet = sampler.quiet
     spent = 0
-    problem, first = seeded_and_prepared(sampler.store, sampler.problem, seed, quiet)
+    problem, first = seeded_and_prepared(
+        sampler.store, sampler.problem, seed, quiet, sampler.workers
+    )
     spent += 1
     rounds = 0
     while True:
@@ -153,7 +156,7 @@ def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
     best, _ = polish_sections(asked, theta)
     design = sections_value(problem, best.theta).design
-    raced = _raced(asked.store, problem, best.theta, quiet)
+    raced = _raced(asked.store, problem, best.theta, quiet, asked.workers)
     worst, members = worst_members(problem, best.theta, design, 0, _teller("at the end", quiet))
     return _End(best, design, raced, worst, members)
 
@@ -164,7 +167,7 @@ def _verified(
     problem, best, made = asked.problem, end.best, end.design
     assert made.controller is not None
     worst = end.worst
-    wide, checked = judged_widely(problem, best.theta, made.controller, worst)
+    wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
     predicted = best.bandwidth
     if outcome.surrogates:
         predicted = float(outcome.surrogates[0].predict(np.array(best.theta)[None, :])[0])
@@ -204,7 +207,11 @@ def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
 
 
 def seeded_and_prepared(
-    store: SampleStore, problem: CoDesignProblem, seed: int, quiet: bool
+    store: SampleStore,
+    problem: CoDesignProblem,
+    seed: int,
+    quiet: bool,
+    workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, str]:
     """Anchors and members, from the store where an earlier run has found them.
 
@@ -214,7 +221,7 @@ def seeded_and_prepared(
     key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:
-        found, made = prepared(problem, _teller("race at the start", quiet))
+        found, made = prepared(problem, _teller("race at the start", quiet), workers)
         sections = sections_of_problem(found)
         known = {
             "anchors": [list(a) for a in sections.anchors],
@@ -234,14 +241,18 @@ def seeded_and_prepared(
 
 
 def _raced(
-    store: SampleStore, problem: CoDesignProblem, theta: tuple[float, ...], quiet: bool
+    store: SampleStore,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    quiet: bool,
+    workers: Pool | None = None,
 ) -> Raced:
     """A full race at θ, from the store where it was run before."""
     owner = problem_hash({"race": problem_hash(problem.identity())})
     key = sample_key(owner, theta, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:
-        made = race(problem, theta, _teller("race at the end", quiet))
+        made = race(problem, theta, _teller("race at the end", quiet), workers)
         known = {
             "certified": made.certified,
             "bandwidth": float(made.bandwidth) if made.certified else 0.0,

@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.loop import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced, transmission_zeros
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.synthesis.norms import hinf_norm
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
@@ -81,12 +82,18 @@ def certify(
     sampling: Sampling | None = None,
     *,
     integrator: bool = True,
+    workers: Pool | None = None,
 ) -> Certificate:
     """Judge an SI controller (e in, u out) on SISO plants against the bounds.
 
-    `integrator`: the shape counts from 0 on, else from ω_low. ω_b is the least of all plants.
+    `integrator`: the shape counts from 0 on, else from ω_low. ω_b is the least of all plants. The
+    plants are spread over `workers`.
     """
-    found = [judged(plant, controller, bounds, sampling, integrator) for plant in plants]
+    tasks = [
+        (i, (plant, controller, bounds, sampling, integrator)) for i, plant in enumerate(plants)
+    ]
+    each = dict((workers or Workers(1)).map_unordered(_judge, tasks))
+    found = [each[i] for i in range(len(tasks))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
     if unstable:
         words = f"unstable on plant {unstable[0]} of {len(found)}"
@@ -109,6 +116,13 @@ def certify(
         words = f"stable and within every bound on {len(found)} plants"
     passed = not broken and not lost and bandwidth > 0.0
     return Certificate(passed, bandwidth, tuple(found), worst, words)
+
+
+Task = tuple[ScaledPlant, StateSpace, Bounds, Sampling | None, bool]
+
+
+def _judge(task: tuple[int, Task]) -> tuple[int, PlantFigures]:
+    return task[0], judged(*task[1])
 
 
 def judged(

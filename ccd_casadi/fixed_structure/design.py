@@ -1,11 +1,11 @@
-"""The largest bandwidth of a fixed structure on a set of plants: starts, races, certificate.
+"""The largest bandwidth of a fixed structure on a set of plants: starts, race, certificate.
 
-Many starts climb some steps each, the better half goes on, and so forth; what is left climbs until
-steps help no longer. The best one whose controller passes the judge (`certificate`) is the design.
+The best end of a race of local searches whose controller passes the judge (`certificate`) is the
+design.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from time import perf_counter
 
@@ -16,20 +16,17 @@ from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
+from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
 from ccd_casadi.fixed_structure.structure import Kind, Structure, state_space
-from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
+from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 POOL = 12  # random starts tried for stability for each one that is raced
-RACE = (15, 30, 60)  # steps of each round, after which the better half goes on
-LAST = 3  # that climb to the end, if they are
-BEHIND = 0.1  # (in ln ω_b) no further behind
-LONGEST = 300
-SAME = 2e-3  # relative: bandwidths of one local optimum
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
@@ -40,15 +37,6 @@ class SectionsOutcome(StrEnum):
     NO_STABLE_START = "no start is stable on every plant of the set"
     BOUND_NOT_MET = "no controller was found that meets every bound"
     NOT_CERTIFIED = "the judge does not confirm what the search found"
-
-
-@dataclass(frozen=True)
-class LocalOptimum:
-    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached, with one κ."""
-
-    bandwidth: float
-    count: int
-    kappa: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -124,13 +112,15 @@ def synthesise_sections(
     only_initial: bool = False,
     frequencies: tuple[float, float] | None = None,
     progress: Progress | None = None,
+    workers: Pool | None = None,
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every SISO plant.
 
     `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they race
     beside `starts` others by rules and at random, or alone with `only_initial`. `frequencies` as in
-    `problem_for`: give them where designs at several θ are compared. Raises PlantError
-    for plants that cannot be in a set.
+    `problem_for`: give them where designs at several θ are compared. The searches of a race are
+    spread over `workers`; their number changes nothing else. Raises PlantError for plants that
+    cannot be in a set.
     """
     begun = perf_counter()
     problem = problem_for(plants, structure, bounds, sampling, frequencies)
@@ -150,11 +140,12 @@ def synthesise_sections(
 
     if not len(pool):
         return failed(SectionsOutcome.NO_STABLE_START)
-    ends, evaluations = _race(problem, pool, tell)
+    runners = run_race(problem, pool, tell, workers)
+    evaluations = sum(runner.evaluations for runner in runners)
+    ends = finished(runners)
     best: SectionsDesign | None = None
-    optima = _distinct(problem, ends)
-    for end in sorted(ends, key=lambda end: -end.point.merit()):
-        point = end.point
+    optima = local_optima(problem, ends)
+    for point in (runner.point for runner in ends):
         if point.assessment.violation > MARGIN:
             again = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02)
             evaluations += again.evaluations
@@ -241,42 +232,6 @@ def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
     tau = float(np.log(0.1))
     misses = [assess(problem, one, tau).violation for one in kappa]
     return kappa[np.argsort(misses)[:count]]
-
-
-def _race(problem: Problem, pool: Array, tell: Progress) -> tuple[list[Ascent], int]:
-    tau = float(np.log(0.1))
-    field = [Ascent(Point(k, tau, assess(problem, k, tau)), FIRST_RADIUS, 0) for k in pool]
-    evaluations = len(field)
-    scale = problem.plants.omega_0 / (2.0 * np.pi)
-    for steps in (*RACE, LONGEST):
-        moved = []
-        for runner in field:
-            end = ascend(problem, runner.point, iterations=steps, radius=runner.radius)
-            moved.append(end)
-            evaluations += end.evaluations
-        field = sorted(moved, key=lambda end: -end.point.merit())
-        lead = field[0].point
-        tell(f"{len(field)} searches, {evaluations} loops: {np.exp(lead.tau) * scale:.2f} Hz, "
-             f"bounds passed by {lead.assessment.violation:.1g}")  # fmt: skip
-        if steps != LONGEST:
-            field = field[: max(LAST, len(field) // 2 if steps != RACE[-1] else LAST)]
-        if steps == RACE[-1]:
-            field = [end for end in field if end.point.merit() > lead.tau - BEHIND] or field[:1]
-    return field, evaluations
-
-
-def _distinct(problem: Problem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, ...]:
-    P = problem.plants
-    good = [end.point for end in ends if end.point.assessment.violation <= 1e-4]
-    found: list[LocalOptimum] = []
-    for point in sorted(good, key=lambda point: -point.tau):
-        value = float(np.exp(point.tau)) * P.omega_0
-        if found and value >= found[-1].bandwidth * (1.0 - SAME):
-            found[-1] = replace(found[-1], count=found[-1].count + 1)
-        else:
-            kappa = problem.structure.in_units(point.kappa, P.omega_0, P.force)
-            found.append(LocalOptimum(value, 1, tuple(map(float, kappa))))
-    return tuple(found)
 
 
 def _designed(

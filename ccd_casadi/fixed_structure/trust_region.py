@@ -54,11 +54,15 @@ class Point:
 
 @dataclass(frozen=True)
 class Ascent:
-    """Where a local search ended, the radius it had, and how many loops it looked at."""
+    """Where a local search is, the radius it has, and how many loops it looked at.
+
+    `done`: further steps do not help.
+    """
 
     point: Point
     radius: float
     evaluations: int
+    done: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,10 +87,11 @@ def ascend(
     penalty: float = PENALTY,
 ) -> Ascent:
     """Climb from a start whose loops are stable; ends where steps no longer help."""
-    point, evaluations, steady = start, 0, 0
+    point, evaluations, steady, done = start, 0, 0, False
     for _ in range(iterations):
         step = best_step(problem, point, radius, penalty)
         if step is None or step.straight <= least_gain or radius < least_radius:
+            done = True
             break
         if step.predicted <= least_gain:  # so curved that the model finds nothing as far as this
             radius *= 0.3
@@ -114,9 +119,7 @@ def ascend(
             # What a small step gains less than predicted may be a violation so small that the
             # linear rows overshoot it, whatever the radius: it is the gain that asks for more.
             radius, steady = min(WIDER * radius, LARGEST_RADIUS), 0
-        if radius < least_radius:
-            break
-    return Ascent(point, radius, evaluations)
+    return Ascent(point, radius, evaluations, done)
 
 
 def _moved(problem: Problem, point: Point, change: Array) -> Point:

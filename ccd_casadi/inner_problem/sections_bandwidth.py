@@ -19,6 +19,8 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
@@ -26,6 +28,7 @@ from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 MOST_ANCHORS = 3
 DISTINCT = 0.1  # relative: local optima further below the best are no anchors
@@ -118,7 +121,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
     sections = sections_of_problem(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = [np.array(kappa) for kappa in sections.anchors]
+    initial = _warm(problem, theta, plants, bounds)
     made: SectionsDesign | None = None
     spent = 0
     if initial:
@@ -134,6 +137,51 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
         )  # fmt: skip
         spent += 1
     return valued(problem, theta, plants, made, spent)
+
+
+def _warm(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+) -> list[Array]:
+    """Each anchor as it is or moved with the plant from the start θ to this, whichever is nearer.
+
+    Moved: frequencies with the first flexible mode, the gain as 1/|G| at the frequency that the
+    crossover moves with; a notch stays on its resonance.
+    """
+    sections = sections_of_problem(problem)
+    if not sections.anchors:
+        return []
+    first = scaled_plant(problem, problem.start)
+    here = plants[0]
+    frequency = _first_mode(here) / _first_mode(first)
+    found = problem_for(plants, sections.structure, bounds, sections.sampling, sections.frequencies)
+    warm = []
+    for kappa in map(np.array, sections.anchors):
+        crossover = 0.1 * first.omega_0
+        gain = _size(first, crossover) / _size(here, frequency * crossover)
+        moved = sections.structure.in_units(kappa, frequency, gain)
+        both = [kappa, moved]
+        merits = [
+            started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
+            for one in both
+        ]
+        warm.append(both[int(np.argmax(merits))])
+    return warm
+
+
+def _first_mode(plant: ScaledPlant) -> float:
+    """The lowest flexible frequency in rad/s; ω₀ where there is none."""
+    light = plant.natural[plant.natural > 0.0]
+    return float(light.min()) if len(light) else plant.omega_0
+
+
+def _size(plant: ScaledPlant, omega: float) -> float:
+    """|G(jω)| in m/N."""
+    si = plant.plant_si()
+    solved = np.linalg.solve(1j * omega * np.eye(len(si.A)) - si.A, si.B + 0j)
+    return float(np.abs((si.C @ solved)[0, 0]))
 
 
 def valued(
@@ -153,7 +201,10 @@ def valued(
 
 
 def race(
-    problem: CoDesignProblem, theta: Sequence[float], progress: Progress | None = None
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    progress: Progress | None = None,
+    workers: Pool | None = None,
 ) -> SectionsDesign:
     """A full race at θ: the problem's starts, and its anchors beside them."""
     sections = sections_of_problem(problem)
@@ -161,7 +212,7 @@ def race(
         plants_of(problem, theta), sections.structure, bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
         initial=[np.array(kappa) for kappa in sections.anchors],
-        frequencies=sections.frequencies, progress=progress,
+        frequencies=sections.frequencies, progress=progress, workers=workers,
     )  # fmt: skip
 
 
@@ -184,7 +235,9 @@ def with_range(problem: CoDesignProblem) -> CoDesignProblem:
 
 
 def prepared(
-    problem: CoDesignProblem, progress: Progress | None = None
+    problem: CoDesignProblem,
+    progress: Progress | None = None,
+    workers: Pool | None = None,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     """The problem with anchors and members: a full race at its start θ, worst plants added.
 
@@ -195,7 +248,7 @@ def prepared(
     uncertain = uncertain_plant(problem, problem.start)
     members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
     problem = _with(problem, members=members)
-    made = race(problem, problem.start, progress)
+    made = race(problem, problem.start, progress, workers)
     if not made.certified:
         return problem, made
     anchors = _anchors(made)
@@ -265,7 +318,11 @@ def worst_members(
 
 
 def judged_widely(
-    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace, worst: Excess
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    controller: StateSpace,
+    worst: Excess,
+    workers: Pool | None = None,
 ) -> tuple[Certificate, int]:
     """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
 
@@ -275,7 +332,7 @@ def judged_widely(
     points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
     if not uncertain.names:
         points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
-    return _judged(problem, uncertain.plants(points), controller), len(points)
+    return _judged(problem, uncertain.plants(points), controller, workers), len(points)
 
 
 def judged_corners(
@@ -287,7 +344,10 @@ def judged_corners(
 
 
 def _judged(
-    problem: CoDesignProblem, plants: Sequence[ScaledPlant], controller: StateSpace
+    problem: CoDesignProblem,
+    plants: Sequence[ScaledPlant],
+    controller: StateSpace,
+    workers: Pool | None = None,
 ) -> Certificate:
     sections, bounds = sections_of_problem(problem), bounds_of(problem)
     loose = replace(
@@ -298,7 +358,9 @@ def _judged(
         compliance_max=_times(bounds.compliance_max),
     )
     integrator = sections.structure.integrator
-    return certify(plants, controller, loose, sections.sampling, integrator=integrator)
+    return certify(
+        plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
+    )
 
 
 def _times(value: float | None) -> float | None:

@@ -1,0 +1,159 @@
+"""A race of local searches: from many starts, by successive halving, to distinct local optima.
+
+All climb some steps, the better half goes on, and so forth. A search stops early where its steps no
+longer help, where it has come to a controller that a better one has already been at, and where it
+gains so little that it cannot overtake. Each climb is a function of its start alone, so that any
+number of processes finds the same.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.figures import Problem, assess
+from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool, Workers
+
+FIRST = float(np.log(0.1))  # τ at the start, ω_b over ω₀
+ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
+HALVINGS = 3  # rounds after which the better half goes on
+LAST = 3  # that are never halved away
+BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
+OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
+MERGED = 1e-3  # in κ and τ: searches as close as that are one
+SAME = 2e-3  # relative: bandwidths of one local optimum
+WITHIN = 1e-4  # ln: a violation that the end of a search may have
+
+
+@dataclass(frozen=True)
+class LocalOptimum:
+    """A bandwidth (rad/s) that `count` of the searches that ran to the end reached, with one κ."""
+
+    bandwidth: float
+    count: int
+    kappa: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Runner:
+    """One search: where it is, the radius, what its last round gained, loops looked at in all.
+
+    `done`: its steps no longer help. `running`: it goes on. `count`: searches that it stands for.
+    """
+
+    point: Point
+    radius: float = FIRST_RADIUS
+    gained: float = np.inf
+    evaluations: int = 1
+    done: bool = False
+    running: bool = True
+    count: int = 1
+
+    @property
+    def merit(self) -> float:
+        """That of its point."""
+        return self.point.merit()
+
+
+def run_race(
+    problem: Problem,
+    pool: Array,
+    tell: Callable[[str], None],
+    workers: Pool | None = None,
+) -> list[Runner]:
+    """All searches from the starts `pool` (N, n), the best first."""
+    field = [Runner(started(problem, kappa)) for kappa in pool]
+    scale = problem.plants.omega_0 / (2.0 * np.pi)
+    for turn, steps in enumerate(ROUNDS):
+        running = [runner for runner in field if runner.running]
+        if not running:
+            break
+        others = [runner for runner in field if not runner.running]
+        field = others + _climbed(problem, running, steps, workers or Workers(1))
+        field = _merged(problem, sorted(field, key=lambda runner: -runner.merit))
+        field = _going_on(field, turn)
+        lead = field[0].point
+        going = sum(runner.running for runner in field)
+        tell(f"{len(running)} searches, {sum(runner.evaluations for runner in field)} loops, "
+             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds passed by "
+             f"{lead.assessment.violation:.1g}")  # fmt: skip
+    return field
+
+
+def started(problem: Problem, kappa: Array) -> Point:
+    """A controller at the bandwidth that searches start from."""
+    return Point(kappa, FIRST, assess(problem, kappa, FIRST))
+
+
+def finished(runners: Sequence[Runner]) -> list[Runner]:
+    """Those whose steps no longer help, and the best; the best first."""
+    return [runner for i, runner in enumerate(runners) if runner.done or i < LAST]
+
+
+def local_optima(problem: Problem, ends: Sequence[Runner]) -> tuple[LocalOptimum, ...]:
+    """The distinct bandwidths within the bounds, the largest first."""
+    P = problem.plants
+    good = [end for i, end in enumerate(ends)
+            if (end.done or i == 0) and end.point.assessment.violation <= WITHIN]  # fmt: skip
+    found: list[LocalOptimum] = []
+    for end in sorted(good, key=lambda end: -end.point.tau):
+        value = float(np.exp(end.point.tau)) * P.omega_0
+        if found and value >= found[-1].bandwidth * (1.0 - SAME):
+            found[-1] = replace(found[-1], count=found[-1].count + end.count)
+        else:
+            kappa = problem.structure.in_units(end.point.kappa, P.omega_0, P.force)
+            found.append(LocalOptimum(value, end.count, tuple(map(float, kappa))))
+    return tuple(found)
+
+
+def _climbed(
+    problem: Problem, running: Sequence[Runner], steps: int, workers: Pool
+) -> list[Runner]:
+    """All of them some steps further, in their order."""
+    tasks = [(i, problem, r.point, r.radius, steps) for i, r in enumerate(running)]
+    ends = dict(workers.map_unordered(_climb, tasks))
+    found = []
+    for i, runner in enumerate(running):
+        end = ends[i]
+        spent = runner.evaluations + end.evaluations
+        gained = end.point.merit() - runner.merit
+        found.append(Runner(end.point, end.radius, gained, spent, end.done, not end.done,
+                            runner.count))  # fmt: skip
+    return found
+
+
+def _climb(task: tuple[int, Problem, Point, float, int]) -> tuple[int, Ascent]:
+    index, problem, point, radius, steps = task
+    return index, ascend(problem, point, iterations=steps, radius=radius)
+
+
+def _merged(problem: Problem, field: Sequence[Runner]) -> list[Runner]:
+    """The field, best first, without searches that are where a better one is."""
+    kept: list[Runner] = []
+    for runner in field:
+        for i, other in enumerate(kept):
+            near = abs(runner.point.tau - other.point.tau) <= MERGED
+            if near and np.abs(runner.point.kappa - other.point.kappa).max() <= MERGED:
+                spent = other.evaluations + runner.evaluations
+                kept[i] = replace(other, count=other.count + runner.count, evaluations=spent)
+                break
+        else:
+            kept.append(runner)
+    return kept
+
+
+def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
+    """The field, best first, with those stopped that have lost."""
+    running = [i for i, runner in enumerate(field) if runner.running]
+    most = max(LAST, len(running) // 2) if turn < HALVINGS else len(running)
+    lead, found = field[0].merit, list(field)
+    for place, i in enumerate(running):
+        runner = field[i]
+        behind = lead - runner.merit
+        lost = place >= most or behind > OVERTAKING * runner.gained
+        lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
+        if lost and i:
+            found[i] = replace(runner, running=False)
+    return found
