@@ -18,6 +18,7 @@ from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.sections_verdict import sections_verdict
 from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
@@ -111,6 +112,25 @@ def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str,
     }
 
 
+def proof_dict(proof: Proof) -> dict[str, Any]:
+    """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
+    found: dict[str, Any] = {
+        "outcome": proof.outcome.name.lower(),
+        "words": proof.words,
+        "slack": proof.slack,
+        "parameters": list(proof.parameters),
+        "levels": {BINDS[name]: level for name, level in proof.levels.items()},
+        "boxes": proof.boxes,
+    }
+    if proof.refuted:
+        found |= {
+            "option": proof.option,
+            "point": list(proof.point),
+            "passed": [BINDS[proof.passed[0]], proof.passed[1]],
+        }
+    return found
+
+
 def sections_result(
     problem: CoDesignProblem,
     formulation: str,
@@ -132,7 +152,7 @@ def sections_result(
         "constraints": bool((lam <= 1e-9).all()),
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.race_gap <= tolerance),
-        "robust": verified.wide.passed,
+        "robust": verified.wide.passed and not verified.proof.refuted,
     }
     verdict = sections_verdict(
         verified, constraints=checks["constraints"], error=error, tolerance=tolerance
@@ -170,6 +190,7 @@ def sections_result(
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
         "robust": wide_dict(problem, verified),
+        "proof": proof_dict(verified.proof),
         "notes": notes,
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         "syntheses": syntheses,

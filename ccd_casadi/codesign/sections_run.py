@@ -25,12 +25,14 @@ from ccd_casadi.codesign.sections_truth import (
     solve_direct_sections,
 )
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import (
     joined,
     judged_widely,
     prepared,
+    proof_of,
     race,
     sections_of_problem,
     sections_value,
@@ -63,7 +65,7 @@ class VerifiedSections:
     """The design of a run at θ, and what was found out about it.
 
     `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
-    `worst` the worst plant that was found. `race_gap`: by how much (relative) the race at the end
+    `proof` for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much (relative) the race at the end
     beats the design. `predicted` is what the surrogate says at θ, rad/s.
     """
 
@@ -77,6 +79,7 @@ class VerifiedSections:
     raced: Raced
     wide: Certificate
     checked: int
+    proof: Proof
     worst: Excess
     predicted: float
     rounds: int
@@ -182,6 +185,7 @@ def _verified(
         raced=end.raced,
         wide=wide,
         checked=checked,
+        proof=proof_of(problem, best.theta, made),
         worst=worst,
         predicted=predicted,
         rounds=rounds,

@@ -68,14 +68,22 @@ def _predicted(error: float, tolerance: float) -> Line:
 
 def _survives(verified: VerifiedSections) -> Line:
     wide, excess = verified.wide, math.expm1(verified.worst.value)
-    figures = {"plants": verified.checked, "worst_excess": excess}
+    proof = verified.proof
+    figures = {
+        "plants": verified.checked,
+        "worst_excess": excess,
+        "proof": proof.outcome.name.lower(),
+        "proven": proof.levels,
+    }
     where = f"{verified.checked} plants of the box that [robust] names"
     if not wide.passed:
         return Line(State.FAILED, f"on {where}: {wide.words}", figures)
+    if proof.refuted:
+        return Line(State.FAILED, f"within every bound on {where}, but {proof.words}", figures)
     words = f"within every bound on {where}, the worst searched {100.0 * excess:+.2g} % of a bound"
     if verified.checked <= 1:
         return Line(State.WARNED, "[robust] names no plant but the model", figures)
-    return Line(State.PASSED, f"{words}; between them nothing is proven", figures)
+    return Line(State.PASSED, f"{words}; {proof.words}", figures)
 
 
 def _deployable(verified: VerifiedSections) -> Line:

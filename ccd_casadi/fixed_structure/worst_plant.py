@@ -4,7 +4,7 @@
 
 by compass searches from many points at once; an unstable loop is worst of all. What the end says is
 what was done: the number of plants that were looked at, a lattice of the box among them, and the
-worst of them. It is no proof for what lies between, though c is smooth and the lattice fine.
+worst of them. For what lies between there is `box_proof`.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.design import (
     SectionsDesign,
@@ -28,6 +29,7 @@ from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
 
 WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
 UNSTABLE = 10.0  # ln: what an unstable loop counts as
@@ -51,13 +53,15 @@ class RobustDesign:
     """A design on a set of plants that the search found, judged on many more.
 
     `added` are the set's (option, point); `worst` what the search found last; `certificate` is the
-    judge's on `checked` plants of a lattice and the worst ones. `words` say what holds where.
+    judge's on `checked` plants of a lattice and the worst ones, `proof` for the whole box. `words`
+    say what holds where.
     """
 
     design: SectionsDesign
     added: tuple[tuple[int, Array], ...]
     worst: Excess
     certificate: Certificate | None
+    proof: Proof | None
     checked: int
     rounds: int
     seconds: float
@@ -159,18 +163,20 @@ def synthesise_robustly(
     initial: Sequence[Array | StateSpace] = (),
     rounds: int = 8,
     progress: Callable[[str], None] | None = None,
+    workers: Pool | None = None,
 ) -> RobustDesign:
     """max ω_b with every bound on every plant of a box, as far as searches find none that fails.
 
     The set starts with the models and the corners of the box. Each round designs on the set,
-    searches the worst plants of the box, and adds those that pass a bound.
+    searches the worst plants of the box, and adds those that pass a bound. The searches of the race
+    and the plants of the judge are spread over `workers`.
     """
     begun = perf_counter()
     tell = progress or (lambda words: None)
     members = uncertain.corners()
     made = synthesise_sections(
         uncertain.plants(members), structure, bounds, sampling=sampling, starts=starts, seed=seed,
-        initial=initial, progress=progress,
+        initial=initial, progress=progress, workers=workers,
     )  # fmt: skip
     looked, turn = 0, 0
     worst = Excess(0, uncertain.nominal, np.nan)
@@ -188,19 +194,21 @@ def synthesise_robustly(
                                    seed=seed, initial=[made.kappa], only_initial=True,
                                    progress=progress)  # fmt: skip
     judged: Certificate | None = None
+    proof: Proof | None = None
     checked = 0
     if made.certified and made.controller is not None:
         points = [*lattice(uncertain, LATTICE, seed + 1000), (worst.option, worst.point)]
         checked = len(points)
         tolerant = _loosened(bounds, 2.0 * WITHIN)
         judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,
-                         integrator=structure.integrator)  # fmt: skip
-    if judged is None:
+                         integrator=structure.integrator, workers=workers)  # fmt: skip
+        proof = prove(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
+    if judged is None or proof is None:
         words = made.words
     else:
-        found = f"{np.expm1(worst.value):+.1e} of a bound; nothing is proven between them"
+        found = f"{np.expm1(worst.value):+.1e} of a bound; {proof.words}"
         words = f"{judged.words}; searches over {looked} plants found none worse than {found}"
-    return RobustDesign(made, tuple(members), worst, judged, checked, turn,
+    return RobustDesign(made, tuple(members), worst, judged, proof, checked, turn,
                         perf_counter() - begun, words)  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
+from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -333,6 +334,15 @@ def judged_widely(
     if not uncertain.names:
         points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
     return _judged(problem, uncertain.plants(points), controller, workers), len(points)
+
+
+def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:
+    """Branch and bound over the whole box of plants at θ."""
+    sections = sections_of_problem(problem)
+    return prove(
+        uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
+        bounds_of(problem), sections.sampling,
+    )  # fmt: skip
 
 
 def judged_corners(

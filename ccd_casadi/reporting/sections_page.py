@@ -162,7 +162,7 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
          f"plants, at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
          f"{robust['words']}; the worst that was searched is {100 * robust['worst_excess']:+.2g} % "
-         "of a bound. Between the plants that were looked at nothing is proven"),
+         f"of a bound; {r['proof']['words']}"),
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over θ; {number(r['controller']['kkt_residual'], 2)} over the controller"),
         ("A full race at this θ", optima or "–",

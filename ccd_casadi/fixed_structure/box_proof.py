@@ -1,0 +1,216 @@
+"""A proof that a controller keeps its bounds on a whole box of plants, by branch and bound.
+
+Frequency and up to three uncertain parameters are divided until enclosures (`enclosure`) say on
+every sub-box that the loop has no pole on the axis and every figure stays below 1 + `slack` times
+its bound. With the model's own loop stable, so are all of them. What the given number of boxes does
+not close is still bounded: the proof then names the factor that is proven.
+"""
+
+import itertools
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
+from ccd_casadi.fixed_structure.loop import Sampling, closed_loops, stable
+from ccd_casadi.fixed_structure.modal_sum import modal_sum
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.support.arrays import Array
+
+SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
+MOST_PARAMETERS = 3
+MOST_BOXES = 1_000_000  # half a minute
+AT_ONCE = 20_000
+ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
+DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
+
+
+class ProofOutcome(StrEnum):
+    """How far a proof came."""
+
+    PROVEN = "every bound holds, with its slack, on the whole box"
+    LOOSER = "stable on the whole box; some bound is only proven with a larger factor"
+    OPEN = "stability is not proven on the whole box within the number of boxes"
+    REFUTED = "a plant of the box passes a bound by more than the slack"
+    UNSTABLE = "the model's own loop is not stable"
+    TOO_MANY_PARAMETERS = "more than three uncertain parameters"
+    NOT_MODAL = "a given damping matrix couples the modes"
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What is proven on the box: every |figure| <= `levels` times its bound, by kind of bound.
+
+    `slack` was asked for. `boxes` were looked at. Of a refuted box `option`, `point`, the bound and
+    the factor by which it is passed at least; enclosures say so, not a sample.
+    """
+
+    outcome: ProofOutcome
+    slack: float
+    parameters: tuple[str, ...]
+    levels: dict[str, float] = field(default_factory=dict)
+    boxes: int = 0
+    option: int = 0
+    point: tuple[float, ...] = ()
+    passed: tuple[str, float] = ("", np.nan)
+
+    @property
+    def proven(self) -> bool:
+        """Whether every bound holds with its slack on the whole box."""
+        return self.outcome is ProofOutcome.PROVEN
+
+    @property
+    def refuted(self) -> bool:
+        """Whether a plant of the box passes a bound by more than the slack."""
+        return self.outcome is ProofOutcome.REFUTED
+
+    @property
+    def stable(self) -> bool:
+        """Whether stability is proven on the whole box."""
+        return self.outcome in (ProofOutcome.PROVEN, ProofOutcome.LOOSER)
+
+    @property
+    def words(self) -> str:
+        """One line."""
+        if self.outcome is ProofOutcome.REFUTED:
+            at = ", ".join(f"{n} {v:.4g}" for n, v in zip(self.parameters, self.point, strict=True))
+            return f"{self.passed[0]} is passed by a factor of {self.passed[1]:.4g} at {at}"
+        if not self.stable:
+            return f"between these plants nothing is proven: {self.outcome.value}"
+        worst = max(self.levels.values(), default=0.0)
+        return (
+            f"proven for the whole box by {self.boxes} enclosures: stable, every figure at most "
+            f"{worst:.5g} of its bound"
+        )
+
+
+def prove(
+    uncertain: UncertainPlant,
+    structure: Structure,
+    kappa: Array,
+    bandwidth: float,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    *,
+    slack: float = SLACK,
+    most_boxes: int = MOST_BOXES,
+) -> Proof:
+    """Bounds and stability of the SI controller κ with ω_b (rad/s) on the whole box.
+
+    Of SISO plants with modal damping. The box is that of `uncertain`, all its options; the plant's
+    modal data and κ count as exact.
+    """
+    names = uncertain.names
+
+    def without(outcome: ProofOutcome) -> Proof:
+        return Proof(outcome, slack, names)
+
+    if len(names) > MOST_PARAMETERS:
+        return without(ProofOutcome.TOO_MANY_PARAMETERS)
+    models = [uncertain.plant(uncertain.nominal, i) for i in range(len(uncertain.options))]
+    problem = problem_for(models, structure, bounds, sampling)
+    P = problem.plants
+    if not stable(closed_loops(P, structure, in_problem_units(problem, kappa))).all():
+        return without(ProofOutcome.UNSTABLE)
+    unit = ABOVE * max(bandwidth, float(np.abs(P.poles).max()) * P.omega_0, bounds.omega_low)
+    levels: dict[str, float] = {}
+    looked = 0
+    for option in range(len(models)):
+        plant = modal_sum(uncertain, option, unit)
+        if plant is None:
+            return without(ProofOutcome.NOT_MODAL)
+        period = None if sampling is None else sampling.period * unit
+        delay = 0.0 if sampling is None else sampling.delay * unit
+        family = LoopFamily(plant, names, structure, structure.in_units(kappa, 1.0 / unit, 1.0),
+                            bounds, bandwidth, unit, period, delay)  # fmt: skip
+        boxes = _first(family, uncertain.box)
+        share = most_boxes // len(models)
+        spent = 0
+        while len(boxes.chart):
+            again: list[Boxes] = []
+            for start in range(0, len(boxes.chart), AT_ONCE):
+                part = boxes.only(np.arange(start, min(start + AT_ONCE, len(boxes.chart))))
+                with np.errstate(invalid="ignore", over="ignore"):  # of boxes that enclose nothing
+                    found = family.enclose(part)
+                spent += len(part.chart)
+                worst = found.highest.max(axis=0)
+                k, j = np.unravel_index(np.argmax(found.somewhere), found.somewhere.shape)
+                if found.somewhere[k, j] > 1.0 + slack:
+                    middle = 0.5 * (part.low + part.high)[1:, j]
+                    passed = (found.names[k], float(found.somewhere[k, j]))
+                    return Proof(ProofOutcome.REFUTED, slack, names, {}, looked + spent, option,
+                                 tuple(map(float, middle)), passed)  # fmt: skip
+                closed = worst <= 1.0 + slack
+                if spent >= share:
+                    closed[:] = True
+                for name, value in zip(found.names, found.highest[:, closed], strict=True):
+                    levels[name] = max(levels.get(name, 0.0), float(value.max(initial=0.0)))
+                if not closed.all():
+                    again.append(_divided(part.only(~closed), found.spread[:, ~closed]))
+            boxes = _joined(again)
+        looked += spent
+    highest = max(levels.values(), default=0.0)
+    outcome = ProofOutcome.PROVEN
+    if not np.isfinite(highest):
+        outcome = ProofOutcome.OPEN
+    elif highest > 1.0 + slack:
+        outcome = ProofOutcome.LOOSER
+    return Proof(outcome, slack, names, levels, looked)
+
+
+def _first(family: LoopFamily, box: Array) -> Boxes:
+    """Cells of frequency from 0 to infinity, or to half the sampling rate, over the whole box."""
+    low, band = family.bounds.omega_low / family.unit, family.bandwidth / family.unit
+    scale, top = 1.0, 1.0
+    if family.period is not None:
+        scale, top = family.period, np.pi
+    edges = np.geomspace(10.0**-DECADES, 1.0, int(2 * DECADES) + 1) * top
+    edges = np.unique(np.concatenate([[0.0], edges, [low * scale, band * scale]]))
+    edges = edges[edges <= top]
+    cells = [(Chart.LOW if family.period is None else Chart.SAMPLED, a, b)
+             for a, b in itertools.pairwise(edges)]  # fmt: skip
+    if family.period is None:
+        steps = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])
+        cells += [(Chart.HIGH, a, b) for a, b in itertools.pairwise(steps)]
+    cells.append((Chart.POINT, low * scale, low * scale))
+    chart = np.array([cell[0] for cell in cells])
+    ends = [np.array([[cell[i] for cell in cells]]) for i in (1, 2)]
+    count = len(cells)
+    return Boxes(chart, np.concatenate([ends[0], np.tile(box[0][:, None], (1, count))]),
+                 np.concatenate([ends[1], np.tile(box[1][:, None], (1, count))]))  # fmt: skip
+
+
+def _divided(boxes: Boxes, spread: Array) -> Boxes:
+    """Each box halved along the coordinate that moves its loop most."""
+    width = boxes.high - boxes.low
+    size = np.maximum(np.abs(boxes.low), np.abs(boxes.high))
+    fine = width > 1e-13 * np.maximum(size, 1e-300)
+    score = np.where(fine, np.where(np.isfinite(spread), spread, width), -1.0)
+    along = np.argmax(score, axis=0)
+    rows = np.arange(len(along))
+    a, b = boxes.low[along, rows], boxes.high[along, rows]
+    middle = 0.5 * (a + b)
+    wide = (along == 0) & (b > 4.0 * a)
+    with np.errstate(invalid="ignore"):
+        middle = np.where(wide, np.where(a > 0.0, np.sqrt(a * b), 0.1 * b), middle)
+    left, right = boxes.high.copy(), boxes.low.copy()
+    left[along, rows] = right[along, rows] = middle
+    return Boxes(
+        np.concatenate([boxes.chart, boxes.chart]),
+        np.concatenate([boxes.low, right], axis=1),
+        np.concatenate([left, boxes.high], axis=1),
+    )
+
+
+def _joined(parts: list[Boxes]) -> Boxes:
+    if not parts:
+        return Boxes(np.zeros(0, int), np.zeros((1, 0)), np.zeros((1, 0)))
+    return Boxes(
+        np.concatenate([part.chart for part in parts]),
+        np.concatenate([part.low for part in parts], axis=1),
+        np.concatenate([part.high for part in parts], axis=1),
+    )
