@@ -65,8 +65,9 @@ class VerifiedSections:
     """The design of a run at θ, and what was found out about it.
 
     `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
-    `proof` for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much (relative) the race at the end
-    beats the design. `predicted` is what the surrogate says at θ, rad/s.
+    `proof` is for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much
+    (relative) the race at the end beats the design. `predicted` is what the surrogate says at θ,
+    rad/s.
     """
 
     problem: CoDesignProblem

@@ -1,6 +1,6 @@
 """A proof that a controller keeps its bounds on a whole box of plants, by branch and bound.
 
-Frequency and up to three uncertain parameters are divided until enclosures (`enclosure`) say on
+Frequency and up to four uncertain parameters are divided until enclosures (`enclosure`) say on
 every sub-box that the loop has no pole on the axis and every figure stays below 1 + `slack` times
 its bound. With the model's own loop stable, so are all of them. What the given number of boxes does
 not close is still bounded: the proof then names the factor that is proven.
@@ -22,8 +22,8 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.support.arrays import Array
 
 SLACK = 1e-3  # relative: by how much a bound may be passed in what is proven
-MOST_PARAMETERS = 3
-MOST_BOXES = 1_000_000  # half a minute
+MOST_PARAMETERS = 4
+MOST_BOXES = 500_000  # some twenty seconds
 AT_ONCE = 20_000
 ABOVE = 3.0  # times ω_b and the fastest pole: from there on frequencies are counted by 1/ω
 DECADES = 6.0  # of frequency cells at the start, downwards; below is one cell to 0
@@ -37,7 +37,7 @@ class ProofOutcome(StrEnum):
     OPEN = "stability is not proven on the whole box within the number of boxes"
     REFUTED = "a plant of the box passes a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
-    TOO_MANY_PARAMETERS = "more than three uncertain parameters"
+    TOO_MANY_PARAMETERS = "more than four uncertain parameters"
     NOT_MODAL = "a given damping matrix couples the modes"
 
 

@@ -162,14 +162,16 @@ def synthesise_robustly(
     seed: int = 0,
     initial: Sequence[Array | StateSpace] = (),
     rounds: int = 8,
+    count: int = LATTICE,
     progress: Callable[[str], None] | None = None,
     workers: Pool | None = None,
 ) -> RobustDesign:
     """max ω_b with every bound on every plant of a box, as far as searches find none that fails.
 
     The set starts with the models and the corners of the box. Each round designs on the set,
-    searches the worst plants of the box, and adds those that pass a bound. The searches of the race
-    and the plants of the judge are spread over `workers`.
+    searches the worst plants of the box, and adds those that pass a bound. Searches start
+    from the worst of `count` plants of a lattice, the judge looks at as many. The searches of the
+    race and the plants of the judge are spread over `workers`.
     """
     begun = perf_counter()
     tell = progress or (lambda words: None)
@@ -181,12 +183,12 @@ def synthesise_robustly(
     looked, turn = 0, 0
     worst = Excess(0, uncertain.nominal, np.nan)
     while made.certified:
-        heads, count = worst_plants(uncertain, structure, made.kappa, made.bandwidth, bounds,
-                                    sampling, seed=seed + turn)  # fmt: skip
-        looked += count
+        heads, seen = worst_plants(uncertain, structure, made.kappa, made.bandwidth, bounds,
+                                    sampling, seed=seed + turn, count=count)  # fmt: skip
+        looked += seen
         worst = heads[0]
         turn += 1
-        tell(f"worst of {count} plants: {np.expm1(worst.value):+.2%} of a bound at {worst.point}")
+        tell(f"worst of {seen} plants: {np.expm1(worst.value):+.2%} of a bound at {worst.point}")
         if worst.value <= WITHIN or turn > rounds:
             break
         members = members + _apart(heads, members, uncertain.box)
@@ -197,7 +199,7 @@ def synthesise_robustly(
     proof: Proof | None = None
     checked = 0
     if made.certified and made.controller is not None:
-        points = [*lattice(uncertain, LATTICE, seed + 1000), (worst.option, worst.point)]
+        points = [*lattice(uncertain, count, seed + 1000), (worst.option, worst.point)]
         checked = len(points)
         tolerant = _loosened(bounds, 2.0 * WITHIN)
         judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,

@@ -1,0 +1,154 @@
+"""The proof over a box of plants: enclosures hold, and what does not hold is not proven."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS
+from helpers import HZ, SUSPENSION, two_mass_model
+
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
+from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, root, variable
+from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
+from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.worst_plant import lattice
+from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.support.arrays import Array
+
+SYSTEM = mechanics(two_mass_model(), np.array([55.0, 55.0]))
+BOX = UncertainPlant(
+    (SYSTEM,), SUSPENSION, WEIGHTS.M_K, resonance_shift=0.02, damping=(0.5, 2.0), gain=0.03
+)
+STRUCTURE = Structure(biquads=1)
+# integrator, lead, a broad notch on the resonance at 183.6 Hz, roll-off: a PID as in a textbook
+KAPPA = np.log(
+    [1.2e5, 1.0 * HZ, 4.0 * HZ, 60.0 * HZ, 183.0 * HZ, 0.15, 183.0 * HZ, 0.8, 300.0 * HZ, 0.7]
+)
+
+
+def figures(sampling: Sampling | None, points: list, bounds: Bounds) -> dict[str, float]:
+    """The judge's worst figures over their bounds on these plants."""
+    judge = certify(BOX.plants(points), state_space(STRUCTURE, KAPPA), bounds, sampling)
+    assert judge.worst, judge.words
+    return judge.worst | {"SHAPE": 0.0, "bandwidth": judge.bandwidth}
+
+
+def tight(found: dict[str, float], margin: float) -> tuple[Bounds, float]:
+    """Bounds that the worst of the plants that were looked at keeps by this margin, and ω_b."""
+    assert BOUNDS.weighted_level is not None
+    assert BOUNDS.compliance_max is not None
+    bounds = replace(
+        BOUNDS,
+        S_max=BOUNDS.S_max * found["S_max"] * margin,
+        S_low=BOUNDS.S_low * found["S_low"] * margin,
+        weighted_level=BOUNDS.weighted_level * max(found["KS"], found["T"]) * margin,
+        compliance_max=BOUNDS.compliance_max * found["GS"] * margin,
+    )
+    return bounds, found["bandwidth"] / margin
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+def test_what_the_judge_finds_is_below_what_is_proven_and_close(sampling) -> None:
+    corners = figures(sampling, BOX.corners(), BOUNDS)
+    bounds, bandwidth = tight(corners, 1.02)
+    proof = prove(BOX, STRUCTURE, KAPPA, bandwidth, bounds, sampling)
+    assert proof.proven, proof.words
+    assert max(proof.levels.values()) <= 1.0 + proof.slack
+    seen = figures(sampling, lattice(BOX, 6, 7)[-6:], bounds)
+    names = {"S_max": "S_MAX", "S_low": "S_LOW", "KS": "KS", "T": "T", "GS": "GS"}
+    for name, own in names.items():
+        assert seen[name] <= proof.levels[own]
+    assert seen["bandwidth"] >= bandwidth / (1.0 + proof.slack)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST], ids=["continuous", "fast"])
+def test_a_box_with_a_plant_that_fails_is_refuted_at_a_plant_that_fails(sampling) -> None:
+    bounds, bandwidth = tight(figures(sampling, BOX.corners()[:1], BOUNDS), 1.005)
+    proof = prove(BOX, STRUCTURE, KAPPA, bandwidth, bounds, sampling)
+    assert proof.outcome is ProofOutcome.REFUTED
+    worst = figures(sampling, [(proof.option, np.array(proof.point))], bounds)
+    name, factor = proof.passed
+    if name == "SHAPE":
+        assert worst["bandwidth"] < bandwidth
+    else:
+        assert worst[{"S_MAX": "S_max", "S_LOW": "S_low"}.get(name, name)] >= factor * (1.0 - 1e-9)
+
+
+def test_an_unstable_corner_is_never_proven() -> None:
+    """With a gain at which the model is stable and 1.9 times as much is not: no bound helps."""
+    box = replace(BOX, gain=0.9, resonance_shift=0.0, damping=(1.0, 1.0))
+    models = problem_for(box.plants(box.corners()), STRUCTURE, BOUNDS)
+    for factor in np.geomspace(4.0, 100.0, 20):
+        hot = KAPPA + np.log(factor) * (np.arange(len(KAPPA)) == 0)
+        good = stable(closed_loops(models.plants, STRUCTURE, in_problem_units(models, hot)))[0]
+        if not good.all():
+            break
+    assert good[0]
+    assert not good[-1]
+    loose = replace(BOUNDS, S_max=50.0, S_low=10.0, weighted_level=1e4, compliance_max=1.0)
+    proof = prove(box, STRUCTURE, hot, 0.01, loose, most_boxes=20_000)
+    assert not proof.stable
+    assert not proof.proven
+
+
+def test_what_cannot_be_closed_says_what_is_proven() -> None:
+    """Far more is asked for than the boxes allow: the factor that is proven is no smaller then."""
+    bounds, bandwidth = tight(figures(None, BOX.corners(), BOUNDS), 1.0)
+    few = prove(BOX, STRUCTURE, KAPPA, bandwidth, bounds, slack=1e-9, most_boxes=12_000)
+    assert not few.proven
+    if few.outcome is ProofOutcome.LOOSER:
+        assert 1.0 + few.slack < max(few.levels.values()) < np.inf
+    else:
+        assert few.outcome in (ProofOutcome.REFUTED, ProofOutcome.OPEN)
+
+
+def test_beyond_four_parameters_and_with_coupled_damping_nothing_is_proven() -> None:
+    K = 1e6 * np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
+    none = [np.zeros((0, *shape)) for shape in ((3, 3), (3, 3), (3, 3), (3, 1), (1, 3))]
+    d_M, d_D, d_K, d_B, d_C = none
+    chain = Mechanics(np.eye(3), np.zeros((3, 3)), K, np.eye(3)[:, :1], np.eye(3)[2:], 0.01,
+                      (d_M, d_D, d_K, d_B, d_C))  # fmt: skip
+    many = replace(BOX, options=(chain,), mode_shift=0.01)
+    assert len(many.names) == 5
+    assert prove(many, STRUCTURE, KAPPA, 1.0, BOUNDS).outcome is ProofOutcome.TOO_MANY_PARAMETERS
+    coupled = replace(SYSTEM, damping_ratio=None, D=np.diag([50.0, 400.0]))
+    box = replace(BOX, options=(coupled,))
+    assert prove(box, STRUCTURE, KAPPA, 1.0, BOUNDS).outcome is ProofOutcome.NOT_MODAL
+
+
+def forms(rng: np.random.Generator, count: int = 200) -> tuple[Affine, Array, np.ndarray]:
+    """Random forms of three variables, points of their boxes, and the forms' values there."""
+    centre = rng.normal(size=count) + 1j * rng.normal(size=count)
+    slope = (rng.normal(size=(3, count)) + 1j * rng.normal(size=(3, count))) * 0.1
+    t = rng.uniform(-1.0, 1.0, (3, count))
+    t[:, ::3] = np.sign(t[:, ::3])
+    return Affine(centre, slope, np.zeros(count)), t, centre + (slope * t).sum(0)
+
+
+def encloses(form: Affine, t: Array, value: np.ndarray) -> bool:
+    """The value lies within the form at t, and its size within the form's bounds."""
+    near = np.abs(value - form.centre - (form.slope * t).sum(0)) <= form.rest
+    size = np.abs(value)
+    return bool((near & (size <= form.highest) & (size >= form.lowest)).all())
+
+
+def test_affine_forms_enclose_what_they_say() -> None:
+    rng = np.random.default_rng(3)
+    (f, t, a), (g, _, _) = forms(rng), forms(rng)
+    b = g.centre + (g.slope * t).sum(0)
+    assert encloses(f + g, t, a + b)
+    assert encloses(f - g, t, a - b)
+    assert encloses(f * g, t, a * b)
+    assert encloses(f * f * g, t, a * a * b)
+    assert encloses(inverse(f), t, 1.0 / a)
+    assert encloses(exponential(f), t, np.exp(a))
+    assert encloses(phi(f), t, np.expm1(a) / a)
+    small = f * 1e-6
+    assert encloses(phi(small), t, 1.0 + 0.5e-6 * a + a**2 * 1e-12 / 6.0)
+    x = variable(np.array([1.0]), np.array([2.0]), 1, 3)
+    here = np.array([[0.0], [0.7], [0.0]])
+    assert encloses(root(x * x), here, np.array([1.85]))
+    assert np.isfinite(inverse(f).rest).mean() > 0.5
