@@ -205,6 +205,9 @@ def _programme(
     low, high = np.full(n + 1, -radius), np.full(n + 1, radius)
     low[: n - 1] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
     high[: n - 1] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
+    # Where nothing bounds ω_b it stops at the end of the grid instead of running away.
+    room = float(np.log(problem.plants.frequency(problem.base[-1]))) - point.tau
+    high[n - 1] = max(min(radius, room), -radius)
     low[n], high[n] = 0.0, 1e4
     for name in ("daqp", "ipqp"):
         solver = _solver(name, n + 1, size)
