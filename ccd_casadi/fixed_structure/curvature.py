@@ -1,4 +1,4 @@
-"""The Hessian of the Lagrangian Σ μ_j c_j to (κ, τ), exact but for one difference in frequency.
+"""The Hessians of the constraints c_j to (κ, τ), exact but for one difference in frequency.
 
 At a fixed frequency, with g = ∂ln K,
 
@@ -7,9 +7,11 @@ At a fixed frequency, with g = ∂ln K,
 and a peak moves as κ does: -c_xκ c_xκᵀ/c_xx is added, x = ln v. (T here is without weight.)
 """
 
+from functools import singledispatch
+
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, evaluate
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, LoopProblem, Problem, evaluate
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
 
@@ -17,23 +19,21 @@ STEP = 1e-5  # of ln v
 OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
 
 
-def lagrangian_hessian(
-    problem: Problem, kappa: Array, tau: float, rows: Constraints, mu: Array
-) -> Array:
-    """(n + 1, n + 1): κ, then τ; for multipliers μ >= 0 of these constraints."""
-    n = len(kappa)
-    out = np.zeros((n + 1, n + 1))
-    rows, mu = rows.only(mu > 0.0), mu[mu > 0.0]
-    if not len(mu):
+@singledispatch
+def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
+    """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
+    assert isinstance(problem, Problem)
+    n, m = len(kappa), len(rows.v)
+    out = np.zeros((m, n + 1, n + 1))
+    if not m:
         return out
     at = evaluate(problem, kappa, tau, rows.plant, rows.v)
     T = 1.0 - at.S
     of_s = np.isin(rows.curve, OF_S)
-    weight = mu * np.where(of_s, -T, at.S)
     second = second_slopes(problem.structure, kappa, 1j * rows.v)
-    out[:n, :n] = np.einsum("m,mij->ij", weight, second).real
     g = at.to_kappa
-    out[:n, :n] -= np.einsum("m,mi,mj->ij", mu * at.S * T, g, g).real
+    weighted = np.where(of_s, -T, at.S)[:, None, None] * second
+    out[:, :n, :n] = (weighted - (at.S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
     slopes, gradients = [], []
     for sign in (1.0, -1.0):
         moved = rows.v * np.exp(sign * STEP)
@@ -47,13 +47,23 @@ def lagrangian_hessian(
     end = rows.curve == Curve.CROSSING
     fixed = end | (rows.curve == Curve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
-    out[:n, :n] -= np.einsum("m,mi,mj->ij", (mu / np.where(top, c_xx, np.inf))[top], c_xk[top],
-                             c_xk[top])  # fmt: skip
+    shift = c_xk / np.where(top, -c_xx, np.inf)[:, None]
+    out[:, :n, :n] += shift[:, :, None] * c_xk[:, None, :]
     if end.any():
         chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
-        out[:n, n] = out[n, :n] = (mu[end] * chain) @ c_xk[end]
-        out[n, n] = float((mu[end] * chain**2) @ c_xx[end])
+        out[end, :n, n] = out[end, n, :n] = chain[:, None] * c_xk[end]
+        out[end, n, n] = chain**2 * c_xx[end]
     return out
+
+
+def lagrangian_hessian(
+    problem: LoopProblem, kappa: Array, tau: float, rows: Constraints, mu: Array
+) -> Array:
+    """Σ μ_j ∂²c_j, (n + 1, n + 1), for multipliers μ >= 0 of these constraints."""
+    chosen = mu > 0.0
+    return np.asarray(
+        np.einsum("m,mij->ij", mu[chosen], hessians(problem, kappa, tau, rows.only(chosen)))
+    )
 
 
 def _chosen(parts: dict[Curve, Array], curve: np.ndarray) -> Array:

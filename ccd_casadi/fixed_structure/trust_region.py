@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
-from ccd_casadi.fixed_structure.figures import Assessment, Constraints, Problem, assess
+from ccd_casadi.fixed_structure.figures import Assessment, Constraints, LoopProblem, assess
 from ccd_casadi.support.arrays import Array
 
 FIRST_RADIUS = 0.2
@@ -69,7 +69,7 @@ class Step:
 
 
 def ascend(
-    problem: Problem,
+    problem: LoopProblem,
     start: Point,
     *,
     iterations: int,
@@ -107,14 +107,14 @@ def ascend(
     return Ascent(point, radius, evaluations)
 
 
-def _moved(problem: Problem, point: Point, step: Step) -> Point:
+def _moved(problem: LoopProblem, point: Point, step: Step) -> Point:
     kappa = np.clip(point.kappa + step.change[:-1], *problem.box)
     tau = point.tau + float(step.change[-1])
     return Point(kappa, tau, assess(problem, kappa, tau))
 
 
 def best_step(
-    problem: Problem, point: Point, radius: float, penalty: float = PENALTY
+    problem: LoopProblem, point: Point, radius: float, penalty: float = PENALTY
 ) -> Step | None:
     """The step of the quadratic model; None where its programme has no answer."""
     rows = _rows(point.assessment, radius)
@@ -131,7 +131,7 @@ def best_step(
 
 
 def _corrected(
-    problem: Problem, point: Point, step: Step, trial: Point, radius: float, penalty: float
+    problem: LoopProblem, point: Point, step: Step, trial: Point, radius: float, penalty: float
 ) -> Step | None:
     """The second-order correction: the same model with the constraints as they are at the trial."""
     rows = _rows(trial.assessment, radius)
@@ -141,7 +141,7 @@ def _corrected(
 
 
 def _programme(
-    problem: Problem,
+    problem: LoopProblem,
     point: Point,
     rows: Constraints,
     value: Array,
