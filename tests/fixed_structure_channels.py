@@ -1,4 +1,4 @@
-"""Loops of several channels for the tests: a square stage, symmetric or with its load off centre."""
+"""Loops of several channels for the tests: a stage whose load may lie off centre."""
 
 from functools import lru_cache
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -50,7 +51,7 @@ class ChannelStructure:
     def slices(self) -> tuple[slice, ...]:
         """Where each channel's parameters are in κ."""
         ends = np.cumsum([0, *(len(own.names) for own in self.structures)]).tolist()
-        return tuple(slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return tuple(slice(a, b) for a, b in pairwise(ends))
 
     def split(self, kappa: Array) -> Iterator[tuple[Structure, Array]]:
         """The structure and the parameters of each channel."""

@@ -1,8 +1,8 @@
 """The problem of a controller with several channels, made of parts.
 
 Plants that fall apart in the channels' coordinates are one SISO problem for each channel, whose
-bounds are the whole's: the singular values of S, KS, T and GS are the channels' moduli. Plants whose
-channels are coupled are judged as a whole (`mimo_figures`). All parts share ω_b.
+bounds are the whole's: the singular values of S, KS, T and GS are the channels' moduli. Plants
+whose channels are coupled are bounded as a whole (`mimo_figures`). All parts share ω_b.
 """
 
 from collections.abc import Sequence

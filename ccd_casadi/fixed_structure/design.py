@@ -8,16 +8,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from time import perf_counter
+from typing import overload
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
-from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.figures import Curve, LoopProblem, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
-from ccd_casadi.fixed_structure.structure import Kind, Structure, state_space
+from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -64,7 +67,7 @@ class SectionsDesign:
 
     outcome: SectionsOutcome
     words: str
-    structure: Structure
+    structure: Structure | ChannelStructure
     kappa: Array
     frequencies: tuple[float, float]
     controller: StateSpace | None
@@ -89,18 +92,40 @@ class SectionsDesign:
 Progress = Callable[[str], None]
 
 
+@overload
 def problem_for(
     plants: Sequence[ScaledPlant],
     structure: Structure,
     bounds: Bounds,
     sampling: Sampling | None = None,
     frequencies: tuple[float, float] | None = None,
-) -> Problem:
-    """The problem in the units of the first plant.
+) -> Problem: ...
+
+
+@overload
+def problem_for(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+) -> LoopProblem: ...
+
+
+def problem_for(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+) -> LoopProblem:
+    """The problem in the units of the first plant, of one channel or of several.
 
     `frequencies` (rad/s) bound those of K's roots; by default 1e-3 ω₀ and 30 times the fastest
     pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
     """
+    if isinstance(structure, ChannelStructure):
+        return composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
     family = plant_set(plants, sampling)
     fastest = 30.0 * max(1.0, float(np.abs(family.poles).max()))
     if family.period is not None:
@@ -139,7 +164,7 @@ def synthesise_sections(
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
-    spanned = _span(problem)
+    spanned = span_of(problem)
 
     def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
         nothing = np.full(len(structure.names), np.nan)
@@ -152,7 +177,7 @@ def synthesise_sections(
         return failed(SectionsOutcome.NO_STABLE_START)
     ends, evaluations = _race(problem, pool, tell)
     best: SectionsDesign | None = None
-    optima = _distinct(problem, ends)
+    optima = distinct(problem, ends)
     for end in sorted(ends, key=lambda end: -end.point.merit()):
         point = end.point
         if point.assessment.violation > MARGIN:
@@ -163,7 +188,7 @@ def synthesise_sections(
                       least_gain=1e-14)  # fmt: skip
         evaluations += last.evaluations
         point = last.point
-        made = _designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
+        made = designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
                          perf_counter() - begun)  # fmt: skip
         if best is None or (made.certified and not best.certified):
             best = made
@@ -192,13 +217,13 @@ def bandwidth_and_gradient(
     return design.bandwidth, design.bandwidth * slope
 
 
-def in_problem_units(problem: Problem, kappa: Array) -> Array:
+def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
     """SI parameters κ in the units of the problem."""
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
 
 
-def _span(problem: Problem) -> tuple[float, float]:
+def span_of(problem: LoopProblem) -> tuple[float, float]:
     """The bounds of frequencies of K's roots in rad/s."""
     index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
     low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
@@ -265,7 +290,7 @@ def _race(problem: Problem, pool: Array, tell: Progress) -> tuple[list[Ascent], 
     return field, evaluations
 
 
-def _distinct(problem: Problem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, ...]:
+def distinct(problem: LoopProblem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, ...]:
     P = problem.plants
     good = [end.point for end in ends if end.point.assessment.violation <= 1e-4]
     found: list[LocalOptimum] = []
@@ -279,8 +304,8 @@ def _distinct(problem: Problem, ends: Sequence[Ascent]) -> tuple[LocalOptimum, .
     return tuple(found)
 
 
-def _designed(
-    problem: Problem,
+def designed(
+    problem: LoopProblem,
     plants: Sequence[ScaledPlant],
     sampling: Sampling | None,
     point: Point,
@@ -292,7 +317,7 @@ def _designed(
 ) -> SectionsDesign:
     structure, bounds, P = problem.structure, problem.bounds, problem.plants
     kappa = structure.in_units(point.kappa, P.omega_0, P.force)
-    controller = state_space(structure, kappa)
+    controller = controller_of(structure, kappa)
     found = optimality(problem, point)
     bandwidth = float(np.exp(point.tau)) * P.omega_0
     judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
@@ -314,7 +339,7 @@ def _designed(
     if outcome is SectionsOutcome.CERTIFIED:
         bandwidth = min(bandwidth, judged.bandwidth)
     return SectionsDesign(
-        outcome, words, structure, kappa, _span(problem), controller, bandwidth, judged,
+        outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
         found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
         seconds,
     )  # fmt: skip

@@ -1,7 +1,7 @@
 """Square plants of several channels in the loop with one controller, as `loop` has those of one.
 
-Everything is in the variable w and in the units of `loop`. u = -K y with K = V diag(K_i) Uᵀ; where U
-and V are orthogonal the plants are turned into the coordinates of the channels first.
+Everything is in the variable w and in the units of `loop`. u = -K y with K = V diag(K_i) Uᵀ; where
+U and V are orthogonal the plants are turned into the coordinates of the channels first.
 """
 
 from collections.abc import Sequence
