@@ -177,7 +177,9 @@ def _failed(
     )  # fmt: skip
 
 
-def _of_channel(structure: ChannelStructure, item: Array | StateSpace, i: int) -> Array | StateSpace:
+def _of_channel(
+    structure: ChannelStructure, item: Array | StateSpace, i: int
+) -> Array | StateSpace:
     """One channel's part of stacked parameters, or of a controller of the whole."""
     if not isinstance(item, StateSpace):
         return np.asarray(item, float)[structure.slices[i]]

@@ -275,7 +275,9 @@ def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:
     return out
 
 
-def _offsets(problem: MatrixProblem, tau: float, curve: np.ndarray, v: Array) -> tuple[Array, Array]:
+def _offsets(
+    problem: MatrixProblem, tau: float, curve: np.ndarray, v: Array
+) -> tuple[Array, Array]:
     """What is added to ln σ to make it a constraint, and its slope to ln v."""
     plants, bounds = problem.plants, problem.bounds
     omega = plants.frequency(v)
