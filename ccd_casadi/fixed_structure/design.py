@@ -33,6 +33,7 @@ LAST = 3  # that climb to the end, if they are
 BEHIND = 0.1  # (in ln ω_b) no further behind
 LONGEST = 300
 SAME = 2e-3  # relative: bandwidths of one local optimum
+LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
@@ -212,9 +213,22 @@ def bandwidth_and_gradient(
     problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
     kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
     slope = log_bandwidth_gradient(problem, kappa, found)
     return design.bandwidth, design.bandwidth * slope
+
+
+def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
+    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
+    assessment = assess(problem, kappa, tau)
+    peaks = assessment.peaks
+    if peaks is not None:
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
+        if abs(room) < LOWER_AT_MOST:
+            tau += room
+            assessment = assess(problem, kappa, tau)
+    return Point(kappa, tau, assessment)
 
 
 def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:

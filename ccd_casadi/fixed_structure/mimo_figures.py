@@ -246,24 +246,32 @@ def _levels(
     """
     plants = problem.plants
     which = np.broadcast_to(np.arange(len(v))[:, None], v.shape)
-    k = np.stack([response(own, part, 1j * v) for own, part in problem.structure.split(kappa)], -1)
-    K = plants.into @ (k[..., None] * plants.out)
-    G, _ = plants.responses(which, v)
-    eye = np.eye(K.shape[-1])
-    S = np.linalg.inv(eye + G @ K)
+    S, KS, T = loop_matrices(problem, kappa, which, v)
     found: dict[Curve, Array] = {}
     for curve in problem.curves:
         offset, _ = _offsets(problem, tau, np.full(v.shape, curve), v)
         if curve is Curve.KS:
-            M = K @ S
+            M = KS
         elif curve is Curve.T:
-            M = eye - S
+            M = T
         elif curve is Curve.GS:
             M = S @ plants.free_responses(which, v)[0]
         else:
             M = S
         found[curve] = _log_gains(M, offset, least)
     return found
+
+
+def loop_matrices(
+    problem: MatrixProblem, kappa: Array, which: np.ndarray, v: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """S, KS and T (..., p, p) of the plants `which` at v, without weights."""
+    k = np.stack([response(own, part, 1j * v) for own, part in problem.structure.split(kappa)], -1)
+    K = problem.plants.into @ (k[..., None] * problem.plants.out)
+    G, _ = problem.plants.responses(which, v)
+    eye = np.eye(K.shape[-1])
+    S = np.linalg.inv(eye + G @ K)
+    return S, K @ S, eye - S
 
 
 def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:

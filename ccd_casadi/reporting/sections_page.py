@@ -8,8 +8,9 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.fixed_structure.composite import CompositeProblem, largest_gains
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.fixed_structure.figures import Problem, evaluate
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -41,7 +42,10 @@ STEPS = 200  # points of it
 
 @dataclass(frozen=True)
 class Loops:
-    """S, KS (N/m), T and L of every plant (rows) over Hz."""
+    """S, KS (N/m), T and L of every plant (rows) over Hz.
+
+    Of several channels the largest singular values, and no L.
+    """
 
     hz: Array
     S: np.ndarray
@@ -68,12 +72,15 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     verified = solution.sections
     assert verified is not None
     loops = loops_of(verified)
-    return [
+    found = [
         _design(problem, solution.result),
         Section("The controller", _controller(solution.result)),
         Section("Closed loop on every plant", _gains(problem, verified, loops)),
-        Section("Nyquist plot and a step of force", _nyquist(problem, verified, loops)),
     ]
+    if len(loops.L):  # of one channel
+        body = _nyquist(problem, verified, loops)
+        found.append(Section("Nyquist plot and a step of force", body))
+    return found
 
 
 def loops_of(verified: "VerifiedSections") -> Loops:
@@ -88,16 +95,25 @@ def loops_of(verified: "VerifiedSections") -> Loops:
         made.frequencies,
     )
     P = inside.plants
+    poles = P.poles
+    if isinstance(inside, CompositeProblem):
+        poles = np.concatenate([part.problem.plants.poles.ravel() for part in inside.parts])
     low = 0.2 * problem.inner.omega_low
-    high = 20.0 * float(np.abs(P.poles).max()) * P.omega_0
+    high = 20.0 * float(np.abs(poles).max()) * P.omega_0
     if sampling is not None:
         high = min(high, 0.98 * np.pi / sampling.period)
-    near = np.abs(P.poles.imag) + np.abs(P.poles.real) * np.linspace(-12, 12, 97)[:, None, None]
+    near = np.abs(poles.imag) + np.abs(poles.real) * np.linspace(-12, 12, 97).reshape(
+        -1, *[1] * poles.ndim
+    )
     omega = np.concatenate([np.geomspace(low, high, POINTS), near.ravel() * P.omega_0])
     omega = np.unique(omega[(omega >= low) & (omega <= high)])
     v = P.variable(omega / P.omega_0)
-    which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     kappa = in_problem_units(inside, made.kappa)
+    if isinstance(inside, CompositeProblem):
+        S, KS, T = largest_gains(inside, kappa, v)
+        return Loops(omega / HZ, S, KS * P.force, T, np.zeros((0, len(v))))
+    assert isinstance(inside, Problem)
+    which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     tau = float(np.log(made.bandwidth / P.omega_0))
     found = evaluate(inside, kappa, tau, which, grid, order=0)
     L = 1.0 / found.S - 1.0
@@ -174,8 +190,16 @@ def _controller(result: dict[str, Any]) -> str:
         for s in controller["sections"]
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    gains = (
+        f"Gain {number(controller['gain'], 6)} N/m"
+        if "gain" in controller
+        else ", ".join(
+            f"{channel['name']}: gain {number(channel['gain'], 6)} N/m"
+            for channel in controller["channels"]
+        )
+    )
     words = (
-        f"Gain {number(controller['gain'], 6)} N/m, order {controller['order']}, stable but for "
+        f"{gains}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
     return paragraph(words) + table_html(Table(head, rows))
