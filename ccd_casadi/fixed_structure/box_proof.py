@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
 from ccd_casadi.fixed_structure.loop import Sampling, closed_loops, stable
@@ -38,6 +39,7 @@ class ProofOutcome(StrEnum):
     REFUTED = "a plant of the box passes a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     TOO_MANY_PARAMETERS = "more than four uncertain parameters"
+    SEVERAL_CHANNELS = "a proof is for one input and one output"
     NOT_MODAL = "a given damping matrix couples the modes"
 
 
@@ -90,7 +92,7 @@ class Proof:
 
 def prove(
     uncertain: UncertainPlant,
-    structure: Structure,
+    structure: Structure | ChannelStructure,
     kappa: Array,
     bandwidth: float,
     bounds: Bounds,
@@ -109,6 +111,8 @@ def prove(
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
+    if isinstance(structure, ChannelStructure):
+        return without(ProofOutcome.SEVERAL_CHANNELS)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)
     models = [uncertain.plant(uncertain.nominal, i) for i in range(len(uncertain.options))]

@@ -15,17 +15,20 @@ from ccd_casadi.fixed_structure import (
     Bounds,
     Certificate,
     SectionsDesign,
+    Structure,
     bandwidth_and_gradient,
     certify,
-    synthesise_sections,
 )
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
+from ccd_casadi.fixed_structure.channel_design import synthesise
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem, Member, SectionsProblem
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -63,6 +66,35 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         weights=problem.weights if weighted else None,
         compliance_max=sections.compliance_max,
     )
+
+
+def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
+    """The controller's structure: one, or one for each channel of a plant with several."""
+    if plant_of(problem).outputs == 1:
+        return sections_of_problem(problem).structure
+    channels = sections_of_problem(with_channels(problem)).channels
+    names, outputs, inputs = zip(
+        *((channel.name, channel.outputs or (), channel.inputs or ()) for channel in channels),
+        strict=True,
+    )
+    structures = tuple(channel.structure for channel in channels)
+    return ChannelStructure(given_decoupling(names, outputs, inputs), structures)
+
+
+def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with the directions of its channels, by the plant at its start, for every θ."""
+    sections = sections_of_problem(problem)
+    known = {channel.name: channel for channel in sections.channels}
+    given = [channel.outputs is not None for channel in sections.channels]
+    if plant_of(problem).outputs == 1 or any(given):
+        return problem
+    found = find_decoupling(scaled_plant(problem, problem.start))
+    channels = []
+    for i, name in enumerate(found.names):
+        own = known.get(name, ChannelProblem(name, sections.structure))
+        outputs, inputs = (tuple(map(float, M[:, i])) for M in (found.outputs, found.inputs))
+        channels.append(replace(own, outputs=outputs, inputs=inputs))
+    return _with(problem, channels=tuple(channels))
 
 
 def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
@@ -126,14 +158,14 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     made: SectionsDesign | None = None
     spent = 0
     if initial:
-        made = synthesise_sections(
-            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+        made = synthesise(
+            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
     if made is None or not made.certified:
-        made = synthesise_sections(
-            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+        made = synthesise(
+            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
@@ -157,12 +189,13 @@ def _warm(
     first = scaled_plant(problem, problem.start)
     here = plants[0]
     frequency = _first_mode(here) / _first_mode(first)
-    found = problem_for(plants, sections.structure, bounds, sections.sampling, sections.frequencies)
+    structure = structure_of(problem)
+    found = problem_for(plants, structure, bounds, sections.sampling, sections.frequencies)
     warm = []
     for kappa in map(np.array, sections.anchors):
         crossover = 0.1 * first.omega_0
         gain = _size(first, crossover) / _size(here, frequency * crossover)
-        moved = sections.structure.in_units(kappa, frequency, gain)
+        moved = structure.in_units(kappa, frequency, gain)
         both = [kappa, moved]
         merits = [
             started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
@@ -179,10 +212,10 @@ def _first_mode(plant: ScaledPlant) -> float:
 
 
 def _size(plant: ScaledPlant, omega: float) -> float:
-    """|G(jω)| in m/N."""
+    """‖G(jω)‖ in m/N."""
     si = plant.plant_si()
     solved = np.linalg.solve(1j * omega * np.eye(len(si.A)) - si.A, si.B + 0j)
-    return float(np.abs((si.C @ solved)[0, 0]))
+    return float(np.linalg.norm(si.C @ solved, 2))
 
 
 def valued(
@@ -209,8 +242,8 @@ def race(
 ) -> SectionsDesign:
     """A full race at θ: the problem's starts, and its anchors beside them."""
     sections = sections_of_problem(problem)
-    return synthesise_sections(
-        plants_of(problem, theta), sections.structure, bounds_of(problem),
+    return synthesise(
+        plants_of(problem, theta), structure_of(problem), bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
         initial=[np.array(kappa) for kappa in sections.anchors],
         frequencies=sections.frequencies, progress=progress, workers=workers,
@@ -218,10 +251,12 @@ def race(
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:
-    """The problem with the range of K's frequencies, by the plant at its start, alike at every θ.
+    """The problem with its channels and the range of K's frequencies, by the plant at its start,
+    alike at every θ.
 
     A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
     """
+    problem = with_channels(problem)
     sections = sections_of_problem(problem)
     if sections.frequencies is not None:
         return problem
@@ -299,7 +334,7 @@ def worst_members(
     """The worst plant of the box for a design, and those to add: past a bound, each a new one."""
     sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     heads, count = worst_plants(
-        uncertain, sections.structure, made.kappa, made.bandwidth, bounds_of(problem),
+        uncertain, structure_of(problem), made.kappa, made.bandwidth, bounds_of(problem),
         sections.sampling, seed=sections.seed + turn,
     )  # fmt: skip
     if progress is not None:
@@ -367,7 +402,7 @@ def _judged(
         weighted_level=_times(bounds.weighted_level),
         compliance_max=_times(bounds.compliance_max),
     )
-    integrator = sections.structure.integrator
+    integrator = structure_of(problem).integrator
     return certify(
         plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
     )

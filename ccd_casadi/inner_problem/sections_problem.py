@@ -32,6 +32,17 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
+class ChannelProblem:
+    """One channel of a plant with several: its structure, and its directions of outputs and inputs
+    (None: not given; those that are found at the start hold then for every θ)."""
+
+    name: str
+    structure: Structure
+    outputs: tuple[float, ...] | None = None
+    inputs: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
 class SectionsProblem:
     """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
 
@@ -40,7 +51,8 @@ class SectionsProblem:
     `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
     before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
-    θ; None: by the plant at the start.
+    θ; None: by the plant at the start. `channels` of a plant with several outputs; where the case
+    names none they are found, with `structure` for each.
     """
 
     structure: Structure = field(default_factory=Structure)
@@ -54,11 +66,12 @@ class SectionsProblem:
     frequencies: tuple[float, float] | None = None
     anchors: tuple[tuple[float, ...], ...] = ()
     members: tuple[Member, ...] = ()
+    channels: tuple[ChannelProblem, ...] = ()
 
     def identity(self) -> dict[str, Any]:
         """What determines ω_b*(θ), as plain values."""
         structure, sampling = self.structure, self.sampling
-        return {
+        found: dict[str, Any] = {
             "structure": vars(structure),
             "shape": self.shape,
             "weighted_level": self.weighted_level,
@@ -72,3 +85,8 @@ class SectionsProblem:
             "anchors": self.anchors,
             "members": self.members,
         }
+        if self.channels:
+            found["channels"] = [
+                vars(channel) | {"structure": vars(channel.structure)} for channel in self.channels
+            ]
+        return found
