@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.progress import Progress
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -49,11 +48,26 @@ def summary(solution: "Solution") -> str:
         f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
         f"binding       {', '.join(result['active']) or 'nothing'}",
+        *design_plant_lines(result.get("robust") or {}),
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
+    """Which plant of a robust set the controller is made on, and what came of the others."""
+    if "design_at" not in robust:
+        return []
+    others = [
+        f"{name}: {item['status'].replace('_', ' ')}"
+        + (f", J {item['objective']:.6g}" if item.get("objective") is not None else "")
+        for name, item in robust.get("tried", {}).items()
+        if name != robust["design_at"]
+    ]
+    beside = f" ({'; '.join(others)})" if others else ""
+    return [f"design plant  {robust['design_at']}{beside}"]
 
 
 def sections_summary(result: Mapping[str, Any]) -> str:
@@ -167,9 +181,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"run folder    {folder}")
     from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    with Progress(1, "drawing the report", quiet=options.quiet) as bar:
-        write_report(folder, resolved(case, solution), solution.problem or problem, solution)
-        bar.advance()
+    plant_case, solved = resolved(case, solution), solution.problem or problem
+    write_report(folder, plant_case, solved, solution, quiet=options.quiet)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code

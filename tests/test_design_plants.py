@@ -18,6 +18,7 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.sweep import missed_by, shortfall
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.solve import design_plant_lines
 from ccd_casadi.support.process_pool import Workers
 
 OPEN = RobustSet(0.02, 3, (), None)
@@ -97,3 +98,15 @@ def test_the_words_say_what_was_tried_where_and_what_next() -> None:
     assert "is not proven" in remedies(case, 0.5)
     assert "+-1 %" in remedies(case, 0.5)
     assert "[robust]" not in remedies(problem())
+
+
+def test_the_terminal_says_which_plant_won_and_what_the_others_came_to() -> None:
+    tried = {
+        "low": {"status": "not_verified", "objective": 92.05},
+        "nominal": {"status": "infeasible"},
+        "high": {"status": "verified", "objective": 82.335},
+    }
+    (line,) = design_plant_lines({"design_at": "high", "tried": tried})
+    plain = " ".join(line.split())
+    assert plain == "design plant high (low: not verified, J 92.05; nominal: infeasible)"
+    assert design_plant_lines({}) == []

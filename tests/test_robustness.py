@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import control
 import numpy as np
@@ -16,7 +17,7 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace, scale_plant
-from ccd_casadi.reporting.robustness_page import conclusion, robustness_html
+from ccd_casadi.reporting.robustness_page import _bandwidth_lost, conclusion, robustness_html
 from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
 from ccd_casadi.robust.perturbed import (
@@ -282,3 +283,18 @@ def test_in_a_process_of_its_own_the_structured_bound_is_the_same(run: FinishedR
     here, there = (with_structured_bound(run, study, seconds) for seconds in (None, 120.0))
     assert there.overrun is None
     assert repr(here.structured) == repr(there.structured)
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.99, False), (0.6, True)])
+def test_plants_that_lose_bandwidth_are_said_though_stable_and_within_s_max(
+    share: float, said: bool
+) -> None:
+    """D8: "0 unstable, 0 above S_max" was all that was said where a quarter had 37 Hz of 59."""
+    bandwidths = HZ * np.array([59.0] * 15 + [share * 59.0] * 5)
+    judged = [SimpleNamespace(stable=True, bandwidth=value) for value in bandwidths]
+    run = SimpleNamespace(figures=SimpleNamespace(bandwidth=59.0 * HZ))
+    words = _bandwidth_lost(run, SimpleNamespace(tolerances=SimpleNamespace(judged=judged)))
+    assert bool(words) == said
+    if said:
+        assert "35.4 Hz" in words[0]
+        assert "59 Hz" in words[0]

@@ -158,7 +158,7 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
 def test_positions_and_accelerations_at_any_time() -> None:
     profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
     times, states = flown(profile)
-    place, rate = profile.at(np.append(times, 1.0))
+    place, _, rate, _, _ = profile.at(np.append(times, 1.0))
     assert place == pytest.approx(np.append(states[:, 0], 0.01), abs=1e-12)
     assert rate == pytest.approx(np.append(states[:, 2], 0.0), abs=1e-10)
 

@@ -48,6 +48,19 @@ def test_a_kinked_bandwidth_recommends_lifted() -> None:
     assert "kinked where they are equal" in recommendation(several)
 
 
+def test_what_predicts_left_out_samples_badly_is_called_neither_smooth_nor_supported() -> None:
+    """D10: Q² of 0.84 was "smooth, supported", and one of 0.998 "kinked"."""
+    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    for q2, said in ((0.84, "poorly followed"), (0.93, "kinked"), (0.998, "nearly smooth")):
+        kinked = replace(q, roughness=Roughness.KINKED, kfold=replace(q.kfold, q2=q2))
+        assert kinked.samples_look == said
+    poor = replace(q, roughness=Roughness.SMOOTH, kfold=replace(q.kfold, q2=0.84))
+    assert poor.samples_look == "poorly followed"
+    assert not poor.smooth_enough
+    assert "0.84" in poor.unsupported
+    assert "support the design" not in recommendation([poor])
+
+
 def test_a_design_beyond_the_samples_is_flagged() -> None:
     near = X[(X < 58.0).all(axis=1)]
     few = fit(near, near.sum(1) ** 2, **BOX, starts=1)

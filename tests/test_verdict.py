@@ -1,6 +1,8 @@
 """The verdict: states follow their figures; what is not optimal is never verified; kinks count."""
 
+import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,22 +14,30 @@ from hypothesis import strategies as st
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.box_look import BoxLook
+from ccd_casadi.codesign.box_look import BoxLook, _starts
 from ccd_casadi.codesign.direct import acceptable, objective
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import FORMULATIONS, formulation_of, solve
 from ccd_casadi.codesign.survival import REACH, Survival, survival
-from ccd_casadi.inner_problem.problem import RobustSet, scaled_plant, true_design, true_inner
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    RobustSet,
+    scaled_plant,
+    true_design,
+    true_inner,
+)
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import verdict as shown
+from ccd_casadi.sampling.sampler import BandwidthSample
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
+from surrogates import design
 
 ROOT = Path(__file__).parent.parent
 CORNER = (55.0, 55.0)
@@ -231,6 +241,49 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     assert kkt_certificate(case, end, found).stationarity <= SMOOTH
     assert objective(case, end, found) < objective(case, start, quantities.at(start))
     assert len(quantities.designs) < 40
+
+
+@pytest.fixture(scope="module")
+def chain_problem() -> Callable[[int], CoDesignProblem]:
+    """The random chains of `benchmarks/formulations_agree.py`."""
+    place = ROOT / "benchmarks" / "chain_plants.py"
+    spec = importlib.util.spec_from_file_location("chain_plants", place)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.chain_problem
+
+
+def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
+    """Where the bandwidth would jump is an edge like another: no start stops on the way along it.
+
+    A margin of 10 (share of the box)² to the edge left ends 0.2 to 1.7 % apart after 30 steps.
+    """
+    case = chain_problem(2)
+    lower, upper = lifted_bounds(case)
+    quantities = TrueQuantities(case)
+    ends = []
+    for share in ((0.37, 0.66, 0.15, 0.89, 1.0, 1.0), (0.2, 0.6, 0.5, 0.5, 1.0, 1.0)):
+        end = descend(case, quantities, lower + (upper - lower) * np.array(share))
+        kkt = kkt_certificate(case, end, quantities.at(end))
+        assert acceptable(case, end, quantities.at(end))
+        assert any(name.startswith("-3 dB") for name in kkt.active)
+        assert kkt.stationarity <= v.KKT_LEVEL
+        ends.append(objective(case, end, quantities.at(end)))
+    assert ends[0] == pytest.approx(ends[1], rel=1e-5)
+
+
+def test_local_solves_start_from_more_than_what_beats_its_neighbours() -> None:
+    case = problem()
+    thetas = design("sobol", np.array(case.lower), np.array(case.upper), 16, 0)
+    samples = [
+        BandwidthSample(tuple(theta), 1.0, (0.0, 0.0), 1.0, 1.0, (), "", 0.0, 1)
+        for theta in thetas
+    ]  # fmt: skip
+    values = ((thetas - np.array(case.lower)) ** 2).sum(axis=1)  # one basin, one lowest point
+    starts = _starts(case, samples, values, np.array(case.upper))
+    assert [samples.index(start) for start in starts] == list(np.argsort(values))
 
 
 @pytest.mark.slow

@@ -8,9 +8,11 @@ maximum of S is near -3 dB),
     ω_b + k σ   over   ln‖S‖∞ - k σ <= ln S_max,  ln|S(jω_low)| - k σ <= ln S_low,   k = 4,
 
 do not reach the J at hand. The `CHECKED` most promising of those are solved all the same, and all
-of them where one is better than the surrogates' optimism allowed. Whatever is better than its
-neighbours starts a local solve on the true problem (`kinked.descend`); the best end wins. What this
-excludes is a better optimum whose basin one of the points lies in, and no more.
+of them where one is better than the surrogates' optimism allowed. What is better than its
+neighbours, and after that the best of the rest, start local solves on the true problem
+(`kinked.descend`); the best end wins. A basin is often entered by points that are no better than
+their neighbours: with these alone one random problem of six ended above its optimum. What this
+excludes is a better optimum whose basin one of the starts lies in, and no more.
 """
 
 from collections.abc import Sequence
@@ -30,7 +32,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
-LOCAL_STARTS = 8  # local solves at most, from the best of the points that beat their neighbours
+POINTS_A_START = 4  # points looked at for every local solve: each costs as much as an inner problem
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
@@ -89,7 +91,7 @@ def look_over_box(
     values = np.array([_objective(problem, sample) for sample in feasible])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best = None, J
-    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))
+    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
     for sample in starts:
         begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
         end = descend(problem, quantities, begin)
@@ -227,19 +229,20 @@ def _apart(thetas: Array, width: Array) -> list[bool]:
 def _starts(
     problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
 ) -> list[BandwidthSample]:
-    """Samples with a lower J than their n_θ + 1 nearest neighbours, away from θ; the best first."""
+    """Samples with a lower J than their n_θ + 1 nearest neighbours, then the best; away from θ."""
     if not samples:
         return []
     lower, upper = box(problem)
     unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
     here = (theta - lower) / (upper - lower)
-    chosen = []
+    lowest: list[BandwidthSample] = []
+    others: list[BandwidthSample] = []
     for i in np.argsort(values):
         away = np.abs(unit - unit[i]).max(axis=1)
         near = np.argsort(away)[1 : lower.size + 2]
-        if (values[near] >= values[i]).all() and np.abs(unit[i] - here).max() > SAME:
-            chosen.append(samples[i])
-    return chosen[:LOCAL_STARTS]
+        if np.abs(unit[i] - here).max() > SAME:
+            (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
+    return lowest + others
 
 
 def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate, other_peaks
 from ccd_casadi.codesign.outer_problem import (
     LocalOptimum,
     OuterFailure,
@@ -26,6 +26,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import design
 
+ON_EDGE = 1e-4  # ln: so close to a kink or a jump IPOPT, which knows one gradient alone, stalls
 STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
 
 
@@ -84,7 +85,9 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     if acceptable(problem, x, start) and _stationary(problem, x, start):
         return x, start, None
     x, start = _past_kinks(problem, quantities, x, start)
-    if acceptable(problem, x, start) and _residual(problem, x, start) <= SMOOTH:
+    if acceptable(problem, x, start) and (
+        _residual(problem, x, start) <= SMOOTH or other_peaks(problem, x, start, ON_EDGE)
+    ):
         return x, start, None
     solution: OuterSolution | None = None
     try:
@@ -103,7 +106,7 @@ def _past_kinks(
     problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
 ) -> tuple[Array, Sensitivities]:
     """Every peak of S a constraint of its own: some ten designs where IPOPT takes a hundred."""
-    end = descend(problem, quantities, x, settled=1e-13)
+    end = descend(problem, quantities, x, steps=80, settled=1e-13)
     found = quantities.at(end)
     if not acceptable(problem, end, found):
         return x, design

@@ -25,7 +25,8 @@ BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
 INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
 FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
-SHELF = 10.0  # ln per (share of the box)²: how far a step stays from where ω_b jumps
+SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
+FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
 SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
 
@@ -73,11 +74,12 @@ def descend(
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
     H = scale * np.eye(size)
     rho = scale
+    bend = SHELF
     for _ in range(steps):
-        d, mu, model = _step(here, H, radius, rho)
+        d, mu, model = _step(here, H, radius, rho, bend)
         while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
             radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
-            d, mu, model = _step(here, H, radius, rho)
+            d, mu, model = _step(here, H, radius, rho, bend)
         rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
         if radius < LEAST or model <= settled * abs(here.J):
             break
@@ -85,6 +87,7 @@ def descend(
         gained = -np.inf if there is None else _merit(here, rho) - _merit(there, rho)
         if there is not None:
             H = _updated(H, here, there, mu)
+            bend = _bend(here, there, bend)
         if there is None or gained < 0.1 * model:
             radius = min(radius, float(np.abs(d).max())) * 0.35
         elif gained > 0.7 * model and np.abs(d).max() > 0.9 * radius:
@@ -124,14 +127,35 @@ def _merit(point: _Point, rho: float) -> float:
     return point.J + rho * float(np.maximum(point.g, 0.0).sum())
 
 
-def _step(here: _Point, H: Array, radius: float, rho: float) -> tuple[Array, Array, float]:
+def _bend(here: _Point, there: _Point, bend: float) -> float:
+    """How far a shelf may depart from its slope, ln per (share of the box)², after a step.
+
+    Twice what was seen, but at least a quarter of what was feared before; four times what was
+    feared where a shelf was passed.
+    """
+    d = there.z - here.z
+    size = float(np.abs(d).max())
+    seen = []
+    for value, row, tag in zip(here.g, here.jacobian, here.tags, strict=True):
+        if tag[0] == "shelf" and size > 1e-6:
+            same = _same(tag, there)
+            if same is None and value + row @ d > -BAND:
+                return min(4.0 * bend, SHELF)
+            if same is not None:
+                seen.append(abs(there.g[same] - value - float(row @ d)) / size**2)
+    return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
+
+
+def _step(
+    here: _Point, H: Array, radius: float, rho: float, bend: float
+) -> tuple[Array, Array, float]:
     """d, the multipliers of g, and by how much the model of the merit falls."""
     n, m = here.z.size, here.g.size
     solver = _solver(n, m)
     unit = max(float(np.abs(here.gradient).max()), 1e-300)
     # Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong.
     shelf = np.array([kind == "shelf" for kind, _, _ in here.tags])
-    g = here.g + np.where(shelf, SHELF * radius**2, 0.0)
+    g = here.g + np.where(shelf, bend * radius**2, 0.0)
     # In steps of one radius, so that the solver's tolerances mean the same at every radius.
     hessian = np.zeros((n + m, n + m))
     hessian[:n, :n] = radius * (H / unit + 1e-9 * np.trace(H) / (n * unit) * np.eye(n))

@@ -92,7 +92,7 @@ def result_dict(
     result = {
         **figures_dict(figures),
         "status": "not_verified" if failed else "verified",
-        "reason": "; ".join(part for part in (why, outcome.message) if part),
+        "reason": "; ".join(part for part in (why, outcome.message) if part) if failed else "",
         "verdict": verdict_dict(verdict),
         "formulation": formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),

@@ -46,6 +46,7 @@ from surrogates import design, save
 from surrogates.files import write_whole
 
 Formulation = Nested | Lifted | Direct
+MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -150,13 +151,17 @@ def _with_look(
         len(outcome.iterates) <= rounds
         and _prediction_error(outcome, verified) > formulation.tolerance
     ):
-        x = verified.x if look.x is None else look.x
-        outcome = _resumed(sampler, formulation, outcome, x, seed)
-        again = [verify(sampler, end) for end in _distinct(x, outcome.x)]
-        verified = _best([verified, *again], formulation.tolerance)
+        x, again = verified.x, formulation
+        if look.x is not None:
+            x = look.x
+            if not isinstance(formulation, Direct):
+                again = replace(formulation, max_refinements=min(rounds, MOVED_ROUNDS))
+        outcome = _resumed(sampler, again, outcome, x, seed)
+        ends = [verify(sampler, end) for end in _distinct(x, outcome.x)]
+        verified = _best([verified, *ends], formulation.tolerance)
     if verified.kkt.stationarity > KKT_LEVEL:
-        ends = perturbed(sampler, verified.x, seed)
-        verified = _best([verified, *(verify(sampler, end) for end in ends)], formulation.tolerance)
+        ends = [verify(sampler, end) for end in perturbed(sampler, verified.x, seed)]
+        verified = _best([verified, *ends], formulation.tolerance)
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
 
 
@@ -180,7 +185,7 @@ def _resumed(
             sampler, formulation, seed=seed, given=given, incumbent=new[0] if new else None
         )
     if found.x is None:
-        return replace(outcome, x=x)
+        return replace(outcome, x=x, surrogates=found.surrogates or outcome.surrogates)
     return replace(found, iterates=(*outcome.iterates, *found.iterates))
 
 
@@ -266,11 +271,7 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(sampler, outcome.x) if verified is None else verified
-    with Progress(
-        1, "judging the surrogates", quiet=sampler.quiet or not outcome.surrogates
-    ) as bar:
-        quality = surrogate_quality(outcome.surrogates, verified.x, seed)
-        bar.advance()
+    quality = surrogate_quality(outcome.surrogates, verified.x, seed, quiet=sampler.quiet)
     result = result_dict(
         sampler.problem,
         formulation,

@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess, Quality, quality_of
 
@@ -18,21 +19,24 @@ OUTPUTS = (
 
 
 def surrogate_quality(
-    processes: Sequence[GaussianProcess], x: Array, seed: int = 0
+    processes: Sequence[GaussianProcess], x: Array, seed: int = 0, *, quiet: bool = True
 ) -> tuple[Quality, ...]:
     """Judge the processes of ω_b, or of ω_b, ln‖S‖∞ and ln|S(jω_low)|, at the design x."""
-    return tuple(
-        quality_of(
-            process,
-            x[: process.lower.size],
-            name=name,
-            unit=unit,
-            factor=factor,
-            logarithm=logarithm,
-            seed=seed,
-        )
-        for process, (name, unit, factor, logarithm) in zip(processes, OUTPUTS, strict=False)
-    )
+    found = []
+    with Progress(len(processes), "judging the surrogates", quiet) as bar:
+        for process, (name, unit, factor, logarithm) in zip(processes, OUTPUTS, strict=False):
+            quality = quality_of(
+                process,
+                x[: process.lower.size],
+                name=name,
+                unit=unit,
+                factor=factor,
+                logarithm=logarithm,
+                seed=seed,
+            )
+            found.append(quality)
+            bar.advance()
+    return tuple(found)
 
 
 def recommendation(qualities: Sequence[Quality]) -> str:

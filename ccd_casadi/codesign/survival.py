@@ -12,8 +12,8 @@ The `robustness` command looks closer; this is what no verdict should be without
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
-import control
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -22,6 +22,7 @@ from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
 
 REACH = 0.5  # of the frequency: how far a shift is followed
 FACTORS = (0.1, 10.0)  # of the damping
@@ -113,9 +114,9 @@ def survival(
         stable_shift=stable,
         S_max_shift=shifts(within, PLACES[::2]),
         stable_damping=(factor(FACTORS[0]), factor(FACTORS[1])),
-        gain=margins[0],
-        phase_deg=margins[1],
-        delay=margins[2],
+        gain=(max(m.gain_down for m in margins), min(m.gain_up for m in margins)),
+        phase_deg=min(m.phase_deg for m in margins),
+        delay=min(m.delay for m in margins),
         modulus=float(1.0 / _largest(S).max()),
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
         static_stiffness=float(np.linalg.svd(K0, compute_uv=False).min()),
@@ -215,21 +216,12 @@ def _reach(good: Callable[[float], bool], places: Array) -> float:
     return inside
 
 
-def _margins(
-    loop: _Loop, controller: _ControllerResponse, omega: Array
-) -> tuple[tuple[float, float], float, float]:
-    """Gain factors (down, up), phase in degrees and delay in s: the least of all loops."""
-    L = controller(omega) @ loop.respond(omega)
-    S = np.linalg.inv(np.eye(L.shape[1]) + L)
-    down, up, phase, delay = 0.0, math.inf, math.inf, math.inf
-    for i in range(L.shape[1]):
-        data = control.FrequencyResponseData(1.0 / S[:, i, i] - 1.0, omega, smooth=True)
-        gains, phases, _, _, at, _ = control.stability_margins(data, returnall=True)
-        gains, at = np.asarray(gains, float), np.asarray(at, float)
-        # a positive phase margin is a lag that the crossover allows, a negative one leaves 2π + it
-        lags = np.mod(np.radians(np.asarray(phases, float)), 2.0 * np.pi)
-        up = min(up, float(gains[gains > 1.0].min(initial=math.inf)))
-        down = max(down, float(gains[gains < 1.0].max(initial=0.0)))
-        phase = min(phase, float(np.abs(phases).min(initial=math.inf)))
-        delay = min(delay, float((lags / at).min(initial=math.inf)))
-    return (down, up), phase, delay
+def _margins(loop: _Loop, controller: _ControllerResponse, omega: Array) -> list[ClassicalMargins]:
+    """Of each loop broken alone at the plant's inputs."""
+
+    def broken(i: int, w: Array) -> np.ndarray:
+        L = controller(w) @ loop.respond(w)
+        S = np.linalg.inv(np.eye(L.shape[1]) + L)
+        return np.asarray(1.0 / S[:, i, i] - 1.0)
+
+    return [classical_margins(partial(broken, i), omega) for i in range(loop.B.shape[1])]

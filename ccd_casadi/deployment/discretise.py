@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import cont2discrete
 
 from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
@@ -57,6 +56,8 @@ def discretise(
 
     Raises ValueError where the frequency to be exact at lies above half the sampling rate.
     """
+    from scipy.signal import cont2discrete  # slow to import
+
     parts = (controller.A, controller.B, controller.C, controller.D)
     if conversion.method in (Discretisation.TUSTIN, Discretisation.PREWARPED):
         step = period

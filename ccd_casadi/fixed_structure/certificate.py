@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.loop import Sampling
@@ -264,6 +263,8 @@ def _sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
 
 
 def _tustin(K: StateSpace, period: float) -> StateSpace:
+    from scipy.signal import cont2discrete  # slow to import
+
     A, B, C, D, _ = cont2discrete((K.A, K.B, K.C, K.D), period, "bilinear")
     return StateSpace(A, B, C, D)
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
-from scipy.stats import qmc
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
@@ -84,6 +83,8 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
     if n == 1:
         unit = np.linspace(0.0, 1.0, count)[:, None]
     else:
+        from scipy.stats import qmc  # slow to import
+
         unit = qmc.Halton(n, seed=seed).random(count)
     points = box[0] + unit * (box[1] - box[0])
     share = max(1, len(uncertain.options))

@@ -8,7 +8,6 @@ functions, as after a sweep.
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.ndimage import label, maximum_position
 
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, refine
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -122,6 +121,8 @@ def _next_point(
         excess = (predicted[:, 1:3] - levels).max(axis=1)
         candidates = [int(np.argmin(excess))] if best == -np.inf else []
     else:
+        from scipy.ndimage import label, maximum_position  # slow to import
+
         parts, count = label(inside)
         merit = predicted[:, 0].reshape(FINE, FINE)
         places = maximum_position(merit, parts, range(1, count + 1))

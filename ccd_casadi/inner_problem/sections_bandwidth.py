@@ -23,12 +23,11 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, Member, SectionsProblem
+from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -154,7 +153,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
     sections = sections_of_problem(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = _warm(problem, theta, plants, bounds)
+    initial = warm_starts(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
     spent = 0
     if initial:
@@ -170,52 +169,6 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
         )  # fmt: skip
         spent += 1
     return valued(problem, theta, plants, made, spent)
-
-
-def _warm(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    plants: Sequence[ScaledPlant],
-    bounds: Bounds,
-) -> list[Array]:
-    """Each anchor as it is or moved with the plant from the start θ to this, whichever is nearer.
-
-    Moved: frequencies with the first flexible mode, the gain as 1/|G| at the frequency that the
-    crossover moves with; a notch stays on its resonance.
-    """
-    sections = sections_of_problem(problem)
-    if not sections.anchors:
-        return []
-    first = scaled_plant(problem, problem.start)
-    here = plants[0]
-    frequency = _first_mode(here) / _first_mode(first)
-    structure = structure_of(problem)
-    found = problem_for(plants, structure, bounds, sections.sampling, sections.frequencies)
-    warm = []
-    for kappa in map(np.array, sections.anchors):
-        crossover = 0.1 * first.omega_0
-        gain = _size(first, crossover) / _size(here, frequency * crossover)
-        moved = structure.in_units(kappa, frequency, gain)
-        both = [kappa, moved]
-        merits = [
-            started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
-            for one in both
-        ]
-        warm.append(both[int(np.argmax(merits))])
-    return warm
-
-
-def _first_mode(plant: ScaledPlant) -> float:
-    """The lowest flexible frequency in rad/s; ω₀ where there is none."""
-    light = plant.natural[plant.natural > 0.0]
-    return float(light.min()) if len(light) else plant.omega_0
-
-
-def _size(plant: ScaledPlant, omega: float) -> float:
-    """‖G(jω)‖ in m/N."""
-    si = plant.plant_si()
-    solved = np.linalg.solve(1j * omega * np.eye(len(si.A)) - si.A, si.B + 0j)
-    return float(np.linalg.norm(si.C @ solved, 2))
 
 
 def valued(

@@ -1,4 +1,4 @@
-"""The frequency at which the bound γ_jω is attained, to rounding.
+"""The frequency at which the bound γ_jω is attained, to rounding, and what rounding leaves in it.
 
 The value of a maximum is insensitive to where it is taken, its gradient is not: next to a zero of
 damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the slope's root is sought.
@@ -6,18 +6,43 @@ damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the 
 
 import numpy as np
 
+from ccd_casadi.kernels.gamma import BACKWARD
 from ccd_casadi.kernels.generalized_plant import squared_weights
+
+DEVIATIONS = 4.0  # standard deviations of the rounding that `bound_error` admits
+
+
+def _least_direction(A, B, C, ω):
+    """M = jω - A, M⁻¹B, and σ_p of G = C M⁻¹ B with its singular vectors u, v."""
+    p = C.shape[0]
+    M = 1j * ω * np.eye(A.shape[0]) - A
+    right = np.linalg.solve(M, B)
+    U, s, Vh = np.linalg.svd(C @ right)
+    return M, right, s[p - 1], U[:, p - 1], Vh[p - 1].conj()
+
+
+def bound_error(A, B, C, w, ω):
+    """δγ_jω/γ_jω that rounding leaves in the bound attained at ω, through σ_p(G(jω)).
+
+    δσ = u* C (jω - A)⁻¹ δA (jω - A)⁻¹ B v with |δA| = BACKWARD |A| of the Schur form, spread evenly
+    over the entries. Next to a transmission zero of small damping σ is small and its error is not.
+    """
+    n = A.shape[0]
+    M, right, σ, u, v = _least_direction(A, B, C, ω)
+    if σ == 0.0:
+        return 0.0  # fewer inputs than outputs, or none that acts: the bound is |W1|
+    left = np.linalg.solve(M.T, u.conj() @ C)
+    dσ = BACKWARD * np.linalg.norm(A) / n * np.linalg.norm(left) * np.linalg.norm(right @ v)
+    W1, W2, W3 = squared_weights(w, ω)
+    force = W2 / σ**2
+    return DEVIATIONS * W1 / (W1 + force + W3) * force / (force + W3) * dσ / σ
 
 
 def _bound_slope(A, B, C, w, ω):
     """dγ_jω²(ω)/dω of γ_jω² = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|², dσ = Re(u* dG v)."""
-    n, p = A.shape[0], C.shape[0]
-    M = 1j * ω * np.eye(n) - A
-    right = np.linalg.solve(M, B)
-    U, s, Vh = np.linalg.svd(C @ right)
+    M, right, σ, u, v = _least_direction(A, B, C, ω)
     dG = -1j * (C @ np.linalg.solve(M, right))
-    σ = s[p - 1]
-    dσ = np.vdot(U[:, p - 1], dG @ Vh[p - 1].conj()).real
+    dσ = np.vdot(u, dG @ v).real
     M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
     W1, W2, W3 = squared_weights(w, ω)
     # |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c |W|²)/(c ω² + d)

@@ -1,8 +1,8 @@
 """γ_opt = max(γ_X, γ_jω): the root of the Riccati level, or the bound that no controller passes.
 
 In 1/t the Hamiltonian is affine and f nearly straight, so that Newton's method needs fewer
-steps in 1/t than in t. Near the root the third-order expansion of the stable subspace takes its
-place: a step of order four from one Schur form, whose own terms tell when it is good enough.
+steps in 1/t than in t. Near the root the power series of the stable subspace takes its place: a
+step of order four and more from one Schur form, whose own terms tell when it is good enough.
 """
 
 import numpy as np
@@ -15,6 +15,7 @@ from ccd_casadi.kernels.lapack import lyapunov_triangular
 from ccd_casadi.kernels.refine import narrow, next_trial
 from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 
+ABOVE = 1.005  # times the guess: from above the series alone may close the search
 BACKWARD = 8.0 * 2.0**-52  # |δH|/|H| of a Schur form; 6 eps was measured, N up to 35
 
 
@@ -97,24 +98,41 @@ def rounding_error(frame, t, d1):
 
 
 @compiled
+def undecided(frame, t, f, slope, d1, gamma_jw):
+    """How far above γ_jω, relative, γ_X may yet lie where f > 0 at t, a hair above; 0: nowhere.
+
+    At γ_jω f begins like a square root, so that from t down to there it falls by no more than
+    twice what its tangent says; rounding moves it by as much as it moves a root.
+    """
+    size = 2.0 * (t + d1**2)
+    hair = (t - (gamma_jw**2 - d1**2)) / size
+    left = rounding_error(frame, t, d1)
+    if slope > 0.0 and f > slope * size * (left + 2.0 * hair):
+        return 0.0
+    return left + hair
+
+
+@compiled
 def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
     """γ_opt = max(γ_X, γ_jω) by safeguarded steps on f; at most 60 Schur forms.
 
     `guess` starts the iteration (0: none), `noise` is the level's. Returns γ_opt, whether γ_jω
     limits, the number of Schur forms, whether it closed to the relative `tolerance` in γ, and
-    the relative error that rounding and search may have left (infinite where it is not known).
+    the relative error that rounding and search may have left (infinite where it is not known),
+    γ_jω taken as exact: see `bound_error`.
     """
     # γ_jω itself puts eigenvalues on the axis: the test is made a hair above it.
     t_jw = max(gamma_jw**2 * (1 + 1e-7) - d1**2, 1e-12 * d1**2)
     t_low, t_high = t_jw, np.inf
-    start = guess if guess > 0.0 else 1.3 * gamma_jw
+    start = ABOVE * guess if guess > 0.0 else 1.3 * gamma_jw
     t = max(start**2 - d1**2, t_jw)
     tested = False
     for forms in range(1, 61):
         f, slope, ok, frame = riccati_level(H0, B1, C1, d1, t, noise)
         if ok and f > 0.0:
             if t <= t_jw:
-                return gamma_jw, True, forms, True, tolerance
+                left = undecided(frame, t, f, slope, d1, gamma_jw)
+                return gamma_jw, True, forms, True, max(tolerance, left)
             t_high = min(t_high, t)
         else:
             t_low = max(t_low, t)
@@ -125,7 +143,9 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
             step = f / (slope * t * t)  # Newton's, in 1/t
             error = abs(step)
             if error * t < 0.3:
-                better, estimate = root_nearby(B1, C1, d1, frame, step)
+                # from below another direction of X may have a root beyond the one that is near
+                enough = 2.0 * tolerance * (t + d1**2) / t**2 if f > 0.0 else np.inf
+                better, estimate = root_nearby(B1, C1, d1, frame, step, enough)
                 if abs(better - step) < 0.5 * abs(step):
                     step, error = better, estimate
             new = t / (1.0 + step * t) if step * t > -1.0 else np.inf

@@ -4,6 +4,7 @@ import numpy as np
 
 from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
 from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
+from ccd_casadi.kernels.bound_peak import bound_error
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
@@ -60,8 +61,9 @@ def _search_and_control(gp, H0, bound, backoff, guess, noise):
 def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
     gp = generalized_plant(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
-    return _search_and_control(gp, H0, bound, backoff, guess, NOISE)
+    bound, at = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    row, Ak, Bk, Ck = _search_and_control(gp, H0, bound, backoff, guess, NOISE)
+    return row, Ak, Bk, Ck, at
 
 
 # What follows is plain NumPy: few designs come to it.
@@ -75,47 +77,53 @@ def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
     plant's own ones always.
     """
     if balanced:
-        gp, H0, bound, τ = _balanced(A, B, C, w, grid, sigma)
+        gp, H0, bound, at, τ = _balanced(A, B, C, w, grid, sigma)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
-            noise, back = rounding_noise(H0), τ.reshape(-1, 1)
-            row, Ak, Bk, Ck = _search_and_control(gp, H0, bound, backoff, guess, noise)
-            return row, Ak * (back / τ), Bk * back, Ck / τ
-    found = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
-    row = found[0]
-    closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
-    if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
-        return _with_a_better_optimum(found, A, B, C, w, grid, sigma, backoff)
-    return found
+            noise = rounding_noise(H0)
+            row, *K = _search_and_control(gp, H0, bound, backoff, guess, noise)
+            K = _in_own_coordinates(*K, τ)
+    else:
+        row, *K, at = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+        closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
+        if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
+            row, *K = _with_a_better_optimum(row, K, A, B, C, w, grid, sigma, backoff)
+    if row[Figure.LIMITED_BY_BOUND]:
+        row[Figure.GAMMA_ERROR] += bound_error(A, B, C, w, at)
+    return row, *K
+
+
+def _in_own_coordinates(Ak, Bk, Ck, τ):
+    """The controller on states x̂ = x/τ on x; no rounding, as τ are powers of two."""
+    back = τ.reshape(-1, 1)
+    return Ak * (back / τ), Bk * back, Ck / τ
 
 
 def _balanced(A, B, C, w, grid, sigma):
-    """The generalized plant and H0 in balanced coordinates, the bound γ_jω, and τ."""
+    """The generalized plant and H0 in balanced coordinates, γ_jω and where it is, and τ."""
     p, m = C.shape[0], B.shape[1]
     gp = generalized_plant(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
-    bound, _ = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    bound, at = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
     t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
     with np.errstate(all="ignore"):
         τ = balancing(level_hamiltonian(H0, gp[1], gp[3], gp[5], t))
         gp = in_coordinates(gp, τ)
-    return gp, lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m), bound, τ
+    return gp, lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m), bound, at, τ
 
 
-def _with_a_better_optimum(found, A, B, C, w, grid, sigma, backoff):
-    """γ_opt in balanced coordinates, where it agrees with what was found, and K in the plant's."""
-    row, *_ = found
-    other, H0, bound, _ = _balanced(A, B, C, w, grid, sigma)
+def _with_a_better_optimum(row, K, A, B, C, w, grid, sigma, backoff):
+    """γ_opt and K from balanced coordinates where γ_opt agrees with what was found, or that."""
+    gp, H0, bound, _, τ = _balanced(A, B, C, w, grid, sigma)
     gamma_opt, error = float(row[Figure.GAMMA_OPT]), float(row[Figure.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
-        H0, other[1], other[3], other[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE
+        H0, gp[1], gp[3], gp[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE
     )
     row[Figure.SCHUR_FORMS] += more
     # only what both agree on within their errors is the same optimum
-    if not (closed and not at_bound and left < error and abs(again - gamma_opt) <= error * again):
-        return found
+    if not (closed and left < error and abs(again - gamma_opt) <= error * again):
+        return row, *K
     row[Figure.GAMMA_OPT], row[Figure.GAMMA_ERROR] = again, left
-    gp = generalized_plant(A, B, C, w)
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    Ak, Bk, Ck, ok = central_controller(*gp, H0, backoff * again)
+    row[Figure.LIMITED_BY_BOUND] = at_bound
+    *K, ok = central_controller(*gp, H0, backoff * again)
     row[Figure.CODE] = float(Code.CERTIFIED if ok else Code.RICCATI_FAILED)
-    return row, Ak, Bk, Ck
+    return row, *_in_own_coordinates(*K, τ)

@@ -1,6 +1,6 @@
 """The run report: one self-contained `report.html` about a finished run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,6 +55,7 @@ from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
+from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 
@@ -69,15 +70,29 @@ STATUS = {
 }
 
 
-def write_report(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> Path:
+def write_report(
+    folder: Path,
+    case: Case,
+    problem: CoDesignProblem,
+    solution: "Solution",
+    *,
+    quiet: bool = True,
+) -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    write_whole(path, report_html(folder, case, problem, solution))
+    write_whole(path, report_html(folder, case, problem, solution, quiet=quiet))
     return path
 
 
-def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> str:
-    """The report's text."""
+def report_html(
+    folder: Path,
+    case: Case,
+    problem: CoDesignProblem,
+    solution: "Solution",
+    *,
+    quiet: bool = True,
+) -> str:
+    """The report's text; the bar counts its sections."""
     result = solution.result
     status = result["status"]
     title = f"Co-design of {case.path.stem}"
@@ -92,20 +107,26 @@ def report_html(folder: Path, case: Case, problem: CoDesignProblem, solution: "S
         warned=worst(result) is State.WARNED,
         verdict=verdict_html(result),
     )
-    sections = []
+    parts: list[Callable[[], list[Section]]] = []
     if solution.sections is not None:
-        sections = sections_sections(problem, solution)
+        parts = [lambda: sections_sections(problem, solution)]
     if solution.verified is not None:
-        truths = read_truths(folder / "samples.sqlite", problem)
-        sections = [
-            _design(problem, solution),
-            _theta(problem, solution, solution.verified, truths),
-            *stage_sections(problem, {"start": problem.start, "optimum": solution.verified.theta}),
-            *_loop(problem, solution, solution.verified),
-            _history(case, problem, solution, solution.verified),
-            *_trust(solution),
-            _sweep(problem, solution, solution.verified, truths),
+        verified, truths = solution.verified, read_truths(folder / "samples.sqlite", problem)
+        stages = {"start": problem.start, "optimum": verified.theta}
+        parts = [
+            lambda: [_design(problem, solution)],
+            lambda: [_theta(problem, solution, verified, truths)],
+            lambda: stage_sections(problem, stages),
+            lambda: _loop(problem, solution, verified),
+            lambda: [_history(case, problem, solution, verified)],
+            lambda: _trust(solution),
+            lambda: [_sweep(problem, solution, verified, truths)],
         ]
+    sections: list[Section] = []
+    with Progress(len(parts), "drawing the report", quiet) as bar:
+        for part in parts:
+            sections += part()
+            bar.advance()
     return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
 
 

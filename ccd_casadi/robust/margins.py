@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import control
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +18,7 @@ from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import classical_margins
 from ccd_casadi.synthesis.closed_loop import responses
 
 FINE = 60  # points between the neighbours of the least disk margin found
@@ -101,17 +101,17 @@ def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
 
 
 def _loop(name: str, hz: Array, L: NDArray) -> LoopMargins:
-    response = control.FrequencyResponseData(L, HZ * hz, smooth=True)
-    gains, phases, _, _, at, _ = control.stability_margins(response, returnall=True)
-    gains, at = np.asarray(gains, float), np.asarray(at, float)
+    from scipy.interpolate import CubicSpline  # slow to import
+
+    found = classical_margins(CubicSpline(HZ * hz, L), HZ * hz)
     distance = np.abs(1.0 / (1.0 + L) - 0.5)
     worst = int(distance.argmax())
     return LoopMargins(
         name=name,
-        gain_up=float(gains[gains > 1.0].min(initial=np.inf)),
-        gain_down=float(gains[gains < 1.0].max(initial=0.0)),
-        phase_deg=float(np.abs(phases).min(initial=np.inf)),
-        crossover_hz=float(at.min(initial=np.inf) / HZ),
+        gain_up=found.gain_up,
+        gain_down=found.gain_down,
+        phase_deg=found.phase_deg,
+        crossover_hz=found.crossover / HZ,
         disk=DiskMargin(float(1.0 / distance[worst]), float(hz[worst])),
     )
 
