@@ -11,9 +11,16 @@ from helpers import SUSPENSION, random_plant
 from ccd_casadi.cases.case import CaseError, load_case, problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, uncertain_plant
+from ccd_casadi.inner_problem.sections_bandwidth import (
+    bounds_of,
+    plants_of,
+    structure_of,
+    uncertain_plant,
+    with_channels,
+)
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.store import problem_hash
@@ -114,12 +121,71 @@ def test_option_sets_are_plants_of_the_set(tmp_path: Path) -> None:
         written(tmp_path, SECTIONS, '[robust]\nplants = ["soft.toml"]')
 
 
-def test_a_plant_of_several_outputs_is_refused(tmp_path: Path) -> None:
-    text = (RUNS / "rib_stage.toml").read_text()
-    path = tmp_path / "rib.toml"
-    path.write_text(text + SECTIONS)
-    with pytest.raises(CaseError, match="one of each"):
-        problem_of(load_case(path))
+AXES = """
+def axes(theta):
+    m = theta["m1"]
+    return {"mass": [[m, 0], [0, 2 * m]], "stiffness": [[0, 0], [0, 0]],
+            "damping_ratio": 0.01, "input": [[1, 0], [0, 1]],
+            "output": OUTPUT, "hardware_cost": m}
+"""
+
+
+def two_axes(folder: Path, *added: str, output: str = "[[1, 0], [0, 1]]") -> Case:
+    """Case study 1 with a plant of two rigid axes that do not touch each other."""
+    (folder / "axes.py").write_text(AXES.replace("OUTPUT", output))
+    text = TWO_MASS.read_text().split("[objective]")[1]
+    plant = '[plant]\nfunction = "axes.py:axes"\n[theta.m1]\nlower = 55.0\nupper = 70.0\n'
+    path = folder / "axes.toml"
+    path.write_text(f"{plant}[objective]{text}{SECTIONS}" + "\n".join(added))
+    return load_case(path)
+
+
+def test_channels_of_a_plant_with_several_outputs(tmp_path: Path) -> None:
+    """Found at the start and kept for every θ, or given; single ones with their own structure."""
+    problem = with_channels(problem_of(two_axes(tmp_path, "[controller.channel.2]\nlead = 3")))
+    structure = structure_of(problem)
+    assert isinstance(structure, ChannelStructure)
+    assert [own.lead for own in structure.structures] == [1, 3]
+    assert np.abs(structure.decoupling.outputs).tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    assert structure_of(with_channels(replace(problem, start=(60.0,)))).names == structure.names
+    given = two_axes(tmp_path, "[controller.channel.sum]\noutputs = [1, 1]",
+                     "[controller.channel.difference]\noutputs = [2, -2]\nbiquads = 0")  # fmt: skip
+    again = tmp_path / "again.toml"
+    again.write_text(case_to_toml(given))
+    assert replace(load_case(again), path=given.path) == given
+    found = structure_of(problem_of(given))
+    assert isinstance(found, ChannelStructure)
+    assert found.decoupling.names == ("sum", "difference")
+    assert found.decoupling.outputs == pytest.approx(np.array([[1, 1], [1, -1]]) / np.sqrt(2.0))
+    hashes = [problem_hash(p.identity()) for p in (problem, problem_of(given))]
+    assert len({*hashes, problem_hash(problem_of(two_axes(tmp_path)).identity())}) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "added", "output"),
+    [
+        ("many of one as of the other", (), "[[1, 1]]"),
+        ("two.lead: is -1", ("[controller.channel.two]\nlead = -1",), "[[1, 0], [0, 1]]"),
+        ("name one of them", ("[controller.channel.z]\nlead = 2",), "[[1, 0], [0, 1]]"),
+        ("for every channel or for none",
+         ("[controller.channel.1]\noutputs = [1, 0]", "[controller.channel.2]\nlead = 2"),
+         "[[1, 0], [0, 1]]"),
+        ("as many numbers", ("[controller.channel.1]\noutputs = [1, 0]",), "[[1, 0], [0, 1]]"),
+        ("has one output: drop", ("[controller.channel.1]\nlead = 2",), None),
+        ("an effect with controller", ("[controller.channel.1]\nlead = 2",), ""),
+    ],
+)  # fmt: skip
+def test_mistakes_about_channels_are_told(
+    tmp_path: Path, words: str, added: tuple[str, ...], output: str | None
+) -> None:
+    def made() -> Case:
+        if output:
+            return two_axes(tmp_path, *added, output=output)
+        return written(tmp_path, *((SECTIONS,) if output is None else ()), *added)
+
+    with pytest.raises(CaseError) as caught:
+        problem_of(made())
+    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize("modal", [True, False])

@@ -32,10 +32,17 @@ from ccd_casadi.cases.kinds import (
     check_kind,
     disturbance_of,
     read_options,
-    require_scalar,
+    require_channels,
     sections_problem,
 )
-from ccd_casadi.cases.sections import SECTIONS, Case, Parameter, PlantSection, RobustSection
+from ccd_casadi.cases.sections import (
+    SECTIONS,
+    Case,
+    ChannelSection,
+    Parameter,
+    PlantSection,
+    RobustSection,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
@@ -152,6 +159,14 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         if required and name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
         sections[name] = _section(kind, name, data.get(name, {}), fail)
+    controller = sections["controller"]
+    if controller.channel:
+        own = data["controller"]["channel"]
+        channel = tuple(
+            (key, _section(ChannelSection, f"controller.channel.{key}", own[key], fail))
+            for key in own
+        )
+        sections["controller"] = replace(controller, channel=channel)
     for low, high, why in _ORDERED_WEIGHTS:
         below, above = getattr(sections["weights"], low), getattr(sections["weights"], high)
         if not below < above:
@@ -408,7 +423,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         if problem.sections is not None:
             sets = problem.sections.uncertainty.options
             plants += [plant_of(with_options(problem, item)) for item in sets]
-            require_scalar(plants)
+            require_channels(plants, problem.sections)
         if case.plant.model not in SHIPPED:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
                 if finding.severity is Severity.ERROR:

@@ -82,6 +82,17 @@ def factors(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers above 0"
 
 
+def direction(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
+        return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
+    return f"is {shown(value)}; give a list of numbers, one for each"
+
+
+def table(value: Any) -> str | None:
+    good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
+    return None if good else f"is {shown(value)}; write tables of that name"
+
+
 def files(value: Any) -> str | None:
     good = isinstance(value, list | tuple) and all(isinstance(v, str) and v for v in value)
     return None if good else f"is {shown(value)}; give a list of file names in quotes"

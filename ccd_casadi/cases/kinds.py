@@ -15,7 +15,12 @@ from ccd_casadi.cases.sections import (
     WeightsSection,
 )
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.fixed_structure.decoupling import given_decoupling
+from ccd_casadi.inner_problem.sections_problem import (
+    ChannelProblem,
+    SectionsProblem,
+    Uncertainty,
+)
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
@@ -74,6 +79,13 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     if controller.roll_off == 0 and controller.weighted_level is not None:
         words = "is 0: KS would not fall, and weighted_level holds at no frequency; give 1 or more"
         raise fail("controller.roll_off", words)
+    directed = [own.outputs is not None for _, own in controller.channel]
+    if any(directed) and not all(directed):
+        words = "gives outputs, another channel none; give them for every channel or for none"
+        raise fail(f"controller.channel.{controller.channel[directed.index(True)][0]}", words)
+    for name, own in controller.channel:
+        if own.inputs is not None and own.outputs is None:
+            raise fail(f"controller.channel.{name}.inputs", "has no outputs beside it; add them")
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
 
@@ -101,14 +113,34 @@ def read_options(path: Path) -> dict[str, Any]:
     return found
 
 
-def require_scalar(plants: Sequence[Plant]) -> None:
-    """Raise PlantError unless every plant has one input and one output."""
+def require_channels(plants: Sequence[Plant], sections: SectionsProblem) -> None:
+    """Raise PlantError unless every plant has as many inputs as outputs, and channels for them."""
     for plant in plants:
-        if (plant.inputs, plant.outputs) != (1, 1):
+        m, p = plant.inputs, plant.outputs
+        if m != p:
+            words = f'has {m} inputs and {p} outputs; controller.structure = "sections" needs as'
             raise PlantError(
-                f"has {plant.inputs} inputs and {plant.outputs} outputs; controller.structure = "
-                '"sections" is for one of each: take one channel of it, or "h_infinity"'
+                f'{words} many of one as of the other: leave some out, or "h_infinity"'
             )
+        if p > 1 and sections.minimise == "rms_error":
+            words = 'has several outputs; inner.minimise = "rms_error" is for one: drop it'
+            raise PlantError(words)
+        if not sections.channels:
+            continue
+        given = sections.channels[0].outputs is not None
+        found = [channel.name for channel in sections.channels]
+        if p == 1:
+            raise PlantError("has one output: drop the tables [controller.channel]")
+        if given:
+            channels = [(c.name, c.outputs or (), c.inputs or ()) for c in sections.channels]
+            given_decoupling(*(list(part) for part in zip(*channels, strict=True)))
+            if len(found) != p:
+                raise PlantError(f"has {p} outputs; give as many tables [controller.channel.NAME]")
+        elif not set(found) <= {str(i + 1) for i in range(p)}:
+            words = (
+                f"has channels 1 to {p} where none gives outputs; name one of them, or give them"
+            )
+            raise PlantError(words)
 
 
 def sections_problem(
@@ -143,4 +175,17 @@ def sections_problem(
         starts=controller.starts,
         minimise=inner.minimise,
         bandwidth_least=HZ * (inner.bandwidth_least_hz or 0.0),
+        channels=_channels(controller),
     )
+
+
+def _channels(controller: ControllerSection) -> tuple[ChannelProblem, ...]:
+    """The channels that the case names, each with its structure."""
+    keys = [item.name for item in fields(Structure)]
+    found = []
+    for name, own in controller.channel:
+        values = {key: getattr(own, key) for key in keys if getattr(own, key) is not None}
+        structure = Structure(**({key: getattr(controller, key) for key in keys} | values))
+        inputs = own.outputs if own.inputs is None else own.inputs
+        found.append(ChannelProblem(name, structure, own.outputs, inputs))
+    return tuple(found)

@@ -15,9 +15,10 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import judged_corners, with_range
+from ccd_casadi.inner_problem.sections_bandwidth import judged_corners, structure_of, with_range
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -116,15 +117,15 @@ def _read_sections(
     path = folder / "controller.json"
     table = read_json(path).get("sections")
     words = "is no list of parameters of the case's structure; solve the case again"
-    sections = problem.sections
-    assert sections is not None
     try:
         kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
     except (KeyError, TypeError, ValueError, OverflowError):
         raise UserError(f"{path}: sections.kappa: {words}") from None
-    if kappa.shape != (len(sections.structure.names),) or not (np.abs(kappa) < 200.0).all():
+    problem = _with_directions(problem, table, path)
+    structure = structure_of(problem)
+    if kappa.shape != (len(structure.names),) or not (np.abs(kappa) < 200.0).all():
         raise UserError(f"{path}: sections.kappa: {words}")
-    controller = state_space(sections.structure, kappa)
+    controller = controller_of(structure, kappa)
     judged = judged_corners(problem, theta, controller)
     if not judged.passed:
         words = f"is not certified on the plants of case.toml: {judged.words}"
@@ -160,11 +161,35 @@ def with_function(
     except (KeyError, TypeError, ValueError):
         words = "anchors, robust.set and seed are not those of a solve; solve the case again"
         raise UserError(f"{path}: {words}") from None
-    own = len(sections.structure.names)
+    own = len(structure_of(problem).names)
     if any(len(kappa) != own for kappa in anchors):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
     found = replace(sections, anchors=anchors, members=members, seed=seed)
     return with_range(replace(problem, sections=found))
+
+
+def _with_directions(
+    problem: CoDesignProblem, table: Mapping[str, Any] | None, path: Path
+) -> CoDesignProblem:
+    """The problem with the directions of channels that the controller was designed in."""
+    sections = problem.sections
+    if sections is None or not isinstance(table, Mapping) or "channels" not in table:
+        return problem
+    own = {channel.name: channel.structure for channel in sections.channels}
+    try:
+        channels = tuple(
+            ChannelProblem(
+                str(item["name"]),
+                own.get(str(item["name"]), sections.structure),
+                tuple(map(float, item["outputs"])),
+                tuple(map(float, item["inputs"])),
+            )
+            for item in table["channels"]
+        )
+    except (KeyError, TypeError, ValueError):
+        words = "sections.channels: names no directions; solve the case again"
+        raise UserError(f"{path}: {words}") from None
+    return replace(problem, sections=replace(sections, channels=channels))
 
 
 def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:

@@ -16,6 +16,7 @@ from ccd_casadi.cases.checks import (
     Check,
     choice,
     count,
+    direction,
     factors,
     files,
     flag,
@@ -23,6 +24,7 @@ from ccd_casadi.cases.checks import (
     number,
     points,
     steps,
+    table,
     tables,
 )
 
@@ -141,13 +143,33 @@ class RobustSection:
 
 
 @dataclass(frozen=True)
+class ChannelSection:
+    """[controller.channel.NAME] of a plant with several outputs: what differs from [controller].
+
+    `outputs`: how the channel's measurement is made of the plant's, `inputs`: how its force acts on
+    the plant's (default: as `outputs`). Either every channel gives them or none: then the channels
+    are those that are found, named "1", "2", ….
+    """
+
+    outputs: tuple[float, ...] | None = _key(direction, None)
+    inputs: tuple[float, ...] | None = _key(direction, None)
+    integrator: bool | None = _key(flag, None)
+    lead: int | None = _key(count(0), None)
+    biquads: int | None = _key(count(0), None)
+    roll_off: int | None = _key(count(0), None)
+    least_damping: float | None = _key(
+        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True), None
+    )
+
+
+@dataclass(frozen=True)
 class ControllerSection:
     """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
     of full order with an input disturbance beside the reference, or "sections".
 
     The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
     of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
-    The search starts at `starts` places.
+    The search starts at `starts` places. `channel` overrides the structure of single channels.
     """
 
     structure: str = _key(choice("h_infinity", "h_infinity_disturbance", "sections"), "h_infinity")
@@ -160,6 +182,7 @@ class ControllerSection:
         number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True), 0.0
     )
     starts: int = _key(count(1), 24)
+    channel: tuple[tuple[str, ChannelSection], ...] = _key(table, ())
 
 
 @dataclass(frozen=True)

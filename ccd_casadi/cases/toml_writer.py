@@ -19,7 +19,11 @@ def case_to_toml(case: Case) -> str:
         entry = {key: value for key, value in vars(parameter).items() if key != "name"}
         lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(entry)]
     for name in SECTIONS:
-        lines += ["", f"[{name}]", *_pairs(vars(getattr(case, name)))]
+        entries = dict(vars(getattr(case, name)))
+        tables = entries.pop("channel", ())
+        lines += ["", f"[{name}]", *_pairs(entries)]
+        for key, entry in tables:
+            lines += ["", f"[{name}.channel.{_toml_key(key)}]", *_pairs(vars(entry))]
     return "\n".join(lines) + "\n"
 
 

@@ -3,6 +3,8 @@
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate as Certificate
 from ccd_casadi.fixed_structure.certificate import certify as certify
+from ccd_casadi.fixed_structure.channel_design import synthesise as synthesise
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure as ChannelStructure
 from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
 from ccd_casadi.fixed_structure.design import bandwidth_and_gradient as bandwidth_and_gradient

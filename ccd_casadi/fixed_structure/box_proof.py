@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
 from ccd_casadi.fixed_structure.loop import Sampling, closed_loops, stable
@@ -91,7 +92,7 @@ class Proof:
 
 def prove(
     uncertain: UncertainPlant,
-    structure: Structure,
+    structure: Structure | ChannelStructure,
     kappa: Array,
     bandwidth: float,
     bounds: Bounds,
@@ -110,7 +111,9 @@ def prove(
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
-    if any(system.B.shape[1] != 1 or system.C.shape[0] != 1 for system in uncertain.options):
+    if not isinstance(structure, Structure) or any(
+        system.B.shape[1] != 1 or system.C.shape[0] != 1 for system in uncertain.options
+    ):
         return without(ProofOutcome.SEVERAL_CHANNELS)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)

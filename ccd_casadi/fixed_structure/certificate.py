@@ -1,5 +1,7 @@
 """The judge of a controller on a set of plants; it shares nothing with the synthesis.
 
+Of plants with several inputs and outputs the whole loop is judged, by largest singular values.
+
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
 stability; S, KS, T and GS are evaluated by dense solves on grids through every pole and zero of
 plant, controller and closed loop, refined at every local maximum that matters. For S the largest
@@ -83,7 +85,7 @@ def certify(
     integrator: bool = True,
     workers: Pool | None = None,
 ) -> Certificate:
-    """Judge an SI controller (e in, u out) on SISO plants against the bounds.
+    """Judge an SI controller (e in, u out) on plants against the bounds, σ_max of each matrix.
 
     `integrator`: the shape counts from 0 on, else from ω_low. ω_b is the least of all plants. The
     plants are spread over `workers`.
@@ -183,7 +185,7 @@ def _unstable(stability: float) -> PlantFigures:
 
 
 class _Responses:
-    """|S|, |KS|, |T|, |GS| and the weighted ones at frequencies in rad/s, by dense solves."""
+    """σ_max of S, KS, T, SG and the weighted ones at frequencies in rad/s, by dense solves."""
 
     def __init__(
         self,
@@ -200,13 +202,13 @@ class _Responses:
     def at(self, omega: Array) -> dict[str, Array]:
         s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
         g, k = _response(self.G, s), _response(self.K, s)
-        S = 1.0 / (1.0 + g * k)
+        S = np.linalg.inv(np.eye(g.shape[1]) + g @ k)
         free = g if self.period is None else _response(self.free, 1j * omega)
         found = {
-            "S": np.abs(S),
-            "KS": np.abs(k * S),
-            "T": np.abs(g * k * S),
-            "GS": np.abs(free * S),
+            "S": _gain(S),
+            "KS": _gain(k @ S),
+            "T": _gain(g @ k @ S),
+            "GS": _gain(S @ free),
         }
         if self.bounds.weights is not None:
             _, W_KS, W_T = np.abs(self.bounds.weights.responses(omega))
@@ -217,15 +219,22 @@ class _Responses:
 def _response(system: StateSpace, s: np.ndarray) -> np.ndarray:
     n = len(system.A)
     solved = np.linalg.solve(s[:, None, None] * np.eye(n) - system.A, system.B + 0j)
-    return np.asarray((system.C @ solved + system.D)[:, 0, 0])
+    return np.asarray(system.C @ solved + system.D)
+
+
+def _gain(M: np.ndarray) -> Array:
+    """σ_max of matrices (..., p, m)."""
+    if M.shape[-2:] == (1, 1):
+        return np.abs(M[..., 0, 0])
+    return np.asarray(np.linalg.svd(M, compute_uv=False)[..., 0])
 
 
 def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:
     """S, r to e, of a plant without feedthrough."""
     A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
     B = np.vstack([G.B @ K.D, K.B])
-    C = np.hstack([-G.C, np.zeros((1, len(K.A)))])
-    return StateSpace(A, B, C, np.eye(1))
+    C = np.hstack([-G.C, np.zeros((len(G.C), len(K.A)))])
+    return StateSpace(A, B, C, np.eye(len(G.C)))
 
 
 def _sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
@@ -234,24 +243,23 @@ def _sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     ẋ = A x + B u with u held is integrated over both parts of a period by one exponential of
     [[A, B, 0], [0, 0, 1/T], [0, 0, 0]]-like blocks each.
     """
-    T, n = sampling.period, len(G.A)
+    T, (n, m) = sampling.period, G.B.shape
     whole = int(np.floor(sampling.delay / T + 1e-9))
     rest = max(sampling.delay - whole * T, 0.0)
-    held = np.zeros((n + 1, n + 1))
+    held = np.zeros((n + m, n + m))
     held[:n, :n], held[:n, n:] = G.A, G.B
     first, second = expm(held * rest), expm(held * (T - rest))
-    age = whole + 1  # u_{k-1} … u_{k-age} are kept
-    A, B = np.zeros((n + age, n + age)), np.zeros((n + age, 1))
+    age = m * (whole + 1)  # u_{k-1} … of so many periods are kept
+    A, B = np.zeros((n + age, n + age)), np.zeros((n + age, m))
     A[:n, :n] = second[:n, :n] @ first[:n, :n]
-    A[:n, n + whole : n + whole + 1] = second[:n, :n] @ first[:n, n:]
+    A[:n, n + m * whole : n + m * (whole + 1)] = second[:n, :n] @ first[:n, n:]
     if whole:
-        A[:n, n + whole - 1 : n + whole] += second[:n, n:]
+        A[:n, n + m * (whole - 1) : n + m * whole] += second[:n, n:]
     else:
         B[:n] = second[:n, n:]
-    B[n] = 1.0
-    for i in range(1, age):
-        A[n + i, n + i - 1] = 1.0
-    return StateSpace(A, B, np.hstack([G.C, np.zeros((1, age))]), np.zeros((1, 1)))
+    B[n : n + m] = np.eye(m)
+    A[n + m :, n : n + age - m] = np.eye(age - m)
+    return StateSpace(A, B, np.hstack([G.C, np.zeros((len(G.C), age))]), np.zeros((len(G.C), m)))
 
 
 def _tustin(K: StateSpace, period: float) -> StateSpace:

@@ -7,9 +7,11 @@ At a fixed frequency, with g = ∂ln K,
 and a peak moves as κ does: -c_xκ c_xκᵀ/c_xx is added, x = ln v. (T here is without weight.)
 """
 
+from functools import singledispatch
+
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, evaluate
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, LoopProblem, Problem, evaluate
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
 
@@ -17,8 +19,10 @@ STEP = 1e-5  # of ln v
 OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
 
 
-def hessians(problem: Problem, kappa: Array, tau: float, rows: Constraints) -> Array:
+@singledispatch
+def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
     """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
+    assert isinstance(problem, Problem)
     n, m = len(kappa), len(rows.v)
     out = np.zeros((m, n + 1, n + 1))
     if not m:
@@ -53,7 +57,7 @@ def hessians(problem: Problem, kappa: Array, tau: float, rows: Constraints) -> A
 
 
 def lagrangian_hessian(
-    problem: Problem, kappa: Array, tau: float, rows: Constraints, mu: Array
+    problem: LoopProblem, kappa: Array, tau: float, rows: Constraints, mu: Array
 ) -> Array:
     """Σ μ_j ∂²c_j, (n + 1, n + 1), for multipliers μ >= 0 of these constraints."""
     chosen = mu > 0.0

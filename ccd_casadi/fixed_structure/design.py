@@ -8,17 +8,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from time import perf_counter
+from typing import overload
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
-from ccd_casadi.fixed_structure.figures import Curve, Problem, assess
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.figures import Curve, LoopProblem, Problem, assess
 from ccd_casadi.fixed_structure.loop import Sampling, plant_set
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
-from ccd_casadi.fixed_structure.structure import Kind, Structure, state_space
+from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -27,6 +30,7 @@ from ccd_casadi.support.process_pool import Pool
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 POOL = 12  # random starts tried for stability for each one that is raced
+LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
@@ -52,7 +56,7 @@ class SectionsDesign:
 
     outcome: SectionsOutcome
     words: str
-    structure: Structure
+    structure: Structure | ChannelStructure
     kappa: Array
     frequencies: tuple[float, float]
     controller: StateSpace | None
@@ -77,18 +81,40 @@ class SectionsDesign:
 Progress = Callable[[str], None]
 
 
+@overload
 def problem_for(
     plants: Sequence[ScaledPlant],
     structure: Structure,
     bounds: Bounds,
     sampling: Sampling | None = None,
     frequencies: tuple[float, float] | None = None,
-) -> Problem:
-    """The problem in the units of the first plant.
+) -> Problem: ...
+
+
+@overload
+def problem_for(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+) -> LoopProblem: ...
+
+
+def problem_for(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+) -> LoopProblem:
+    """The problem in the units of the first plant, of one channel or of several.
 
     `frequencies` (rad/s) bound those of K's roots; by default 1e-3 ω₀ and 30 times the fastest
     pole of any plant, sampled 2/T at most. The gain lies within a factor 1e6 of M_K.
     """
+    if isinstance(structure, ChannelStructure):
+        return composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
     family = plant_set(plants, sampling)
     fastest = 30.0 * max(1.0, float(np.abs(family.poles).max()))
     if family.period is not None:
@@ -129,7 +155,7 @@ def synthesise_sections(
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
-    spanned = _span(problem)
+    spanned = span_of(problem)
 
     def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
         nothing = np.full(len(structure.names), np.nan)
@@ -154,7 +180,7 @@ def synthesise_sections(
                       least_gain=1e-14)  # fmt: skip
         evaluations += last.evaluations
         point = last.point
-        made = _designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
+        made = designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
                          perf_counter() - begun)  # fmt: skip
         if best is None or (made.certified and not best.certified):
             best = made
@@ -178,18 +204,31 @@ def bandwidth_and_gradient(
     problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
     kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = optimality(problem, Point(kappa, tau, assess(problem, kappa, tau)))
+    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
     slope = log_bandwidth_gradient(problem, kappa, found)
     return design.bandwidth, design.bandwidth * slope
 
 
-def in_problem_units(problem: Problem, kappa: Array) -> Array:
+def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
+    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
+    assessment = assess(problem, kappa, tau)
+    peaks = assessment.peaks
+    if peaks is not None:
+        rising = peaks.to_tau > 0.0
+        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
+        if abs(room) < LOWER_AT_MOST:
+            tau += room
+            assessment = assess(problem, kappa, tau)
+    return Point(kappa, tau, assessment)
+
+
+def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
     """SI parameters κ in the units of the problem."""
     P = problem.plants
     return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
 
 
-def _span(problem: Problem) -> tuple[float, float]:
+def span_of(problem: LoopProblem) -> tuple[float, float]:
     """The bounds of frequencies of K's roots in rad/s."""
     index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
     low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
@@ -234,8 +273,8 @@ def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
     return kappa[np.argsort(misses)[:count]]
 
 
-def _designed(
-    problem: Problem,
+def designed(
+    problem: LoopProblem,
     plants: Sequence[ScaledPlant],
     sampling: Sampling | None,
     point: Point,
@@ -247,7 +286,7 @@ def _designed(
 ) -> SectionsDesign:
     structure, bounds, P = problem.structure, problem.bounds, problem.plants
     kappa = structure.in_units(point.kappa, P.omega_0, P.force)
-    controller = state_space(structure, kappa)
+    controller = controller_of(structure, kappa)
     found = optimality(problem, point)
     bandwidth = float(np.exp(point.tau)) * P.omega_0
     judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
@@ -269,7 +308,7 @@ def _designed(
     if outcome is SectionsOutcome.CERTIFIED:
         bandwidth = min(bandwidth, judged.bandwidth)
     return SectionsDesign(
-        outcome, words, structure, kappa, _span(problem), controller, bandwidth, judged,
+        outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
         found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
         seconds,
     )  # fmt: skip

@@ -15,13 +15,15 @@ Each is closed on the zero of its exact slope. At a peak the derivative to κ is
     ∂ln|S| = ∂ln|KS| = -Re(S K ∂G),    ∂ln|T| = Re(S ∂G/G)                 (the plant, so θ)
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, singledispatch
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet, closed_loops, stable
 from ccd_casadi.fixed_structure.structure import (
     Structure,
@@ -54,14 +56,14 @@ class Curve(IntEnum):
 
 
 @dataclass(frozen=True)
-class Problem:
+class LoopProblem:
     """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ.
 
     `margin` is how far (in logarithms) inside every bound its searches aim.
     """
 
     plants: PlantSet
-    structure: Structure
+    structure: Structure | ChannelStructure
     bounds: Bounds
     box: Array
     margin: float = 0.0
@@ -107,6 +109,13 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Problem(LoopProblem):
+    """That of SISO plants."""
+
+    structure: Structure
+
+
+@dataclass(frozen=True)
 class Loops:
     """S, K, G, T of some plants at some v, and the slopes of ln|·| to ln v."""
 
@@ -136,6 +145,11 @@ class Constraints:
         return Constraints(*(part[chosen] for part in parts))
 
 
+def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
+    """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
+    return row % len(problem.plants.plants)
+
+
 @dataclass(frozen=True)
 class Assessment:
     """One controller on all plants: stable or not, and where it is, its constraints.
@@ -156,8 +170,9 @@ class Assessment:
         return max(0.0, float(self.peaks.value.max()))
 
 
+@singledispatch
 def assess(
-    problem: Problem,
+    problem: LoopProblem,
     kappa: Array,
     tau: float,
     *,
@@ -170,11 +185,12 @@ def assess(
     `within`: how far below 0 a value on the base grid may be to be among `near`.
     `each`: the constraints of unstable loops are given too, where some are stable.
     """
+    assert isinstance(problem, Problem)
     poles = closed_loops(problem.plants, problem.structure, kappa)[0]
     good = stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
-    v, regular = _grid(problem, kappa, poles)
+    v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles)
     P, k = v.shape
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
     loops = evaluate(problem, kappa, tau, which, v, order=0)
@@ -227,10 +243,10 @@ def constraints(
     to_kappa = (factor[:, None] * loops.to_kappa).real
     omega = problem.plants.frequency(v)
     if problem.bounds.shape is not None:
-        rising = _shaped(problem, omega) * problem.bounds.shape < np.exp(tau)
+        rising = shaped_at(problem, omega) * problem.bounds.shape < np.exp(tau)
         to_tau[(curve == Curve.SHAPE) & rising] = 1.0
     end = curve == Curve.CROSSING
-    to_tau[end] = (loops.slopes[Curve.CROSSING] / _chain(problem, v))[end]
+    to_tau[end] = (loops.slopes[Curve.CROSSING] / chain_of(problem, v))[end]
     return Constraints(curve, which, v, value, to_kappa, to_tau)
 
 
@@ -264,7 +280,7 @@ def evaluate(
             Curve.CROSSING: ln_S + HALF_POWER,
             Curve.SHAPE: ln_S + HALF_POWER,
         }
-        shaped = _shaped(problem, omega)
+        shaped = shaped_at(problem, omega)
         under = np.zeros(v.shape)
         if bounds.shape is not None:
             under = np.minimum(np.log(bounds.shape * shaped) - tau, 0.0)
@@ -282,7 +298,7 @@ def evaluate(
             ceiling = np.log(bounds.compliance_max * plants.force)
             levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
         if order:
-            chain = _chain(problem, v)
+            chain = chain_of(problem, v)
             slope = -(S * (K * dG + L * K_slope)).real
             gradients = dict.fromkeys((Curve.S_MAX, Curve.S_LOW, Curve.CROSSING), slope)
             gradients[Curve.SHAPE] = slope - ((under < 0.0) & (shaped == omega)) * chain
@@ -294,8 +310,10 @@ def evaluate(
     return Loops(v, which, S, K, to_kappa, levels, gradients)
 
 
-def to_theta(problem: Problem, kappa: Array, found: Constraints) -> Array:
+@singledispatch
+def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
     """∂c/∂θ (M, n_θ) at fixed κ and τ."""
+    assert isinstance(problem, Problem)
     plants = problem.plants
     count = plants.plants[0].dA.shape[0]
     out = np.zeros((len(found.v), count))
@@ -330,12 +348,12 @@ def log_weights(weights: Weights, omega: Array) -> tuple[Array, Array]:
     return np.array(values), np.array(slopes)
 
 
-def _shaped(problem: Problem, omega: Array) -> Array:
+def shaped_at(problem: LoopProblem, omega: Array) -> Array:
     """The ω that the shape counts: its own, without an integrator at least ω_low."""
     return omega if problem.structure.integrator else np.maximum(omega, problem.low)
 
 
-def _chain(problem: Problem, v: Array) -> Array:
+def chain_of(problem: LoopProblem, v: Array) -> Array:
     """∂ln ω/∂ln v."""
     T = problem.plants.period
     if T is None:
@@ -343,9 +361,14 @@ def _chain(problem: Problem, v: Array) -> Array:
     return np.asarray(v / problem.plants.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
 
 
-def _grid(problem: Problem, kappa: Array, poles: np.ndarray) -> tuple[Array, np.ndarray]:
-    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base."""
-    own = np.concatenate(roots(problem.structure, kappa))
+def frequency_grid(
+    problem: LoopProblem, controller: tuple[np.ndarray, np.ndarray], poles: np.ndarray
+) -> tuple[Array, np.ndarray]:
+    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
+
+    `controller`: the zeros and the poles of K.
+    """
+    own = np.concatenate(controller)
     own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
     joint = np.concatenate([problem.fixed, _flanked(own), _flanked(poles)], axis=1)
     bottom, top = problem.base[0], problem.base[-1]
@@ -379,13 +402,6 @@ def _closed(
     low: Array,
     high: Array,
 ) -> tuple[Array, np.ndarray]:
-    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
-
-    Where a bracket's slopes do not change sign (an end) the start stays; second: where they do.
-    """
-    if not len(start):
-        return start, np.zeros(0, bool)
-
     def slope(x: Array, of: np.ndarray) -> Array:
         loops = evaluate(problem, kappa, tau, which[of], np.exp(x), order=1)
         out = np.empty(len(x))
@@ -394,6 +410,19 @@ def _closed(
             out[chosen] = loops.slopes[Curve(code)][chosen]
         return out
 
+    return closed_on_zero(slope, start, low, high)
+
+
+def closed_on_zero(
+    slope: Callable[[Array, np.ndarray], Array], start: Array, low: Array, high: Array
+) -> tuple[Array, np.ndarray]:
+    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
+
+    `slope` takes logarithms and the indices of the brackets that they are in. Where a bracket's
+    slopes do not change sign (an end) the start stays; second: where they do.
+    """
+    if not len(start):
+        return start, np.zeros(0, bool)
     every = np.arange(len(start))
     middle = np.log(start)
     f = slope(middle, every)

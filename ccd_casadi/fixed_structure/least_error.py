@@ -102,10 +102,13 @@ def least_error(
     `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
     it began with is, then. A local optimum, as any search from given starts finds.
     """
-    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
+    structure = design.structure
+    if not isinstance(structure, Structure):
+        raise ValueError("the least RMS error is searched for one input and one output only")
+    problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
     hold = None if sampling is None else Hold(sampling.period, sampling.delay)
     goal = RmsError(
-        tuple(p.plant_si() for p in plants), design.structure, replace(budget, window=None), hold
+        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), hold
     )
     model = _OnPlants(problem, goal)
     w0 = problem.plants.omega_0
@@ -169,7 +172,7 @@ def _judged(
     floor: float,
 ) -> SectionsDesign:
     """The end as a design: certified by the judge, with residual and multipliers."""
-    structure, P = design.structure, problem.plants
+    structure, P = problem.structure, problem.plants
     kappa = structure.in_units(end.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
     judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)

@@ -55,8 +55,8 @@ class Sampling:
 class LoopPlant:
     """One plant as the loop sees it.
 
-    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B and `reading` = CV in
-    its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
+    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B (n, m) and `reading` =
+    CV (p, n) in its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
     """
 
     A: Array
@@ -113,39 +113,54 @@ class PlantSet:
 
     def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
         """G of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
-        p, r = self.poles[which], self.residues[which]
-        omega = self.frequency(v)
+        value, slope = self.modal_terms(which, v)
+        r = self.residues[which]
+        return (r * value).sum(-1), (r * slope).sum(-1)
+
+    def modal_terms(
+        self, which: np.ndarray, v: Array, *, free: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """f(p; jv) (..., n), with which modes of unit residue answer, and ∂f/∂ln v.
+
+        `free` of hold and delay.
+        """
+        p, omega = self.poles[which], self.frequency(v)
         s = 1j * omega[..., None]
-        if self.period is None:
-            terms = 1.0 / (s - p)
-            G = (r * terms).sum(-1)
-            return G, -(r * terms * terms).sum(-1) * 1j * v
         T = self.period
+        if T is None or free:
+            warp = v if T is None else v / (1.0 + (0.5 * T * v) ** 2)
+            f = 1.0 / (s - p)
+            return f, -f * f * (1j * warp)[..., None]
         d, late, early, grown = (part[which] for part in self.held)
+        d = d[..., None]
         z = np.exp(s * T)
         gap = grown * np.expm1((s - p) * T)
-        value = r * (late + early / z) / gap
-        slope = r * early / (z * gap) + value * z / gap
-        shift = np.exp(-1j * omega * T * d)
-        G = value.sum(-1)
-        dG = -1j * T * (slope.sum(-1) + d * G)
-        return G * shift, dG * shift * v / (1.0 + (0.5 * T * v) ** 2)
+        value = (late + early / z) / gap
+        slope = early / (z * gap) + value * z / gap + d * value
+        shift = np.exp(-s * T * d)
+        chain = -1j * T * v / (1.0 + (0.5 * T * v) ** 2)
+        return value * shift, slope * shift * chain[..., None]
 
     def free_responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
         """G(jω) of the continuous plant without hold and delay, and ∂G/∂ln v.
 
         A disturbing force d e^{jωt} shows in the samples as G(jω) d, whatever the sampling.
         """
-        omega = self.frequency(v)
-        terms = 1.0 / (1j * omega[..., None] - self.poles[which])
+        value, slope = self.modal_terms(which, v, free=True)
         r = self.residues[which]
-        chain = omega if self.period is None else v / (1.0 + (0.5 * self.period * v) ** 2)
-        return (r * terms).sum(-1), -(r * terms * terms).sum(-1) * 1j * chain
+        return (r * value).sum(-1), (r * slope).sum(-1)
 
     def to_theta(self, which: int, v: Array, *, free: bool = False) -> np.ndarray:
-        """∂G/∂θ (len(v), n_θ) of one plant at jv; `free` of hold and delay.
+        """∂G/∂θ (len(v), n_θ) of one plant at jv; `free` of hold and delay."""
+        one = np.ones((len(v), 1))
+        return self.form_to_theta(which, v, one, one, free=free)
 
-        dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B   (Daleckii and Krein)
+    def form_to_theta(
+        self, which: int, v: Array, left: np.ndarray, right: np.ndarray, *, free: bool = False
+    ) -> np.ndarray:
+        """∂(x G y)/∂θ (k, n_θ) of one plant at jv with rows x (k, p) and columns y (k, m).
+
+        x (dC f(A) B + C f(A) dB + C V (f[p_i, p_j] ∘ V⁻¹dA V) V⁻¹B) y   (Daleckii and Krein)
         """
         plant = self.plants[which]
         p = plant.poles
@@ -162,10 +177,10 @@ class PlantSet:
             else slope[:, :, None] * np.ones(len(p)),
             (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap),
         )
-        c, b = plant.reading, plant.drive
-        out = np.einsum("i,kij,j,tij->kt", c, between, b, plant.dA, optimize=True)
-        out += np.einsum("ti,ki,i->kt", plant.dC, f, b, optimize=True)
-        out += np.einsum("i,ki,ti->kt", c, f, plant.dB, optimize=True)
+        c, b = left @ plant.reading, right @ plant.drive.T
+        out = np.einsum("ki,kij,kj,tij->kt", c, between, b, plant.dA, optimize=True)
+        out += np.einsum("kp,tpi,ki,ki->kt", left, plant.dC, f, b, optimize=True)
+        out += np.einsum("ki,ki,tim,km->kt", c, f, plant.dB, right, optimize=True)
         return np.asarray(out)
 
 
@@ -174,31 +189,57 @@ def plant_set(plants: Sequence[ScaledPlant], sampling: Sampling | None = None) -
 
     Raises PlantError for a plant that is not SISO, not stable, or not diagonalisable.
     """
+    for number, plant in enumerate(plants, 1):
+        if plant.B.shape[1] != 1 or plant.C.shape[0] != 1:
+            raise PlantError(f"plant {number} is not SISO; give one of its channels")
+    found, units = loop_plants(plants, sampling)
+    poles, residues = padded_modes(found)
+    zeros = tuple(finite_zeros(loop) for loop in found)
+    return PlantSet(tuple(found), *units, poles, residues[:, :, 0, 0], zeros,
+                    *padded_states(found))  # fmt: skip
+
+
+def loop_plants(
+    plants: Sequence[ScaledPlant], sampling: Sampling | None
+) -> tuple[list[LoopPlant], tuple[float, float, float | None, float]]:
+    """Plants of any number of inputs and outputs in the units of the first: ω₀, force, T and τ.
+
+    Raises PlantError for a plant that is not stable or not diagonalisable.
+    """
     if not plants:
         raise PlantError("there is no plant in the set; give at least one")
     omega_0, force = plants[0].omega_0, plants[0].force
     period = None if sampling is None else sampling.period * omega_0
     delay = 0.0 if sampling is None else sampling.delay * omega_0
-    found, zeros = [], []
-    for number, plant in enumerate(plants, 1):
-        found.append(_loop_plant(plant, number, omega_0, force, period, delay))
-        zeros.append(_zeros(found[-1]))
+    found = [
+        _loop_plant(plant, number, omega_0, force, period, delay)
+        for number, plant in enumerate(plants, 1)
+    ]
+    return found, (omega_0, force, period, delay)
+
+
+def padded_modes(found: Sequence[LoopPlant]) -> tuple[np.ndarray, np.ndarray]:
+    """Poles (P, n) and residues (P, n, p, m), shorter plants with residues of zero."""
     most = max(len(plant.poles) for plant in found)
+    first = found[0]
     poles = np.full((len(found), most), -1.0, complex)
-    residues = np.zeros((len(found), most), complex)
+    residues = np.zeros((*poles.shape, len(first.reading), first.drive.shape[1]), complex)
     for i, loop in enumerate(found):
         poles[i, : len(loop.poles)] = loop.poles
-        residues[i, : len(loop.poles)] = loop.reading * loop.drive
+        residues[i, : len(loop.poles)] = np.einsum("pn,nm->npm", loop.reading, loop.drive)
+    return poles, residues
+
+
+def padded_states(found: Sequence[LoopPlant]) -> tuple[Array, Array, Array, Array]:
+    """(A, B, C, D) in w of all plants, shorter ones with stable states that do nothing."""
     states = max(len(plant.A) for plant in found)
+    p, m = found[0].D.shape
     A = np.tile(-np.eye(states), (len(found), 1, 1))
-    B, C = np.zeros((len(found), states, 1)), np.zeros((len(found), 1, states))
+    B, C = np.zeros((len(found), states, m)), np.zeros((len(found), p, states))
     for i, loop in enumerate(found):
         n = len(loop.A)
         A[i, :n, :n], B[i, :n], C[i, :, :n] = loop.A, loop.B, loop.C
-    D = np.array([plant.D for plant in found])
-    return PlantSet(
-        tuple(found), omega_0, force, period, delay, poles, residues, tuple(zeros), A, B, C, D
-    )
+    return A, B, C, np.array([plant.D for plant in found])
 
 
 def closed_loops(plants: PlantSet, structure: Structure, kappa: Array) -> np.ndarray:
@@ -271,8 +312,6 @@ def _loop_plant(
     period: float | None,
     delay: float,
 ) -> LoopPlant:
-    if plant.B.shape[1] != 1 or plant.C.shape[0] != 1:
-        raise PlantError(f"plant {number} is not SISO; give one of its channels")
     ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
     A, B, C = ratio * plant.A, drive * plant.B, plant.C
     poles, V = np.linalg.eig(A)
@@ -280,42 +319,41 @@ def _loop_plant(
         words = "is not stable; a suspension has to hold its rigid-body modes"
         raise PlantError(f"plant {number} {words}")
     W = np.linalg.inv(V)
-    b, c = W @ B[:, 0], C[0] @ V
+    b, c = W @ B, C @ V
     at = 1j * np.geomspace(1e-2, 1e2, 7)
-    direct = [complex((C @ np.linalg.solve(s * np.eye(len(A)) - A, B))[0, 0]) for s in at]
-    modal = (c * b / (at[:, None] - poles)).sum(-1)
+    direct = np.array([C @ np.linalg.solve(s * np.eye(len(A)) - A, B) for s in at])
+    modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (at[:, None] - poles), b)
     if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
         words = "has poles that coincide and are coupled; move a damping ratio away from 1"
         raise PlantError(f"plant {number} {words}")
-    state = (A, B, C, np.zeros((1, 1)))
+    state = (A, B, C, np.zeros((len(C), B.shape[1])))
     if period is not None:
         state = _in_w(*_sampled(A, B, C, period, delay), period)
     theta = len(plant.dA)
     dA = np.einsum("ij,tjk,kl->til", W, ratio * plant.dA, V) if theta else np.zeros((0, *A.shape))
-    dB = drive * plant.dB[:, :, 0] @ W.T
-    return LoopPlant(*state, poles, b, c, dA, dB, plant.dC[:, 0] @ V)
+    return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
 
 
 def _sampled(A: Array, B: Array, C: Array, T: float, delay: float) -> tuple[Array, Array, Array]:
     """x_{k+1} = A x_k + B u_k behind hold and delay; states [x; u_{k-1}; …]."""
-    n = len(A)
+    n, m = B.shape
     d = int(np.floor(delay / T + INSTANT))
     rest = max(delay - d * T, 0.0)
-    joint = np.zeros((n + 1, n + 1))
+    joint = np.zeros((n + m, n + m))
     joint[:n] = np.hstack([A, B])
     early, late = expm(joint * rest), expm(joint * (T - rest))
-    kept = d + (rest > 0.0)
-    Ad, Bd = np.zeros((n + kept, n + kept)), np.zeros((n + kept, 1))
+    kept = m * (d + (rest > 0.0))
+    Ad, Bd = np.zeros((n + kept, n + kept)), np.zeros((n + kept, m))
     Ad[:n, :n] = late[:n, :n] @ early[:n, :n]
     for age, gain in ((d, late[:n, n:]), (d + 1, late[:n, :n] @ early[:n, n:])):
         if age == 0:
             Bd[:n] = gain
-        elif age <= kept:
-            Ad[:n, n + age - 1 : n + age] = gain
+        elif m * age <= kept:
+            Ad[:n, n + m * (age - 1) : n + m * age] = gain
     if kept:
-        Bd[n] = 1.0
-        Ad[n + 1 :, n : n + kept - 1] = np.eye(kept - 1)
-    return Ad, Bd, np.hstack([C, np.zeros((1, kept))])
+        Bd[n : n + m] = np.eye(m)
+        Ad[n + m :, n : n + kept - m] = np.eye(kept - m)
+    return Ad, Bd, np.hstack([C, np.zeros((len(C), kept))])
 
 
 def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, Array]:
@@ -330,11 +368,11 @@ def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, 
     )
 
 
-def _zeros(plant: LoopPlant) -> np.ndarray:
+def finite_zeros(plant: LoopPlant) -> np.ndarray:
     """Finite zeros in w: the finite eigenvalues of the system matrix's pencil."""
-    n = len(plant.A)
+    n, m = plant.B.shape
     system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
-    shape = np.zeros((n + 1, n + 1))
+    shape = np.zeros((n + m, n + m))
     shape[:n, :n] = np.eye(n)
     values = eig(system, shape, right=False)
     return np.asarray(values[np.isfinite(values) & (np.abs(values) < 1e5)])

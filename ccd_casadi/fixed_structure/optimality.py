@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, to_theta
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, LoopProblem, to_theta
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.support.arrays import Array
 
@@ -42,7 +42,7 @@ class Optimality:
         return found
 
 
-def optimality(problem: Problem, point: Point) -> Optimality:
+def optimality(problem: LoopProblem, point: Point) -> Optimality:
     """Non-negative least squares on the active constraints of a point whose loops are stable."""
     peaks = point.assessment.peaks
     assert peaks is not None
@@ -66,7 +66,7 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     return Optimality(active, mu[:count], found, residual, point.assessment.violation)
 
 
-def log_bandwidth_gradient(problem: Problem, kappa: Array, found: Optimality) -> Array:
+def log_bandwidth_gradient(problem: LoopProblem, kappa: Array, found: Optimality) -> Array:
     """d ln ω_b*/dθ (n_θ,); NaN where the conditions of optimality do not hold."""
     slopes = to_theta(problem, kappa, found.active)
     if found.residual > RESIDUAL or found.violation > ACTIVE:

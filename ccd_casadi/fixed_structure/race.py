@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import Problem, assess
+from ccd_casadi.fixed_structure.figures import LoopProblem, assess
 from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -58,7 +58,7 @@ class Runner:
 
 
 def run_race(
-    problem: Problem,
+    problem: LoopProblem,
     pool: Array,
     tell: Callable[[str], None],
     workers: Pool | None = None,
@@ -82,7 +82,7 @@ def run_race(
     return field
 
 
-def started(problem: Problem, kappa: Array) -> Point:
+def started(problem: LoopProblem, kappa: Array) -> Point:
     """A controller at the bandwidth that searches start from."""
     return Point(kappa, FIRST, assess(problem, kappa, FIRST))
 
@@ -92,7 +92,7 @@ def finished(runners: Sequence[Runner]) -> list[Runner]:
     return [runner for i, runner in enumerate(runners) if runner.done or i < LAST]
 
 
-def local_optima(problem: Problem, ends: Sequence[Runner]) -> tuple[LocalOptimum, ...]:
+def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOptimum, ...]:
     """The distinct bandwidths within the bounds, the largest first."""
     P = problem.plants
     good = [end for i, end in enumerate(ends)
@@ -109,7 +109,7 @@ def local_optima(problem: Problem, ends: Sequence[Runner]) -> tuple[LocalOptimum
 
 
 def _climbed(
-    problem: Problem, running: Sequence[Runner], steps: int, workers: Pool
+    problem: LoopProblem, running: Sequence[Runner], steps: int, workers: Pool
 ) -> list[Runner]:
     """All of them some steps further, in their order."""
     tasks = [(i, problem, r.point, r.radius, steps) for i, r in enumerate(running)]
@@ -124,12 +124,12 @@ def _climbed(
     return found
 
 
-def _climb(task: tuple[int, Problem, Point, float, int]) -> tuple[int, Ascent]:
+def _climb(task: tuple[int, LoopProblem, Point, float, int]) -> tuple[int, Ascent]:
     index, problem, point, radius, steps = task
     return index, ascend(problem, point, iterations=steps, radius=radius)
 
 
-def _merged(problem: Problem, field: Sequence[Runner]) -> list[Runner]:
+def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
     """The field, best first, without searches that are where a better one is."""
     kept: list[Runner] = []
     for runner in field:

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import hessians
-from ccd_casadi.fixed_structure.figures import Assessment, Constraints, Problem, assess
+from ccd_casadi.fixed_structure.figures import Assessment, Constraints, LoopProblem, assess
 from ccd_casadi.support.arrays import Array
 
 FIRST_RADIUS = 0.2
@@ -77,7 +77,7 @@ class Step:
 
 
 def ascend(
-    problem: Problem,
+    problem: LoopProblem,
     start: Point,
     *,
     iterations: int,
@@ -122,14 +122,14 @@ def ascend(
     return Ascent(point, radius, evaluations, done)
 
 
-def _moved(problem: Problem, point: Point, change: Array) -> Point:
+def _moved(problem: LoopProblem, point: Point, change: Array) -> Point:
     kappa = np.clip(point.kappa + change[:-1], *problem.box)
     tau = point.tau + float(change[-1])
     return Point(kappa, tau, assess(problem, kappa, tau))
 
 
 def best_step(
-    problem: Problem, point: Point, radius: float, penalty: float = PENALTY
+    problem: LoopProblem, point: Point, radius: float, penalty: float = PENALTY
 ) -> Step | None:
     """The best step that the model knows; None where its programme has no answer.
 
@@ -171,7 +171,7 @@ def best_step(
 
 
 def _corrected(
-    problem: Problem, point: Point, step: Step, trial: Point, radius: float, penalty: float
+    problem: LoopProblem, point: Point, step: Step, trial: Point, radius: float, penalty: float
 ) -> Array | None:
     """The second-order correction: the same model with the constraints as they are at the trial."""
     rows, _ = _rows(trial.assessment, radius)
@@ -182,7 +182,7 @@ def _corrected(
 
 
 def _programme(
-    problem: Problem,
+    problem: LoopProblem,
     point: Point,
     slopes: Array,
     value: Array,

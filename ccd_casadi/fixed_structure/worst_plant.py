@@ -16,11 +16,13 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.channel_design import synthesise
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.design import (
     SectionsDesign,
     in_problem_units,
     problem_for,
-    synthesise_sections,
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop import Sampling
@@ -92,7 +94,7 @@ def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int,
 def excesses(
     uncertain: UncertainPlant,
     points: Sequence[tuple[int, Array]],
-    structure: Structure,
+    structure: Structure | ChannelStructure,
     kappa: Array,
     bandwidth: float,
     bounds: Bounds,
@@ -105,14 +107,14 @@ def excesses(
     found = assess(problem, scaled, tau, each=True)
     out = np.full(len(points), -np.inf)
     if found.peaks is not None:
-        np.maximum.at(out, found.peaks.plant, found.peaks.value - problem.margin)
+        np.maximum.at(out, plants_of_rows(problem, found.peaks), found.peaks.value - problem.margin)
     grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
     return np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
 
 
 def worst_plants(
     uncertain: UncertainPlant,
-    structure: Structure,
+    structure: Structure | ChannelStructure,
     kappa: Array,
     bandwidth: float,
     bounds: Bounds,
@@ -155,7 +157,7 @@ def worst_plants(
 
 def synthesise_robustly(
     uncertain: UncertainPlant,
-    structure: Structure,
+    structure: Structure | ChannelStructure,
     bounds: Bounds,
     *,
     sampling: Sampling | None = None,
@@ -177,7 +179,7 @@ def synthesise_robustly(
     begun = perf_counter()
     tell = progress or (lambda words: None)
     members = uncertain.corners()
-    made = synthesise_sections(
+    made = synthesise(
         uncertain.plants(members), structure, bounds, sampling=sampling, starts=starts, seed=seed,
         initial=initial, progress=progress, workers=workers,
     )  # fmt: skip
@@ -193,7 +195,7 @@ def synthesise_robustly(
         if worst.value <= WITHIN or turn > rounds:
             break
         members = members + _apart(heads, members, uncertain.box)
-        made = synthesise_sections(uncertain.plants(members), structure, bounds, sampling=sampling,
+        made = synthesise(uncertain.plants(members), structure, bounds, sampling=sampling,
                                    seed=seed, initial=[made.kappa], only_initial=True,
                                    progress=progress)  # fmt: skip
     judged: Certificate | None = None

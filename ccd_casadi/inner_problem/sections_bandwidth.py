@@ -15,15 +15,18 @@ from ccd_casadi.fixed_structure import (
     Bounds,
     Certificate,
     SectionsDesign,
+    Structure,
     bandwidth_and_gradient,
     certify,
-    synthesise_sections,
 )
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
+from ccd_casadi.fixed_structure.channel_design import synthesise
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_problem import Member, SectionsProblem
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem, Member, SectionsProblem
 from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -62,6 +65,35 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         weights=problem.weights if weighted else None,
         compliance_max=sections.compliance_max,
     )
+
+
+def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
+    """The controller's structure: one, or one for each channel of a plant with several."""
+    if plant_of(problem).outputs == 1:
+        return sections_of_problem(problem).structure
+    channels = sections_of_problem(with_channels(problem)).channels
+    names, outputs, inputs = zip(
+        *((channel.name, channel.outputs or (), channel.inputs or ()) for channel in channels),
+        strict=True,
+    )
+    structures = tuple(channel.structure for channel in channels)
+    return ChannelStructure(given_decoupling(names, outputs, inputs), structures)
+
+
+def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with the directions of its channels, by the plant at its start, for every θ."""
+    sections = sections_of_problem(problem)
+    known = {channel.name: channel for channel in sections.channels}
+    given = [channel.outputs is not None for channel in sections.channels]
+    if plant_of(problem).outputs == 1 or any(given):
+        return problem
+    found = find_decoupling(scaled_plant(problem, problem.start))
+    channels = []
+    for i, name in enumerate(found.names):
+        own = known.get(name, ChannelProblem(name, sections.structure))
+        outputs, inputs = (tuple(map(float, M[:, i])) for M in (found.outputs, found.inputs))
+        channels.append(replace(own, outputs=outputs, inputs=inputs))
+    return _with(problem, channels=tuple(channels))
 
 
 def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
@@ -121,18 +153,18 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
     sections = sections_of_problem(problem)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
-    initial = warm_starts(problem, plants, bounds)
+    initial = warm_starts(problem, structure_of(problem), plants, bounds)
     made: SectionsDesign | None = None
     spent = 0
     if initial:
-        made = synthesise_sections(
-            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+        made = synthesise(
+            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
     if made is None or not made.certified:
-        made = synthesise_sections(
-            plants, sections.structure, bounds, sampling=sections.sampling, seed=sections.seed,
+        made = synthesise(
+            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
@@ -163,8 +195,8 @@ def race(
 ) -> SectionsDesign:
     """A full race at θ: the problem's starts, and its anchors beside them."""
     sections = sections_of_problem(problem)
-    return synthesise_sections(
-        plants_of(problem, theta), sections.structure, bounds_of(problem),
+    return synthesise(
+        plants_of(problem, theta), structure_of(problem), bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
         initial=[np.array(kappa) for kappa in sections.anchors],
         frequencies=sections.frequencies, progress=progress, workers=workers,
@@ -172,10 +204,12 @@ def race(
 
 
 def with_range(problem: CoDesignProblem) -> CoDesignProblem:
-    """The problem with the range of K's frequencies, by the plant at its start, alike at every θ.
+    """The problem with its channels and the range of K's frequencies, by the plant at its start,
+    alike at every θ.
 
     A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
     """
+    problem = with_channels(problem)
     sections = sections_of_problem(problem)
     if sections.frequencies is not None:
         return problem
@@ -253,7 +287,7 @@ def worst_members(
     """The worst plant of the box for a design, and those to add: past a bound, each a new one."""
     sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
     heads, count = worst_plants(
-        uncertain, sections.structure, made.kappa, made.bandwidth, bounds_of(problem),
+        uncertain, structure_of(problem), made.kappa, made.bandwidth, bounds_of(problem),
         sections.sampling, seed=sections.seed + turn,
     )  # fmt: skip
     if progress is not None:
@@ -321,7 +355,7 @@ def _judged(
         weighted_level=_times(bounds.weighted_level),
         compliance_max=_times(bounds.compliance_max),
     )
-    integrator = sections.structure.integrator
+    integrator = structure_of(problem).integrator
     return certify(
         plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
     )

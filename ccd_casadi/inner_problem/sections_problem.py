@@ -32,6 +32,17 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
+class ChannelProblem:
+    """One channel of a plant with several: its structure, and its directions of outputs and inputs
+    (None: not given; those that are found at the start hold then for every θ)."""
+
+    name: str
+    structure: Structure
+    outputs: tuple[float, ...] | None = None
+    inputs: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
 class SectionsProblem:
     """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
 
@@ -42,6 +53,8 @@ class SectionsProblem:
     before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
     θ; None: by the plant at the start. `minimise` "rms_error": at a θ the search goes on from there
     to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more.
+    `channels` of a plant with several outputs; where the case names none they are found, with
+    `structure` for each.
     """
 
     structure: Structure = field(default_factory=Structure)
@@ -57,11 +70,12 @@ class SectionsProblem:
     members: tuple[Member, ...] = ()
     minimise: str = "bandwidth"
     bandwidth_least: float = 0.0
+    channels: tuple[ChannelProblem, ...] = ()
 
     def identity(self) -> dict[str, Any]:
         """What determines ω_b*(θ), as plain values."""
         structure, sampling = self.structure, self.sampling
-        return {
+        found: dict[str, Any] = {
             "structure": vars(structure),
             "shape": self.shape,
             "weighted_level": self.weighted_level,
@@ -75,3 +89,8 @@ class SectionsProblem:
             "anchors": self.anchors,
             "members": self.members,
         }
+        if self.channels:
+            found["channels"] = [
+                vars(channel) | {"structure": vars(channel.structure)} for channel in self.channels
+            ]
+        return found

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Structure
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
@@ -13,7 +13,10 @@ from ccd_casadi.support.arrays import Array
 
 
 def warm_starts(
-    problem: CoDesignProblem, plants: Sequence[ScaledPlant], bounds: Bounds
+    problem: CoDesignProblem,
+    structure: Structure | ChannelStructure,
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
 ) -> list[Array]:
     """Each anchor as it is or moved with the plant from the start θ, whichever is nearer; κ in SI.
 
@@ -26,12 +29,12 @@ def warm_starts(
     first = scaled_plant(problem, problem.start)
     here = plants[0]
     frequency = _first_mode(here) / _first_mode(first)
-    found = problem_for(plants, sections.structure, bounds, sections.sampling, sections.frequencies)
+    found = problem_for(plants, structure, bounds, sections.sampling, sections.frequencies)
     warm = []
     for kappa in map(np.array, sections.anchors):
         crossover = 0.1 * first.omega_0
         gain = _size(first, crossover) / _size(here, frequency * crossover)
-        moved = sections.structure.in_units(kappa, frequency, gain)
+        moved = structure.in_units(kappa, frequency, gain)
         both = [kappa, moved]
         merits = [
             started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
@@ -48,7 +51,7 @@ def _first_mode(plant: ScaledPlant) -> float:
 
 
 def _size(plant: ScaledPlant, omega: float) -> float:
-    """|G(jω)| in m/N."""
+    """‖G(jω)‖ in m/N."""
     si = plant.plant_si()
     solved = np.linalg.solve(1j * omega * np.eye(len(si.A)) - si.A, si.B + 0j)
-    return float(np.abs((si.C @ solved)[0, 0]))
+    return float(np.linalg.norm(si.C @ solved, 2))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.structure import Kind
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -71,8 +72,13 @@ def gain_of(kappa: Array) -> float:
     return float(np.exp(kappa[0]))
 
 
-def sections_dict(structure: Structure, kappa: Array) -> dict[str, Any]:
-    """`controller` of result.json and `sections` of controller.json."""
+def sections_dict(structure: Structure | ChannelStructure, kappa: Array) -> dict[str, Any]:
+    """`controller` of result.json and `sections` of controller.json.
+
+    Of several channels each is under `channels` with its directions, and all sections in one list.
+    """
+    if isinstance(structure, ChannelStructure):
+        return _channels_dict(structure, kappa)
     units = {Kind.GAIN: "N/m", Kind.FREQUENCY: "Hz", Kind.DAMPING: "1"}
     rows = zip(structure.names, structure.kinds, np.exp(kappa).tolist(), strict=True)
     return {
@@ -92,3 +98,28 @@ def sections_dict(structure: Structure, kappa: Array) -> dict[str, Any]:
         "gain": gain_of(kappa),
         "sections": [vars(item) for item in section_words(structure, kappa)],
     }  # fmt: skip
+
+
+def _channels_dict(structure: ChannelStructure, kappa: Array) -> dict[str, Any]:
+    own = structure.decoupling
+    channels = [
+        {"name": name, "outputs": own.outputs[:, i].tolist(), "inputs": own.inputs[:, i].tolist()}
+        | sections_dict(part, values)
+        for i, (name, (part, values)) in enumerate(
+            zip(own.names, structure.split(np.asarray(kappa, float)), strict=True)
+        )
+    ]
+
+    def joined(key: str, word: str) -> list[dict[str, Any]]:
+        return [
+            item | {word: f"{channel['name']}: {item[word]}"}
+            for channel in channels
+            for item in channel[key]
+        ]
+
+    return {
+        "order": structure.order,
+        "parameters": joined("parameters", "name"),
+        "sections": joined("sections", "kind"),
+        "channels": channels,
+    }

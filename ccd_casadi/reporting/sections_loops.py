@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.composite import CompositeProblem, largest_gains
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.fixed_structure.figures import Problem, evaluate
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.reporting.force_step import force_step
@@ -29,7 +30,10 @@ STEPS = 200  # points of it
 
 @dataclass(frozen=True)
 class Loops:
-    """S, KS (N/m), T and L of every plant (rows) over Hz."""
+    """S, KS (N/m), T and L of every plant (rows) over Hz.
+
+    Of several channels the largest singular values, and no L.
+    """
 
     hz: Array
     S: np.ndarray
@@ -49,16 +53,23 @@ def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDes
         made.frequencies,
     )
     P = inside.plants
+    poles = P.poles
+    if isinstance(inside, CompositeProblem):
+        poles = np.concatenate([part.problem.plants.poles.ravel() for part in inside.parts])
     low = 0.2 * problem.inner.omega_low
-    high = 20.0 * float(np.abs(P.poles).max()) * P.omega_0
+    high = 20.0 * float(np.abs(poles).max()) * P.omega_0
     if sampling is not None:
         high = min(high, 0.98 * np.pi / sampling.period)
-    near = np.abs(P.poles.imag) + np.abs(P.poles.real) * np.linspace(-12, 12, 97)[:, None, None]
+    near = np.abs(poles.imag)[..., None] + np.abs(poles.real)[..., None] * np.linspace(-12, 12, 97)
     omega = np.concatenate([np.geomspace(low, high, POINTS), near.ravel() * P.omega_0])
     omega = np.unique(omega[(omega >= low) & (omega <= high)])
     v = P.variable(omega / P.omega_0)
-    which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     kappa = in_problem_units(inside, made.kappa)
+    if isinstance(inside, CompositeProblem):
+        S, KS, T = largest_gains(inside, kappa, v)
+        return Loops(omega / HZ, S, KS * P.force, T, np.zeros((0, len(v))))
+    assert isinstance(inside, Problem)
+    which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     tau = float(np.log(made.bandwidth / P.omega_0))
     found = evaluate(inside, kappa, tau, which, grid, order=0)
     L = 1.0 / found.S - 1.0

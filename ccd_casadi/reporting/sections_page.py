@@ -43,15 +43,17 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     assert verified is not None
     assert verified.design.controller is not None
     loops = loops_of(verified.problem, verified.theta, verified.design)
-    return [
+    found = [
         _design(problem, solution.result),
         Section("The controller", _controller(solution.result)),
         Section("Full order beside it", _beside(problem, solution.result)),
         Section("Closed loop on every plant", gains_html(problem, verified, loops)),
-        Section("Nyquist plot and a step of force", nyquist_html(problem, verified, loops)),
-        Section("A move", move_html(verified)),
-        *budget_section(verified.problem, verified.theta, verified.design.controller),
     ]
+    if len(loops.L):  # of one channel
+        body = nyquist_html(problem, verified, loops)
+        found.append(Section("Nyquist plot and a step of force", body))
+        found.append(Section("A move", move_html(verified)))
+    return [*found, *budget_section(verified.problem, verified.theta, verified.design.controller)]
 
 
 def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
@@ -181,8 +183,16 @@ def _controller(result: dict[str, Any]) -> str:
         for s in controller["sections"]
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    gains = (
+        f"Gain {number(controller['gain'], 6)} N/m"
+        if "gain" in controller
+        else ", ".join(
+            f"{channel['name']}: gain {number(channel['gain'], 6)} N/m"
+            for channel in controller["channels"]
+        )
+    )
     words = (
-        f"Gain {number(controller['gain'], 6)} N/m, order {controller['order']}, stable but for "
+        f"{gains}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
     return paragraph(words) + table_html(Table(head, rows))

@@ -1,0 +1,220 @@
+"""The largest bandwidth of a controller with a fixed structure for each of its channels.
+
+Where every plant falls apart in the channels' coordinates each channel is designed on its own, and
+ω_b is the least of theirs. Where channels are coupled the same designs, on the diagonal of every
+plant, are where the search on the whole loop starts, with ever tighter bounds on the channels
+until together they hold every plant stable.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.composite import CompositeProblem, composite_problem
+from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
+from ccd_casadi.fixed_structure.design import (
+    MARGIN,
+    Progress,
+    SectionsDesign,
+    SectionsOutcome,
+    designed,
+    in_problem_units,
+    span_of,
+    synthesise_sections,
+)
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.race import (
+    LocalOptimum,
+    finished,
+    local_optima,
+    run_race,
+    started,
+)
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.trust_region import Point, ascend
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
+
+TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
+RESTORING = 400.0  # penalty when an end is to be brought within its bounds
+ALIKE = 1e-9  # relative: responses of channels that are one problem
+
+
+def synthesise(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    *,
+    sampling: Sampling | None = None,
+    starts: int = 24,
+    seed: int = 0,
+    initial: Sequence[Array | StateSpace] = (),
+    only_initial: bool = False,
+    frequencies: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+    workers: Pool | None = None,
+) -> SectionsDesign:
+    """max ω_b over κ on a set of plants, of one channel or of several; see `synthesise_sections`.
+
+    With several `initial` are stacked parameters κ in SI, or controllers of the whole plant.
+    """
+    if isinstance(structure, Structure):
+        return synthesise_sections(
+            plants, structure, bounds, sampling=sampling, starts=starts, seed=seed,
+            initial=initial, only_initial=only_initial, frequencies=frequencies, progress=progress,
+            workers=workers,
+        )  # fmt: skip
+    begun = perf_counter()
+    tell = progress or (lambda words: None)
+    problem = composite_problem(plants, structure, bounds, sampling, frequencies, MARGIN)
+    alike = [in_units_of(plant, plants[0]) for plant in plants]
+    span = span_of(problem)
+
+    def channels(limits: Bounds) -> list[SectionsDesign]:
+        """A design for each channel, on its entry of every plant; one for all that are alike."""
+        found: list[SectionsDesign] = []
+        own_plants: list[list[ScaledPlant]] = []
+        for i, own in enumerate(structure.structures):
+            members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
+            begins = [_of_channel(structure, item, i) for item in initial]
+            own_plants.append(members)
+            same = [j for j in range(i) if structure.structures[j] == own
+                    and _alike(members, own_plants[j])]  # fmt: skip
+            if same and not begins:
+                found.append(found[same[0]])
+                continue
+            name = structure.decoupling.names[i]
+            found.append(
+                synthesise_sections(
+                    members, own, limits, sampling=sampling, starts=starts, seed=seed,
+                    initial=begins, only_initial=only_initial, frequencies=span, workers=workers,
+                    progress=lambda words, name=name: tell(f"channel {name}: {words}"),  # type: ignore[misc]
+                )
+            )  # fmt: skip
+        return found
+
+    if problem.separable:
+        made = channels(bounds)
+        short = [(name, one) for name, one in zip(structure.decoupling.names, made, strict=True)
+                 if not one.certified]  # fmt: skip
+        if short:
+            name, one = short[0]
+            return _failed(problem, structure, span, one.outcome, f"channel {name}: {one.words}",
+                           seed, perf_counter() - begun)  # fmt: skip
+        return _joined(problem, plants, sampling, made, seed, begun)
+    pool = [in_problem_units(problem, item) for item in initial if not isinstance(item, StateSpace)]
+    pool = [np.clip(kappa, *problem.box) for kappa in pool]
+    field = _stable(problem, pool)
+    evaluations = len(pool)
+    if not only_initial:
+        for share in TIGHTENED:
+            limits = replace(bounds, S_max=1.0 + share * (bounds.S_max - 1.0))
+            stack = _stacked(problem, channels(limits))
+            evaluations += 1
+            fresh = [] if stack is None else _stable(problem, [stack])
+            field += fresh
+            if fresh:
+                break
+    if not field:
+        return _failed(problem, structure, span, SectionsOutcome.NO_STABLE_START, "", seed,
+                       perf_counter() - begun)  # fmt: skip
+    runners = run_race(
+        problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers
+    )
+    evaluations += sum(runner.evaluations for runner in runners)
+    ends = finished(runners)
+    optima = local_optima(problem, ends)
+    best: SectionsDesign | None = None
+    for point in (runner.point for runner in ends):
+        if point.assessment.violation > MARGIN:
+            point = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02).point
+        last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
+                      least_gain=1e-14)  # fmt: skip
+        evaluations += last.evaluations
+        made_whole = designed(problem, plants, sampling, last.point, optima, len(field),
+                              evaluations, seed, perf_counter() - begun)  # fmt: skip
+        if best is None or (made_whole.certified and not best.certified):
+            best = made_whole
+        if best.certified:
+            break
+    assert best is not None
+    tell(f"{best.outcome.value}: {best.bandwidth / (2.0 * np.pi):.2f} Hz")
+    return best
+
+
+def _joined(
+    problem: CompositeProblem,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    made: Sequence[SectionsDesign],
+    seed: int,
+    begun: float,
+) -> SectionsDesign:
+    """The channels' designs as one, with the bandwidth of the slowest."""
+    kappa = np.concatenate([one.kappa for one in made])
+    inside = in_problem_units(problem, kappa)
+    slowest = min(one.bandwidth for one in made)
+    tau = float(np.log(slowest / problem.plants.omega_0))
+    point = Point(inside, tau, assess(problem, inside, tau))
+    optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)
+    evaluations = sum(one.evaluations for one in made)
+    starts = sum(one.starts for one in made)
+    return designed(problem, plants, sampling, point, optima, starts, evaluations, seed,
+                    perf_counter() - begun)  # fmt: skip
+
+
+def _failed(
+    problem: CompositeProblem,
+    structure: ChannelStructure,
+    span: tuple[float, float],
+    outcome: SectionsOutcome,
+    words: str,
+    seed: int,
+    seconds: float,
+) -> SectionsDesign:
+    nothing = np.full(len(problem.box[0]), np.nan)
+    return SectionsDesign(
+        outcome, words or outcome.value, structure, nothing, span, None, np.nan, None, {}, (),
+        np.nan, {}, (), 0, 0, seed, seconds,
+    )  # fmt: skip
+
+
+def _of_channel(
+    structure: ChannelStructure, item: Array | StateSpace, i: int
+) -> Array | StateSpace:
+    """One channel's part of stacked parameters, or of a controller of the whole."""
+    if not isinstance(item, StateSpace):
+        return np.asarray(item, float)[structure.slices[i]]
+    U, V = structure.decoupling.outputs, structure.decoupling.inputs
+    into, out = np.linalg.inv(U.T)[:, [i]], np.linalg.inv(V)[[i]]
+    return StateSpace(item.A, item.B @ into, out @ item.C, out @ item.D @ into)
+
+
+def _alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
+    """Whether two channels' plants answer alike; so many frequencies tell rational functions."""
+    first, second = plant_set(a), plant_set(b)
+    if first.poles.shape != second.poles.shape:
+        return False
+    v = np.geomspace(1e-2, 1e2, 4 * first.poles.shape[1] + 1)
+    which = np.repeat(np.arange(len(a)), len(v))
+    v = np.tile(v, len(a))
+    one, other = first.responses(which, v)[0], second.responses(which, v)[0]
+    return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
+
+
+def _stacked(problem: CompositeProblem, made: Sequence[SectionsDesign]) -> Array | None:
+    """The channels' parameters in the units of the problem, None where one has found none."""
+    kappa = np.concatenate([one.kappa for one in made])
+    if not np.isfinite(kappa).all():
+        return None
+    return np.clip(in_problem_units(problem, kappa), *problem.box)
+
+
+def _stable(problem: CompositeProblem, pool: Sequence[Array]) -> list[Array]:
+    return [kappa for kappa in pool if started(problem, kappa).assessment.stable]

@@ -1,0 +1,205 @@
+"""The problem of a controller with several channels, made of parts.
+
+Plants that fall apart in the channels' coordinates are one SISO problem for each channel, whose
+bounds are the whole's: the singular values of S, KS, T and GS are the channels' moduli. Plants
+whose channels are coupled are bounded as a whole (`mimo_figures`). All parts share ω_b.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
+from ccd_casadi.fixed_structure.figures import (
+    Assessment,
+    Constraints,
+    LoopProblem,
+    Problem,
+    assess,
+    plant_of_row,
+    to_theta,
+)
+from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
+from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, loop_matrices
+from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.fixed_structure.structure import response
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+
+NOT_THERE = -1.0  # a pole that stands for none
+
+
+@dataclass(frozen=True)
+class Part:
+    """A problem on some of the parameters (`place` of κ) and some of the plants (`members`)."""
+
+    problem: LoopProblem
+    place: slice
+    members: np.ndarray
+
+
+@dataclass(frozen=True)
+class CompositeProblem(LoopProblem):
+    """All parts; `plants` are those of the first, for the units. `count` plants in all.
+
+    The rows of part j are numbered after those of the parts before it.
+    """
+
+    structure: ChannelStructure
+    parts: tuple[Part, ...] = ()
+    count: int = 0
+
+    @property
+    def separable(self) -> bool:
+        """Whether every plant falls apart, so that each channel can be designed on its own."""
+        return not any(isinstance(part.problem, MatrixProblem) for part in self.parts)
+
+    def rows_of(self, number: int) -> tuple[int, int]:
+        """The range of numbers of rows of a part."""
+        sizes = [len(part.members) * len(self.structure.structures) for part in self.parts]
+        start = int(np.sum(sizes[:number], dtype=int))
+        return start, start + sizes[number]
+
+    def split(self, rows: Constraints) -> list[tuple[Part, np.ndarray, Constraints]]:
+        """Each part with the indices of its rows, and these as it numbers them."""
+        found = []
+        for number, part in enumerate(self.parts):
+            start, end = self.rows_of(number)
+            at = np.flatnonzero((rows.plant >= start) & (rows.plant < end))
+            own = rows.only(at)
+            inside = Constraints(own.curve, own.plant - start, own.v, own.value,
+                                 own.to_kappa[:, part.place], own.to_tau)  # fmt: skip
+            found.append((part, at, inside))
+        return found
+
+
+def composite_problem(
+    plants: Sequence[ScaledPlant],
+    structure: ChannelStructure,
+    bounds: Bounds,
+    sampling: Sampling | None = None,
+    frequencies: tuple[float, float] | None = None,
+    margin: float = 0.0,
+) -> CompositeProblem:
+    """The problem in the units of the first plant; `frequencies` (rad/s) bound those of K's roots.
+
+    Raises PlantError for plants that are not square, not stable, or not diagonalisable.
+    """
+    first = plants[0]
+    alike = [in_units_of(plant, first) for plant in plants]
+    apart = np.array([is_decoupled(plant, structure.decoupling) for plant in alike])
+    together = np.flatnonzero(~apart)
+    if frequencies is None:
+        fastest = 30.0 * max(1.0, *(float(np.abs(np.linalg.eigvals(p.A)).max()) for p in alike))
+        if sampling is not None:
+            fastest = min(fastest, 2.0 / (sampling.period * first.omega_0))
+        span = (min(1e-3, 0.01 * fastest), fastest)
+    else:
+        span = (frequencies[0] / first.omega_0, frequencies[1] / first.omega_0)
+    box = structure.bounds(span, (1e-6, 1e6))
+    parts = []
+    if apart.any():
+        members = np.flatnonzero(apart)
+        for i, own in enumerate(structure.structures):
+            place = structure.slices[i]
+            single = [channel_plant(alike[j], structure.decoupling, i) for j in members]
+            problem = Problem(plant_set(single, sampling), own, bounds, box[:, place], margin)
+            parts.append(Part(problem, place, members))
+    if len(together):
+        matrices = matrix_plant_set([alike[j] for j in together], structure.decoupling, sampling)
+        whole = MatrixProblem(matrices, structure, bounds, box, margin)
+        parts.append(Part(whole, slice(0, len(box[0])), together))
+    plant_units = parts[0].problem.plants
+    return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
+
+
+@assess.register
+def _(
+    problem: CompositeProblem,
+    kappa: Array,
+    tau: float,
+    *,
+    each: bool = False,
+    **depths: float,
+) -> Assessment:
+    found = [
+        assess(part.problem, kappa[part.place], tau, each=each, **depths) for part in problem.parts
+    ]
+    widest = sum(one.poles.shape[1] for one in found)
+    poles = np.full((problem.count, widest), NOT_THERE, complex)
+    at = 0
+    for part, one in zip(problem.parts, found, strict=True):
+        poles[part.members, at : at + one.poles.shape[1]] = one.poles
+        at += one.poles.shape[1]
+    seen = [one.stable for one in found]
+    if not (any(seen) if each else all(seen)):
+        return Assessment(False, poles, None, None)
+    sides = []
+    for side in ("peaks", "near"):
+        rows = []
+        for number, (part, one) in enumerate(zip(problem.parts, found, strict=True)):
+            own = getattr(one, side)
+            if own is None:
+                continue
+            wide = np.zeros((len(own.v), len(kappa)))
+            wide[:, part.place] = own.to_kappa
+            start = problem.rows_of(number)[0]
+            rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
+        sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
+    return Assessment(True, poles, sides[0], sides[1])
+
+
+hessians.register(MatrixProblem, whole_hessians)
+
+
+@to_theta.register
+def _(problem: CompositeProblem, kappa: Array, found: Constraints) -> Array:
+    count = problem.plants.plants[0].dA.shape[0]
+    out = np.zeros((len(found.v), count))
+    for part, at, own in problem.split(found):
+        out[at] = to_theta(part.problem, kappa[part.place], own)
+    return out
+
+
+@hessians.register
+def _(problem: CompositeProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
+    n = len(kappa)
+    out = np.zeros((len(rows.v), n + 1, n + 1))
+    for part, at, own in problem.split(rows):
+        place = np.append(np.arange(n)[part.place], n)
+        out[np.ix_(at, place, place)] = hessians(part.problem, kappa[part.place], tau, own)
+    return out
+
+
+def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
+    """The number of the plant that each row is of."""
+    if not isinstance(problem, CompositeProblem):
+        return plant_of_row(problem, found.plant)
+    out = np.zeros(len(found.v), int)
+    for part, at, own in problem.split(found):
+        out[at] = part.members[plant_of_row(part.problem, own.plant)]
+    return out
+
+
+def largest_gains(problem: CompositeProblem, kappa: Array, v: Array) -> tuple[Array, Array, Array]:
+    """σ_max of S, KS and T of every plant at v (k,), each (P, k), in the problem's units."""
+    found = np.zeros((3, problem.count, len(v)))
+    for part in problem.parts:
+        plants, own = part.problem.plants, kappa[part.place]
+        which, at = np.meshgrid(np.arange(len(part.members)), v, indexing="ij")
+        if isinstance(part.problem, MatrixProblem):
+            S, KS, T = loop_matrices(part.problem, own, which, at)
+            gains = [np.linalg.svd(M, compute_uv=False)[..., 0] for M in (S, KS, T)]
+        else:
+            assert isinstance(part.problem, Problem)
+            K, (G, _) = response(part.problem.structure, own, 1j * at), plants.responses(which, at)
+            S = 1.0 / (1.0 + G * K)
+            gains = [np.abs(S), np.abs(K * S), np.abs(G * K * S)]
+        for i, gain in enumerate(gains):
+            found[i, part.members] = np.maximum(found[i, part.members], gain)
+    return found[0], found[1], found[2]

@@ -1,0 +1,316 @@
+"""Every local peak of the singular values of S, KS, T and GS, with exact derivatives.
+
+As `figures`, with the gain of a matrix M(jω) in place of a modulus. Each singular value σ_k is a
+constraint of its own: where the largest two meet, both bind, and no derivative is lost. The sorted
+σ_k of plant i has the number i + kP among the rows, P the number of plants. With u, v its singular
+vectors and κ_a a parameter of channel i, each M depends on K_i by rank one,
+
+    ∂M = P_i ∂K_i Q_i,   ∂σ = Re(uᴴP_i ∂K_i Q_i v),
+
+    M       P               Q            to the plant and to frequency
+    S      -S G V           Uᵀ S         -S ∂(GK) S
+    T       S G V           Uᵀ S          S ∂(GK) S
+    KS     (I - KSG) V      Uᵀ S          ∂K S - KS ∂(GK) S
+    S G₀   -S G V           Uᵀ S G₀      -S ∂(GK) S G₀ + S ∂G₀
+
+where G₀ is the continuous plant (without hold and delay, `free_responses`) and K = V diag(K_i) Uᵀ.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.figures import (
+    HALF_POWER,
+    Assessment,
+    Constraints,
+    Curve,
+    LoopProblem,
+    assess,
+    chain_of,
+    closed_on_zero,
+    frequency_grid,
+    log_weights,
+    plant_of_row,
+    shaped_at,
+    to_theta,
+)
+from ccd_casadi.fixed_structure.loop import stable
+from ccd_casadi.fixed_structure.mimo_loop import MatrixPlantSet, whole_closed_loops
+from ccd_casadi.fixed_structure.structure import response, response_and_slopes
+from ccd_casadi.support.arrays import Array
+
+# ln of the share of its bound under which a peak is none of ours: above that of S = I, whose
+# singular values ripple around 1 wherever the loop has no gain.
+RELEVANT = -0.4
+WITHIN = 0.4
+OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING)
+
+
+@dataclass(frozen=True)
+class MatrixProblem(LoopProblem):
+    """That of square plants of several channels, as a whole."""
+
+    plants: MatrixPlantSet
+    structure: ChannelStructure
+
+
+@dataclass(frozen=True)
+class Rows:
+    """M constraints at fixed frequencies: value and slope to ln v, derivatives to κ (M, n).
+
+    `U`, `s`, `V` (M, c, c) are the singular vectors and values of each row's matrix, `at` which of
+    them, `left` = Uᴴ P (M, c, channels), `right` = Q V, `inner` = Uᵀ S G V; k the channels' K_i
+    (M, c), `log_slopes` (M, n) ∂ln K_i/∂κ.
+    """
+
+    value: Array
+    slope: Array
+    to_kappa: Array
+    U: np.ndarray
+    s: Array
+    V: np.ndarray
+    at: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    inner: np.ndarray
+    k: np.ndarray
+    log_slopes: np.ndarray
+
+
+def evaluate_rows(
+    problem: MatrixProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
+) -> Rows:
+    """The singular values that the rows name, of these curves at these v; without the margin."""
+    plants, structure = problem.plants, problem.structure
+    which, at = plant_of_row(problem, row), row // len(plants.plants)
+    k, ln_slope, log_slopes = _channels(structure, kappa, v)
+    G, dG = plants.responses(which, v)
+    K = plants.into @ (k[..., None] * plants.out)
+    K_x = plants.into @ ((k * ln_slope)[..., None] * plants.out)
+    eye = np.eye(K.shape[-1])
+    S = np.linalg.inv(eye + G @ K)
+    SG = S @ G
+    SL_xS = S @ (dG @ K + G @ K_x) @ S
+    of_t, of_ks, of_gs = (_chosen(curve, code) for code in (Curve.T, Curve.KS, Curve.GS))
+    M = np.where(of_t, eye - S, S)
+    M_x = np.where(of_t, SL_xS, -SL_xS)
+    left = np.where(of_t, SG, -SG)
+    right = plants.out @ S
+    if of_ks.any():
+        KS = K @ S
+        M, M_x = np.where(of_ks, KS, M), np.where(of_ks, K_x @ S - K @ SL_xS, M_x)
+        left = np.where(of_ks, eye - K @ SG, left)
+    if of_gs.any():
+        free, dfree = plants.free_responses(which, v)
+        M = np.where(of_gs, S @ free, M)
+        M_x = np.where(of_gs, S @ dfree - SL_xS @ free, M_x)
+        right = np.where(of_gs, right @ free, right)
+    U, s, Vh = np.linalg.svd(M)
+    V = np.conj(np.swapaxes(Vh, 1, 2))
+    lefts = np.conj(np.swapaxes(U, 1, 2)) @ left @ plants.into
+    rights = right @ V
+    rows = np.arange(len(v))
+    sigma = s[rows, at]
+    offset, offset_slope = _offsets(problem, tau, curve, v)
+    share = lefts[rows, at] * k * rights[rows, :, at] / sigma[:, None]
+    to_kappa = np.empty((len(v), len(kappa)))
+    for i, place in enumerate(structure.slices):
+        to_kappa[:, place] = (share[:, [i]] * log_slopes[:, place]).real
+    pushed = np.einsum("mi,mij,mj->m", np.conj(U[rows, :, at]), M_x, V[rows, :, at])
+    slope = pushed.real / sigma + offset_slope
+    with np.errstate(divide="ignore"):
+        value = np.log(sigma) + offset
+    inner = plants.out @ SG @ plants.into
+    return Rows(value, slope, to_kappa, U, s, V, at, lefts, rights, inner, k, log_slopes)
+
+
+def whole_constraints(
+    problem: MatrixProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
+) -> Constraints:
+    """Values and derivatives of these rows at these v."""
+    found = evaluate_rows(problem, kappa, tau, curve, row, v)
+    to_tau = np.zeros(len(v))
+    if problem.bounds.shape is not None:
+        omega = problem.plants.frequency(v)
+        rising = shaped_at(problem, omega) * problem.bounds.shape < np.exp(tau)
+        to_tau[(curve == Curve.SHAPE) & rising] = 1.0
+    end = curve == Curve.CROSSING
+    to_tau[end] = (found.slope / chain_of(problem, v))[end]
+    return Constraints(curve, row, v, found.value + problem.margin, found.to_kappa, to_tau)
+
+
+@assess.register
+def _(
+    problem: MatrixProblem,
+    kappa: Array,
+    tau: float,
+    *,
+    within: float = WITHIN,
+    depth: float = RELEVANT,
+    each: bool = False,
+) -> Assessment:
+    poles = whole_closed_loops(problem.plants, problem.structure, kappa)
+    good = stable(poles)
+    if not good.any() if each else not good.all():
+        return Assessment(False, poles, None, None)
+    v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles)
+    P, count = v.shape
+    channels = len(problem.structure.structures)
+    crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
+    found, near = [], []
+    for curve, value in _levels(problem, kappa, tau, v, min(depth, -within)).items():
+        if curve is Curve.SHAPE:
+            value = np.where(v[..., None] <= crossing, value, -np.inf)
+        left = np.pad(value, ((0, 0), (1, 0), (0, 0)), constant_values=-np.inf)[:, :-1]
+        right = np.pad(value, ((0, 0), (0, 1), (0, 0)), constant_values=-np.inf)[:, 1:]
+        i, at, k = np.nonzero((value > depth) & (value >= left) & (value > right))
+        low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
+        if curve is Curve.SHAPE:
+            high = np.minimum(high, crossing)
+        found.append((np.full(len(i), curve), i + k * P, v[i, at], low, high))
+        i, at, k = np.nonzero(regular[..., None] & (value > -within))
+        near.append((np.full(len(i), curve), i + k * P, v[i, at]))
+    kind, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
+
+    def slope(x: Array, of: np.ndarray) -> Array:
+        return evaluate_rows(problem, kappa, tau, kind[of], rows[of], np.exp(x)).slope
+
+    top, closed = closed_on_zero(slope, start, low, high)
+    # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
+    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing)
+    kind, rows, top = kind[whole], rows[whole], top[whole]
+    every = np.arange(P * channels)
+    low_v = float(problem.plants.variable(np.array([problem.low]))[0])
+    kind = np.concatenate([kind, np.full(len(every), Curve.S_LOW),
+                           np.full(len(every), Curve.CROSSING)])  # fmt: skip
+    rows = np.concatenate([rows, every, every])
+    top = np.concatenate([top, np.full(len(every), low_v), np.full(len(every), crossing)])
+    other = [np.concatenate(part) for part in zip(*near, strict=True)]
+    return Assessment(
+        True,
+        poles,
+        whole_constraints(problem, kappa, tau, kind, rows, top),
+        whole_constraints(problem, kappa, tau, *other),
+    )
+
+
+@to_theta.register
+def _(problem: MatrixProblem, kappa: Array, found: Constraints) -> Array:
+    plants = problem.plants
+    out = np.zeros((len(found.v), plants.plants[0].dA.shape[0]))
+    which = plant_of_row(problem, found.plant)
+    at = evaluate_rows(problem, kappa, 0.0, found.curve, found.plant, found.v)
+    rows = np.arange(len(found.v))
+    sigma = at.s[rows, at.at][:, None]
+    u, v = np.conj(at.U[rows, :, at.at]), at.V[rows, :, at.at]
+    K = plants.into @ (at.k[..., None] * plants.out)
+    G, _ = plants.responses(which, found.v)
+    S = np.linalg.inv(np.eye(K.shape[-1]) + G @ K)
+    free, _ = plants.free_responses(which, found.v)
+    of_t, of_ks, of_gs = (_chosen(found.curve, code) for code in (Curve.T, Curve.KS, Curve.GS))
+    # ∂M = left ∂G right, and S ∂G₀ of the compliance
+    left = np.where(of_ks, K @ S, S) * np.where(of_t, 1.0, -1.0)
+    right = K @ S
+    right = np.where(of_gs, right @ free, right)
+    x = np.einsum("mi,mij->mj", u, left)
+    y = np.einsum("mij,mj->mi", right, v)
+    x_free = np.einsum("mi,mij->mj", u, S)
+    for i in np.unique(which):
+        own = np.flatnonzero(which == i)
+        out[own] = plants.form_to_theta(int(i), found.v[own], x[own], y[own]).real
+        own = own[found.curve[own] == Curve.GS]
+        if len(own):
+            out[own] += plants.form_to_theta(
+                int(i), found.v[own], x_free[own], v[own], free=True
+            ).real
+    return np.asarray(out / sigma)
+
+
+def _channels(
+    structure: ChannelStructure, kappa: Array, v: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K_i (M, c), ∂ln K_i/∂ln v (M, c), and ∂ln K_i/∂κ (M, n) of every channel's own κ."""
+    parts = [response_and_slopes(own, part, 1j * v) for own, part in structure.split(kappa)]
+    values, slopes, ln_slopes = zip(*parts, strict=True)
+    return np.stack(values, -1), np.stack(ln_slopes, -1), np.concatenate(slopes, -1)
+
+
+def _levels(
+    problem: MatrixProblem, kappa: Array, tau: float, v: Array, least: float
+) -> dict[Curve, Array]:
+    """ln σ over the bound (P, k, c) of every curve, -inf where none can be above `least`.
+
+    σ² is never above the largest row sum of |MᴴM|: most frequencies need no decomposition.
+    """
+    plants = problem.plants
+    which = np.broadcast_to(np.arange(len(v))[:, None], v.shape)
+    S, KS, T = loop_matrices(problem, kappa, which, v)
+    found: dict[Curve, Array] = {}
+    for curve in problem.curves:
+        offset, _ = _offsets(problem, tau, np.full(v.shape, curve), v)
+        if curve is Curve.KS:
+            M = KS
+        elif curve is Curve.T:
+            M = T
+        elif curve is Curve.GS:
+            M = S @ plants.free_responses(which, v)[0]
+        else:
+            M = S
+        found[curve] = _log_gains(M, offset, least)
+    return found
+
+
+def loop_matrices(
+    problem: MatrixProblem, kappa: Array, which: np.ndarray, v: Array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """S, KS and T (..., p, p) of the plants `which` at v, without weights."""
+    k = np.stack([response(own, part, 1j * v) for own, part in problem.structure.split(kappa)], -1)
+    K = problem.plants.into @ (k[..., None] * problem.plants.out)
+    G, _ = problem.plants.responses(which, v)
+    eye = np.eye(K.shape[-1])
+    S = np.linalg.inv(eye + G @ K)
+    return S, K @ S, eye - S
+
+
+def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:
+    square = np.abs(np.conj(np.swapaxes(M, -1, -2)) @ M).sum(-1).max(-1)
+    with np.errstate(divide="ignore"):
+        chosen = 0.5 * np.log(square) + offset > least
+        out = np.full((*offset.shape, M.shape[-1]), -np.inf)
+        out[chosen] = np.log(np.linalg.svd(M[chosen], compute_uv=False)) + offset[chosen][:, None]
+    return out
+
+
+def _offsets(
+    problem: MatrixProblem, tau: float, curve: np.ndarray, v: Array
+) -> tuple[Array, Array]:
+    """What is added to ln σ to make it a constraint, and its slope to ln v."""
+    plants, bounds = problem.plants, problem.bounds
+    omega = plants.frequency(v)
+    chain = chain_of(problem, v)
+    out, slope = np.zeros(v.shape), np.zeros(v.shape)
+    out[curve == Curve.S_MAX] = -np.log(bounds.S_max)
+    out[curve == Curve.S_LOW] = -np.log(bounds.S_low)
+    out[curve == Curve.CROSSING] = HALF_POWER
+    shape = curve == Curve.SHAPE
+    out[shape] = HALF_POWER
+    if bounds.shape is not None and shape.any():
+        counted = shaped_at(problem, omega)
+        under = np.minimum(np.log(bounds.shape * counted) - tau, 0.0)
+        out[shape] -= under[shape]
+        slope[shape] = np.where((under < 0.0) & (counted == omega), -chain, 0.0)[shape]
+    if bounds.weighted_level is not None and bounds.weights is not None:
+        W, dW = log_weights(bounds.weights, omega * plants.omega_0)
+        for code, row, extra in ((Curve.KS, 0, np.log(plants.force)), (Curve.T, 1, 0.0)):
+            own = curve == code
+            out[own] = (W[row] + extra - np.log(bounds.weighted_level))[own]
+            slope[own] = (dW[row] * chain)[own]
+    if bounds.compliance_max is not None:
+        out[curve == Curve.GS] = -np.log(bounds.compliance_max * plants.force)
+    return out, slope
+
+
+def _chosen(curve: np.ndarray, code: Curve) -> np.ndarray:
+    return np.asarray(curve == code)[:, None, None]

@@ -1,0 +1,88 @@
+"""Loops of several channels for the tests: a stage whose load may lie off centre."""
+
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+from helpers import HZ, SUSPENSION, scaled
+
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.decoupling import find_decoupling
+from ccd_casadi.fixed_structure.figures import LoopProblem, assess
+from ccd_casadi.plants.plant import Plant, build_plant, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.weights import Weights
+
+M_K = 4.5e4
+WEIGHTS = Weights(M_S=2.0, A_S=1e-4, omega_S=10.0 * HZ, c_K=1e4, omega_K=100.0 * HZ, M_K=M_K,
+                  A_l=1.0, A_u=1e-2, omega_T=25.0 * HZ)  # fmt: skip
+BOUNDS = Bounds(S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=20.0,
+                weights=WEIGHTS, compliance_max=1e-3)  # fmt: skip
+FAST = Sampling(12500.0, 80.0)
+STRUCTURE = Structure(lead=1, biquads=1, roll_off=1)
+PATTERN = 0.5 * np.array([[1.0, 1, 1, 1], [1, 1, -1, -1], [1, -1, 1, -1]])  # z, tip, tilt
+
+
+@lru_cache
+def stage(off: float = 0.0) -> Plant:
+    """z, tip, tilt of a stage with four corners and three outputs; `load` kg lies off centre.
+
+    One torsion mode acts on tip and tilt alike when the load is off centre, one bending mode on z.
+    """
+    shapes = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0], [0, 0.5, 0], [0, 0, 0.4]])
+    side = np.array([[0.0, 1, -0.7], [1, 0, 0.3], [-0.7, 0.3, 0]])
+
+    def model(theta: dict) -> dict:
+        m, h = theta["m"], theta["h"]
+        mixing = np.zeros((6, 6))
+        mixing[:3, :3] = mixing[3:, 3:] = side
+        mixing[:3, 3:] = mixing[3:, :3] = 0.3 * side
+        mass = ca.diag(ca.vertcat(m, 0.8 * m, 0.7 * m, 0.5, 0.4, 0.4))
+        hz = ca.vertcat(0.0, 0.0, 0.0, 230.0 * h, 310.0 * h, 350.0 * h**1.5)
+        own = ca.vertcat(1.0, 1.0, 1.0, 0.5, 0.4, 0.4)
+        return {
+            "mass": mass + off * 0.1 * ca.DM(mixing),
+            "stiffness": ca.diag(own * (HZ * hz) ** 2),
+            "damping_ratio": 0.01,
+            "input": ca.DM(shapes),
+            "output": ca.DM(shapes.T),
+            "hardware_cost": m,
+        }
+
+    return build_plant(model, ("m", "h"), {})
+
+
+def plant(theta: tuple[float, float] = (1.0, 1.0), off: float = 0.0) -> ScaledPlant:
+    """The stage at θ = (mass, relative frequency)."""
+    return scaled(mechanics(stage(off), theta), M_K, SUSPENSION)
+
+
+def structure(own: Structure = STRUCTURE) -> ChannelStructure:
+    """The same structure for each of the stage's three channels."""
+    return ChannelStructure(find_decoupling(plant()), (own,) * 3)
+
+
+def loop(
+    seed: int, off: tuple[float, ...], sampling: Sampling | None = None
+) -> tuple[LoopProblem, Array]:
+    """A problem on the stage with these loads, and a random κ that all of them are stable with."""
+    rng = np.random.default_rng(seed)
+    plants = [plant(off=x) for x in off]
+    problem = composite_problem(plants, structure(), BOUNDS, sampling)
+    for _ in range(200):
+        values = []
+        for channel in problem.structure.decoupling.names:
+            crossover = np.exp(rng.uniform(-1.0, 0.3))
+            near = {"gain": crossover**2 / 3.0, "integrator": 0.1 * crossover,
+                    "lead 1 zero": crossover / 3.0, "lead 1 pole": 3.0 * crossover,
+                    "biquad 1 zeros": 4.0, "biquad 1 zeros damping": 0.3, "biquad 1 poles": 5.0,
+                    "biquad 1 poles damping": 0.5, "roll-off real": 10.0 * crossover}  # fmt: skip
+            assert channel
+            values += [near[name] * np.exp(0.2 * rng.normal()) for name in STRUCTURE.names]
+        kappa = np.log(values)
+        if assess(problem, kappa, -1.5).stable:
+            return problem, kappa
+    raise AssertionError("no random controller is stable")

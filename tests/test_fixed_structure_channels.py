@@ -1,0 +1,165 @@
+"""Fixed structures on plants of several channels: the whole loop's bounds and their derivatives."""
+
+import numpy as np
+import pytest
+from fixed_structure_channels import BOUNDS, FAST, STRUCTURE, loop, plant, structure
+from helpers import sensitivity_gain
+
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.composite import composite_problem, plants_of_rows
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.decoupling import (
+    Decoupling,
+    find_decoupling,
+    given_decoupling,
+    in_channels,
+    is_decoupled,
+)
+from ccd_casadi.fixed_structure.figures import Curve, assess, to_theta
+from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
+from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.support.errors import PlantError
+
+SKEWED = given_decoupling(("a", "b", "c"), [[1, 0.2, 0], [0, 1, 0.1], [0.1, 0, 1]],
+                          [[1, 0, 0.1], [0.1, 1, 0], [0, 0.1, 1]])  # fmt: skip
+
+
+def whole(problem, sampling: Sampling | None, off: float = 0.3, theta=(1.0, 1.0)) -> MatrixProblem:
+    """The same problem with one plant as a whole, in the units of the stage at θ = (1, 1)."""
+    plants = [plant(), plant(theta, off)]
+    members = matrix_plant_set(plants, problem.structure.decoupling, sampling)
+    return MatrixProblem(members, problem.structure, BOUNDS, problem.box)
+
+
+def test_the_channels_of_a_stage_are_found() -> None:
+    found = find_decoupling(plant())
+    assert found.orthogonal
+    assert is_decoupled(plant(), found)
+    assert is_decoupled(plant((1.3, 0.9)), found)
+    assert not is_decoupled(plant(off=0.05), found)
+    turned = in_channels(plant(off=0.3), find_decoupling(plant(off=0.3)))
+    static = -turned.C @ np.linalg.solve(turned.A, turned.B)
+    assert np.abs(static - np.diag(np.diag(static))).max() < 1e-9 * np.diag(static).min()
+    with pytest.raises(PlantError, match="independent"):
+        given_decoupling(("a", "b"), [[1, 1], [2, 2]], [[1, 0], [0, 1]])
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_where_plants_fall_apart_the_parts_are_the_whole(sampling: Sampling | None) -> None:
+    problem, kappa = loop(0, (0.0,), sampling)
+    together = whole(problem, sampling, off=0.0)
+    parts = assess(problem, kappa, -1.5, depth=-0.4).peaks
+    joint = assess(together, kappa, -1.5, depth=-0.4).peaks
+    assert parts is not None
+    assert joint is not None
+    for i in range(len(parts.v)):
+        one = parts.only(np.array([i]))
+        rows = [
+            whole_constraints(together, kappa, -1.5, one.curve, np.array([2 * k]), one.v)
+            for k in range(3)
+        ]
+        row = min(rows, key=lambda row: abs(row.value[0] - one.value[0]))
+        assert row.value[0] == pytest.approx(one.value[0], abs=1e-9)
+        np.testing.assert_allclose(row.to_kappa, one.to_kappa, atol=1e-8)
+        assert row.to_tau[0] == pytest.approx(one.to_tau[0], abs=1e-8)
+    for curve in np.unique(joint.curve):
+        tops = [found.value[found.curve == curve].max() for found in (parts, joint)]
+        if tops[0] > -0.4:
+            assert tops[1] == pytest.approx(tops[0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("seed", "sampling", "given"),
+    [(0, None, None), (1, FAST, None), (2, None, SKEWED), (3, FAST, SKEWED)],
+)
+def test_derivatives_of_singular_values(
+    seed: int, sampling: Sampling | None, given: Decoupling | None
+) -> None:
+    """To κ, τ and θ against central differences of fourth order, where σ is a simple one."""
+    problem, kappa = loop(seed, (0.0, 0.3), sampling)
+    if given is not None:
+        problem = composite_problem([plant(), plant(off=0.3)],
+                                    ChannelStructure(given, problem.structure.structures),
+                                    BOUNDS, sampling)  # fmt: skip
+    tau = -1.5
+    model = whole(problem, sampling)
+    peaks = assess(model, kappa, tau, depth=-2.0).peaks
+    assert peaks is not None
+    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
+    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
+    gap[range(len(peaks.v)), found.at] = np.inf
+    peaks = peaks.only((peaks.plant % 2 == 1) & (gap.min(axis=1) > 0.03))
+    assert set(peaks.curve) >= {Curve.S_MAX, Curve.S_LOW, Curve.KS, Curve.T, Curve.CROSSING}
+
+    def values(of, kappa, tau):
+        return whole_constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
+
+    size = np.abs(peaks.to_kappa).max(1) + 1e-2
+    h = 1e-4
+    for i, step in enumerate(h * np.eye(len(kappa))):
+        a, b, c, d = (values(model, kappa + x * step, tau) for x in (1, -1, 2, -2))
+        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
+        assert (np.abs(slope - peaks.to_kappa[:, i]) / size).max() < 1e-5
+    rising = peaks.curve != Curve.CROSSING
+    slope = (values(model, kappa, tau + 1e-6) - values(model, kappa, tau - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
+    exact = to_theta(model, kappa, peaks)
+    scale = np.abs(exact).max(1) + 1e-3 * np.abs(exact).max()
+    h = 1e-4
+    for i, step in enumerate(h * np.eye(2)):
+        a, b, c, d = (
+            values(whole(problem, sampling, theta=tuple(1.0 + x * step)), kappa, tau)
+            for x in (1, -1, 2, -2)
+        )
+        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
+        assert (np.abs(slope - exact[:, i]) / scale).max() < 1e-5
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_hessian_of_the_whole_is_the_difference_of_gradients(sampling: Sampling | None) -> None:
+    """In random directions; peaks move with κ. Where σ is a simple one, clear of the next."""
+    problem, kappa = loop(1, (0.3,), sampling)
+    tau = -1.5
+    peaks = assess(problem, kappa, tau).peaks
+    assert peaks is not None
+    model = problem.parts[0].problem
+    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
+    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
+    gap[range(len(peaks.v)), found.at] = np.inf
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        direction = rng.normal(0.0, 1.0, len(kappa))
+        direction /= np.linalg.norm(direction)
+        ends = [assess(problem, kappa + x * direction, tau).peaks for x in (1e-5, -1e-5)]
+        seen = set()
+        for j in np.flatnonzero(gap.min(axis=1) > 0.1):
+            one = peaks.only(np.array([j]))
+            exact = hessians(problem, kappa, tau, one)[0, :-1, :-1] @ direction
+            slopes = []
+            for end in ends:
+                same = np.flatnonzero((end.curve == one.curve[0]) & (end.plant == one.plant[0]))
+                k = same[np.argmin(np.abs(np.log(end.v[same] / one.v[0])))]
+                slopes.append(end.to_kappa[k])
+            numeric = (slopes[0] - slopes[1]) / 2e-5
+            np.testing.assert_allclose(exact, numeric, atol=2e-4 * (1.0 + np.abs(numeric).max()))
+            seen.add(int(one.curve[0]))
+        assert len(seen) >= 5
+
+
+@pytest.mark.parametrize("off", [(0.0,), (0.3,), (0.0, 0.3)])
+def test_peaks_of_the_whole_are_those_of_dense_grids(off: tuple[float, ...]) -> None:
+    problem, kappa = loop(2, off)
+    peaks = assess(problem, kappa, -1.5).peaks
+    assert peaks is not None
+    owner = plants_of_rows(problem, peaks)
+    first = plant(off=off[0])
+    si = problem.structure.in_units(kappa, first.omega_0, first.force)
+    controller = problem.structure.state_space(si)
+    omega = np.geomspace(1e-2, 1e4, 20001) * first.omega_0
+    for i, x in enumerate(off):
+        gain = sensitivity_gain(plant(off=x).plant_si(), controller, omega)
+        own = peaks.value[(owner == i) & (peaks.curve == Curve.S_MAX)].max()
+        assert np.exp(own) * BOUNDS.S_max >= gain.max() * (1.0 - 1e-9)
+        assert np.exp(own) * BOUNDS.S_max <= gain.max() * (1.0 + 1e-3)
+    assert structure().order == 3 * STRUCTURE.order
