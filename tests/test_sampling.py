@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from busy import prompt
+from commands import changed, run
 from helpers import HZ, INNER, problem
 
 from ccd_casadi.inner_problem.problem import PlantSource
@@ -240,8 +241,8 @@ def test_what_determines_a_synthesis_and_nothing_else_is_in_its_key(tmp_path: Pa
 # ---- interruptions -------------------------------------------------------------------------------
 
 
-def command(folder: Path, *more: str) -> list[str]:
-    words = ["-m", "ccd_casadi.solve", str(TWO_MASS), "--out", str(folder), "--quiet", *more]
+def command(folder: Path, *more: str, case: Path = TWO_MASS) -> list[str]:
+    words = ["-m", "ccd_casadi.solve", str(case), "--out", str(folder), "--quiet", *more]
     return [sys.executable, *words]
 
 
@@ -277,16 +278,27 @@ def result(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(solved: Callable[[str], Path]) -> Path:
-    return solved("nested")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Callable[..., list[str]], Path]:
+    """The command on a small case in one process, and the folder that it leaves undisturbed."""
+    folder = tmp_path_factory.mktemp("runs")
+    small = "\n[sampling]\npoints = 3\nlifted_points = 24\n[outer]\nbox_points = 0\n"
+    case = changed(folder, more=small)
+
+    def words(into: Path, *more: str) -> list[str]:
+        return command(into, "--workers", "1", *more, case=case)
+
+    assert run(folder / "run", case=case) == 0
+    return words, folder / "run"
 
 
-def interrupted_runs(folder: Path, kills: int, seed: int, span: float) -> list[int]:
+def interrupted_runs(
+    words: list[str], folder: Path, kills: int, seed: int, span: float
+) -> list[int]:
     """Kill and resume until `kills` kills have met a running command; rows left by each."""
     rng, left = random.Random(seed), []
     store = folder / "samples.sqlite"
     while len(left) < kills:
-        process = started(command(folder))
+        process = started(words)
         if rng.random() < 0.7:  # while it samples
             wait_for_rows(process, store, rows(store) + 1)
             time.sleep(rng.uniform(0.0, 0.3))
@@ -308,19 +320,23 @@ def interrupted_runs(folder: Path, kills: int, seed: int, span: float) -> list[i
     [(3, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)],
 )
 def test_killed_and_resumed_ends_as_if_undisturbed(
-    undisturbed: Path, tmp_path: Path, kills: int, seed: int, span: float
+    undisturbed: tuple[Callable[..., list[str]], Path],
+    tmp_path: Path,
+    kills: int,
+    seed: int,
+    span: float,
 ) -> None:
-    folder = tmp_path / "run"
-    left = interrupted_runs(folder, kills, seed, span)
+    (words, whole), folder = undisturbed, tmp_path / "run"
+    left = interrupted_runs(words(folder), folder, kills, seed, span)
     assert len(set(left)) >= 2, "the kills met the sampling at different points"
     done = subprocess.run(
-        command(folder, "--resume"), cwd=ROOT, capture_output=True, text=True, check=False
+        words(folder, "--resume"), cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert table(folder / "samples.sqlite") == table(undisturbed / "samples.sqlite")
-    assert result(folder) == result(undisturbed)
+    assert table(folder / "samples.sqlite") == table(whole / "samples.sqlite")
+    assert result(folder) == result(whole)
     for name in ("controller.json", "surrogate.json", "case.toml"):
-        assert (folder / name).read_bytes() == (undisturbed / name).read_bytes()
+        assert (folder / name).read_bytes() == (whole / name).read_bytes()
 
 
 POOL = f"""
@@ -371,10 +387,12 @@ def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
     "formulation",
     ["nested", "lifted", "direct"],
 )
-def test_ctrl_c_is_resumable(undisturbed: Path, tmp_path: Path, formulation: str) -> None:
+def test_ctrl_c_is_resumable(
+    undisturbed: tuple[Callable[..., list[str]], Path], tmp_path: Path, formulation: str
+) -> None:
     """In the middle of sampling, or of IPOPT on the truth."""
-    folder = tmp_path / "run"
-    process = started(command(folder, "--formulation", formulation))
+    (words, whole), folder = undisturbed, tmp_path / "run"
+    process = started(words(folder, "--formulation", formulation))
     wait_for_rows(process, folder / "samples.sqlite", 20)
     os.kill(process.pid, signal.SIGINT)
     began = time.monotonic()
@@ -386,9 +404,6 @@ def test_ctrl_c_is_resumable(undisturbed: Path, tmp_path: Path, formulation: str
     assert not (folder / "result.json").exists()
     if formulation == "nested":
         kept = rows(folder / "samples.sqlite")
-        assert 20 <= kept < rows(undisturbed / "samples.sqlite")
-        again = subprocess.run(
-            command(folder), cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        assert again.returncode == 0
-        assert result(folder) == result(undisturbed)
+        assert 20 <= kept < rows(whole / "samples.sqlite")
+        assert run(folder, case=Path(words(folder)[3])) == 0
+        assert result(folder) == result(whole)
