@@ -114,6 +114,8 @@ def test_beyond_four_parameters_and_with_coupled_damping_nothing_is_proven() -> 
     many = replace(BOX, options=(chain,), mode_shift=0.01)
     assert len(many.names) == 5
     assert prove(many, STRUCTURE, KAPPA, 1.0, BOUNDS).outcome is ProofOutcome.TOO_MANY_PARAMETERS
+    twice = replace(BOX, options=(replace(SYSTEM, C=np.eye(2)),))
+    assert prove(twice, STRUCTURE, KAPPA, 1.0, BOUNDS).outcome is ProofOutcome.SEVERAL_CHANNELS
     coupled = replace(SYSTEM, damping_ratio=None, D=np.diag([50.0, 400.0]))
     box = replace(BOX, options=(coupled,))
     assert prove(box, STRUCTURE, KAPPA, 1.0, BOUNDS).outcome is ProofOutcome.NOT_MODAL
