@@ -39,7 +39,7 @@ class ProofOutcome(StrEnum):
     REFUTED = "a plant of the box passes a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     TOO_MANY_PARAMETERS = "more than four uncertain parameters"
-    SEVERAL_CHANNELS = "a proof is for one input and one output"
+    SEVERAL_CHANNELS = "the plant has several inputs or outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
 
 
@@ -111,7 +111,8 @@ def prove(
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
-    if isinstance(structure, ChannelStructure):
+    several = any(system.B.shape[1] != 1 or len(system.C) != 1 for system in uncertain.options)
+    if several or isinstance(structure, ChannelStructure):
         return without(ProofOutcome.SEVERAL_CHANNELS)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)
