@@ -44,6 +44,11 @@ def text(found: dict[str, Any]) -> str:
         + ("met (0 or less)" if item["met"] else "NOT met (it is where it is 0 or less)")
         for item in found["constraints"]
     ]
+    lines += [
+        f"budget        {item['name']} ({item['kind'].replace('_', ' ')}): "
+        + ("white" if item["rms"] is None else f"{item['rms']:.4g} {item['unit']} RMS")
+        for item in found["budget"]
+    ]
     lines += [f"{item['severity']:13s} {item['words']}" for item in found["findings"]]
     if not found["findings"]:
         lines.append("findings      none")

@@ -92,6 +92,7 @@ def _sections(
     """A full race of a fixed structure at θ, worst plants added, and the judge over the box."""
     import numpy as np
 
+    from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_result import active_of, design_dict, sections_controller
     from ccd_casadi.inner_problem.sections_bandwidth import (
@@ -101,6 +102,7 @@ def _sections(
         with_range,
         worst_members,
     )
+    from ccd_casadi.inner_problem.sections_error import least_error_at
 
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)
@@ -110,6 +112,22 @@ def _sections(
         answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
         _print(answer, (), options, began)
         return ExitCode.INFEASIBLE
+    if sections.minimise == "rms_error":
+        if made.bandwidth < sections.bandwidth_least:
+            words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
+            words += f", inner.bandwidth_least_hz asks for {sections.bandwidth_least / HZ:.4g} Hz"
+            answer = head | {"status": "infeasible", "reason": words, "syntheses": 1}
+            _print(answer, (), options, began)
+            return ExitCode.INFEASIBLE
+        fastest = made.bandwidth
+        asked, least = least_error_at(asked, theta, made, tell)
+        made = least.design
+        head["least_error"] = {
+            "error_rms_of_set": least.error,
+            "error_rms_at_largest_bandwidth": least.first_error,
+            "largest_bandwidth_hz": fastest / HZ,
+            "steps": least.steps,
+        }
     worst = worst_members(asked, theta, made)[0]
     assert made.controller is not None
     wide, checked = judged_widely(asked, theta, made.controller, worst)
@@ -127,6 +145,7 @@ def _sections(
             "worst_excess": float(np.expm1(worst.value)),
         },
         "syntheses": 1,
+        **budget_entry(asked, theta, made.controller),
     }
     if options.out is not None:
         folder = run_folder(options.case, options.out)
@@ -138,6 +157,7 @@ def _sections(
 def _design(
     problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
 ) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
+    from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import clean, controller_dict, figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.inner_problem.sweep import active_constraints
@@ -165,6 +185,7 @@ def _design(
             for omega, gain in local_peaks(plant, made.controller)
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
+        **budget_entry(problem, theta, made.controller),
     }
     code = ExitCode.DONE if figures.certified else ExitCode.NOT_VERIFIED
     return code, answer, controller_dict(made.controller)

@@ -24,6 +24,7 @@ _CODES = {
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
+    from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.reporting.verdict import terminal_lines
 
     result = solution.result
@@ -47,6 +48,7 @@ def summary(solution: "Solution") -> str:
         f"certificate   {'passed' if result['certificate']['passed'] else 'FAILED'}: norm "
         f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
+        *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
@@ -72,6 +74,7 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
 
 def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
+    from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.reporting.verdict import terminal_lines
 
@@ -98,6 +101,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"robust        {'passed' if robust['passed'] else 'FAILED'} on {robust['plants']} plants "
         f"of the box; the worst that was searched: {100.0 * robust['worst_excess']:+.3g} % of a "
         "bound",
+        *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "
         "theta, "

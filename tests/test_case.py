@@ -35,7 +35,7 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
     assert vars(case.objective) == {"w1": 0.0995, "w2": -0.9950}
     assert vars(case.weights) == {
         "M_S": 2.0, "A_S": 1e-4, "c_K": 1e4, "omega_K_hz": 100.0, "M_K": 2e7, "A_l": 1.0,
-        "A_u": 1e-2,
+        "A_u": 1e-2, "disturbance": None,
     }  # fmt: skip
     inner = case.inner
     assert (inner.S_max, inner.S_low, inner.omega_low_hz) == (1.75, 0.03, 1.0)

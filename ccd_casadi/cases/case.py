@@ -12,6 +12,7 @@ from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.cases.budget import checked_budget, error_budget
 from ccd_casadi.cases.checks import (
     ANY,
     FRACTION,
@@ -27,7 +28,13 @@ from ccd_casadi.cases.checks import (
     too_large,
 )
 from ccd_casadi.cases.diagnosis import Severity, diagnose
-from ccd_casadi.cases.kinds import check_kind, read_options, require_channels, sections_problem
+from ccd_casadi.cases.kinds import (
+    check_kind,
+    disturbance_of,
+    read_options,
+    require_channels,
+    sections_problem,
+)
 from ccd_casadi.cases.sections import (
     SECTIONS,
     Case,
@@ -166,6 +173,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             words = f"is {above:g}, not above {low} = {below:g}; give {high} > {low}, so that {why}"
             raise fail(f"weights.{high}", words)
     check_kind(sections, fail)
+    sections["budget"] = checked_budget(sections["budget"], path.parent, fail)
     plant = _plant(data["plant"], path, fail)
     files = sections["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
@@ -204,7 +212,7 @@ def _section(
             raise fail(f"{name}.{key}", wrong)
         value = table[key]
         if isinstance(value, list):
-            kept = item.type in (tuple[int, int], tuple[str, ...])
+            kept = item.type in (tuple[int, int], tuple[str, ...], tuple[Mapping[str, Any], ...])
             value = tuple(v if kept else float(v) for v in value)
         elif item.type in (float, float | None):
             value = float(value)
@@ -391,6 +399,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             A_l=w.A_l,
             A_u=w.A_u,
             omega_T=HZ * inner.omega_T_hz[0],
+            disturbance=disturbance_of(case.controller, w),
         ),
         inner=InnerProblem(
             S_max=inner.S_max,
@@ -407,6 +416,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         sections=sections_problem(
             case.controller, case.loop, case.robust, inner, _option_sets(case)
         ),
+        budget=error_budget(case.budget),
     )
     try:
         plants = [plant_of(problem)]

@@ -98,6 +98,12 @@ def files(value: Any) -> str | None:
     return None if good else f"is {shown(value)}; give a list of file names in quotes"
 
 
+def tables(value: Any) -> str | None:
+    several = value if isinstance(value, list | tuple) else [value]
+    good = all(isinstance(item, Mapping) for item in several)
+    return None if good else f"is {shown(value)}; write a table, or several in double brackets"
+
+
 def rows(width: int) -> Check:
     """A list of rows of `width` finite numbers."""
 

@@ -6,7 +6,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.sections import ControllerSection, InnerSection, LoopSection, RobustSection
+from ccd_casadi.budget import Kind
+from ccd_casadi.cases.sections import (
+    ControllerSection,
+    InnerSection,
+    LoopSection,
+    RobustSection,
+    WeightsSection,
+)
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.sections_problem import (
@@ -16,15 +23,18 @@ from ccd_casadi.inner_problem.sections_problem import (
 )
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.units import HZ
 
 SHAPE = 1.1  # of sections, where the case gives none
+DISTURBANCE = 10.0  # W_d over M_K, where the case gives none
 MOST_PLANTS = 24  # option sets
+WITH_DISTURBANCE = "h_infinity_disturbance"
 # Keys that only one kind looks at, by section.
 _OF_SECTIONS = {
     "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
     "robust": ("mode_shift", "gain", "plants"),
-    "inner": ("shape", "compliance_max"),
+    "inner": ("shape", "compliance_max", "minimise", "bandwidth_least_hz"),
 }
 _OF_H_INFINITY = {
     "robust": ("shifts", "design_at"),
@@ -42,6 +52,9 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
         else (_OF_SECTIONS, 'has an effect with controller.structure = "sections" only; drop it, '
               "or choose that structure")
     )  # fmt: skip
+    if controller.structure != WITH_DISTURBANCE and sections["weights"].disturbance is not None:
+        words = f'has an effect with controller.structure = "{WITH_DISTURBANCE}" only; drop it, '
+        raise fail("weights.disturbance", words + "or choose that structure")
     for name, keys in other.items():
         table = sections[name]
         for item in fields(table):
@@ -49,6 +62,14 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
                 raise fail(f"{name}.{item.name}", remedy)
     if not structured:
         return
+    inner, budget = sections["inner"], sections["budget"]
+    of_error = inner.minimise == "rms_error"
+    if of_error and not any(getattr(budget, kind.value) for kind in Kind):
+        words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
+        raise fail("inner.minimise", f"{words} or another")
+    if inner.bandwidth_least_hz is not None and not of_error:
+        words = 'has an effect with inner.minimise = "rms_error" only; drop it'
+        raise fail("inner.bandwidth_least_hz", words)
     if loop.delay_us and loop.rate_hz is None:
         words = "a delay needs a sampled loop, whose poles decide its stability; give loop.rate_hz"
         raise fail("loop.delay_us", words)
@@ -67,6 +88,13 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
             raise fail(f"controller.channel.{name}.inputs", "has no outputs beside it; add them")
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
+
+
+def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> float:
+    """W_d in force over displacement; 0 where the kind has none."""
+    if controller.structure != WITH_DISTURBANCE:
+        return 0.0
+    return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
 
 
 def read_options(path: Path) -> dict[str, Any]:
@@ -94,6 +122,9 @@ def require_channels(plants: Sequence[Plant], sections: SectionsProblem) -> None
             raise PlantError(
                 f'{words} many of one as of the other: leave some out, or "h_infinity"'
             )
+        if p > 1 and sections.minimise == "rms_error":
+            words = 'has several outputs; inner.minimise = "rms_error" is for one: drop it'
+            raise PlantError(words)
         if not sections.channels:
             continue
         given = sections.channels[0].outputs is not None
@@ -142,6 +173,8 @@ def sections_problem(
             options,
         ),
         starts=controller.starts,
+        minimise=inner.minimise,
+        bandwidth_least=HZ * (inner.bandwidth_least_hz or 0.0),
         channels=_channels(controller),
     )
 

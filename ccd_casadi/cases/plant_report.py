@@ -47,11 +47,27 @@ def plant_report(
                 plant.constraint_names, constraint_values(plant, problem.start), strict=True
             )
         ],
+        "budget": _sources(problem),
         "findings": [
             {"severity": f.severity.value, "topic": f.topic.value, "words": f.words}
             for f in first_seen(findings)
         ],
     }
+
+
+def _sources(problem: CoDesignProblem) -> list[dict[str, Any]]:
+    """What moves the stage, each by the RMS of its spectrum; None where it is white."""
+    if problem.budget is None:
+        return []
+    return [
+        {
+            "name": source.name,
+            "kind": source.kind.value,
+            "rms": source.spectrum.rms(),
+            "unit": source.unit,
+        }
+        for source in problem.budget.sources
+    ]
 
 
 def _ranges(facts: Sequence[PlantFacts]) -> list[list[float]]:

@@ -25,6 +25,7 @@ from ccd_casadi.cases.checks import (
     points,
     steps,
     table,
+    tables,
 )
 
 
@@ -64,7 +65,11 @@ class ObjectiveSection:
 
 @dataclass(frozen=True)
 class WeightsSection:
-    """[weights] of the paper's Table 1; M_K in force over displacement."""
+    """[weights] of the paper's Table 1; M_K in force over displacement.
+
+    `disturbance` W_d, of the same unit, with "h_infinity_disturbance": so much force weighs as
+    much as a reference of one unit of length. Default: ten times M_K.
+    """
 
     M_S: float = _key(POSITIVE)
     A_S: float = _key(FRACTION)
@@ -73,11 +78,16 @@ class WeightsSection:
     M_K: float = _key(POSITIVE)
     A_l: float = _key(POSITIVE)
     A_u: float = _key(FRACTION)
+    disturbance: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)
 class InnerSection:
-    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched."""
+    """[inner]: constraints on S, the box of the weights' frequencies, and how it is searched.
+
+    With sections: `minimise` what, "bandwidth" (its negative) or the "rms_error" of [budget], that
+    at a bandwidth of `bandwidth_least_hz` or more.
+    """
 
     S_max: float = _key(
         number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral")
@@ -93,6 +103,8 @@ class InnerSection:
     method: str = _key(choice("search", "sweep"), "search")
     shape: float | None = _key(number(1.0, 10.0, "give 1 to 10", closed=True), None)
     compliance_max: float | None = _key(POSITIVE, None)
+    minimise: str = _key(choice("bandwidth", "rms_error"), "bandwidth")
+    bandwidth_least_hz: float | None = _key(POSITIVE, None)
 
 
 @dataclass(frozen=True)
@@ -152,14 +164,15 @@ class ChannelSection:
 
 @dataclass(frozen=True)
 class ControllerSection:
-    """[controller]: "h_infinity", of full order by mixed sensitivity, or "sections".
+    """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
+    of full order with an input disturbance beside the reference, or "sections".
 
     The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
     of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
     The search starts at `starts` places. `channel` overrides the structure of single channels.
     """
 
-    structure: str = _key(choice("h_infinity", "sections"), "h_infinity")
+    structure: str = _key(choice("h_infinity", "h_infinity_disturbance", "sections"), "h_infinity")
     integrator: bool = _key(flag, True)
     lead: int = _key(count(0), 1)
     biquads: int = _key(count(0), 2)
@@ -178,6 +191,20 @@ class LoopSection:
 
     rate_hz: float | None = _key(POSITIVE, None)
     delay_us: float = _key(number(0.0, 1e6, "give 0 to 1e6", closed=True), 0.0)
+
+
+@dataclass(frozen=True)
+class BudgetSection:
+    """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
+
+    Each kind is one table or several of them; their keys are checked in `budget`.
+    """
+
+    window_ms: float | None = _key(POSITIVE, None)
+    force: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    floor_motion: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    sensor_noise: tuple[Mapping[str, Any], ...] = _key(tables, ())
+    setpoint: tuple[Mapping[str, Any], ...] = _key(tables, ())
 
 
 @dataclass(frozen=True)
@@ -244,6 +271,7 @@ class Case:
     robust: RobustSection
     controller: ControllerSection
     loop: LoopSection
+    budget: BudgetSection
     sampling: SamplingSection
     outer: OuterSection
     baseline: BaselineSection
@@ -258,6 +286,7 @@ SECTIONS: dict[str, type] = {
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,
+    "budget": BudgetSection,
     "sampling": SamplingSection,
     "outer": OuterSection,
     "baseline": BaselineSection,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.box_look import BoxLook
+from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.outer_problem import OuterSolution
@@ -132,6 +133,7 @@ def result_dict(
         "versions": versions(),
     }
     result["surrogate_quality"] = quality_dict(quality)
+    result |= budget_entry(problem, verified.theta, verified.design.controller)
     return clean(result)
 
 

@@ -36,6 +36,7 @@ from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_qualit
 from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -215,6 +216,9 @@ def _of_sections(
     """A co-design with a controller of fixed structure."""
     if given is not None:
         raise UserError("--surrogate: starts no solve with sections; solve the case without it")
+    if sections_of_problem(sampler.problem).minimise != "bandwidth":
+        words = "is for the command inner so far: J of the outer problem counts the bandwidth"
+        raise UserError(f'inner.minimise = "rms_error" {words}; drop it, and solve')
     began, name = perf_counter(), type(formulation).__name__.lower()
     found = run_sections(sampler, formulation, seed)
     return solution_of_sections(

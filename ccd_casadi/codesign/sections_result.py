@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, FullOrder
 from ccd_casadi.codesign.result import (
@@ -198,6 +199,8 @@ def sections_result(
         "seed": seed,
         "versions": versions(),
     }
+    assert made.controller is not None
+    result |= budget_entry(verified.problem, verified.theta, made.controller)
     return clean(result)
 
 

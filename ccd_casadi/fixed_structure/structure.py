@@ -227,8 +227,11 @@ def state_space(structure: Structure, kappa: Array) -> StateSpace:
 
 
 def state_spaces(structure: Structure, kappa: Array) -> tuple[Array, Array, Array, Array]:
-    """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D."""
-    kappa = np.asarray(kappa, float)
+    """The cascades of many parameters κ (N, n): A (N, o, o), B (N, o, 1), C (N, 1, o), D.
+
+    Analytic in κ, which may be complex: a step along the imaginary axis gives derivatives.
+    """
+    kappa = np.asarray(kappa)
     values, at, count = np.exp(kappa).T, 1, len(kappa)
     A, B, C = np.zeros((count, 0, 0)), np.zeros((count, 0, 1)), np.zeros((count, 1, 0))
     D = values[0][:, None, None] * np.ones((count, 1, 1))
@@ -239,7 +242,7 @@ def state_spaces(structure: Structure, kappa: Array) -> tuple[Array, Array, Arra
         k, n = len(b), A.shape[1]
         a_, b_ = _stack(a, count, (k, k)), _stack([[x] for x in b], count, (k, 1))
         c_, d_ = _stack([c], count, (1, k)), _stack([[d]], count, (1, 1))
-        joint = np.zeros((count, n + k, n + k))
+        joint = np.zeros((count, n + k, n + k), values.dtype)
         joint[:, :n, :n], joint[:, n:, n:], joint[:, n:, :n] = A, a_, b_ @ C
         A, B = joint, np.concatenate([B, b_ @ D], axis=1)
         C, D = np.concatenate([d_ @ C, c_], axis=2), d_ @ D
@@ -267,7 +270,7 @@ def state_spaces(structure: Structure, kappa: Array) -> tuple[Array, Array, Arra
 
 
 def _stack(entries: list, count: int, shape: tuple[int, int]) -> Array:
-    out = np.zeros((count, *shape))
+    out = np.zeros((count, *shape), np.result_type(*(x for row in entries for x in row)))
     for i in range(shape[0]):
         for j in range(shape[1]):
             out[:, i, j] = entries[i][j]

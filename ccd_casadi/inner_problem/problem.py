@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
@@ -129,6 +130,7 @@ class CoDesignProblem:
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
     robust: RobustSet | None = None
     sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
+    budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -136,6 +138,7 @@ class CoDesignProblem:
         S_max, S_low, bounds and the objective are not in it: the samples answer any of them.
         """
         w, robust = self.weights, self.robust
+        with_disturbance = (w.disturbance,) if w.disturbance else ()
         perturbed = {} if robust is None else {"robust": vars(robust)}
         if self.sections is not None:
             perturbed["sections"] = self.sections.identity() | {"omega_T": w.omega_T}
@@ -144,7 +147,7 @@ class CoDesignProblem:
             "plant": self.source.identity(),
             "theta": list(self.names),
             "suspension": [self.suspension.frequency_hz, self.suspension.damping_ratio],
-            "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u],
+            "weights": [w.M_S, w.A_S, w.c_K, w.omega_K, w.M_K, w.A_l, w.A_u, *with_disturbance],
             "omega_low": self.inner.omega_low,
             "gamma_backoff": self.inner.gamma_backoff,
             **perturbed,

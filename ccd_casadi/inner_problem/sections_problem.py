@@ -51,8 +51,10 @@ class SectionsProblem:
     `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
     before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
-    θ; None: by the plant at the start. `channels` of a plant with several outputs; where the case
-    names none they are found, with `structure` for each.
+    θ; None: by the plant at the start. `minimise` "rms_error": at a θ the search goes on from there
+    to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more.
+    `channels` of a plant with several outputs; where the case names none they are found, with
+    `structure` for each.
     """
 
     structure: Structure = field(default_factory=Structure)
@@ -66,6 +68,8 @@ class SectionsProblem:
     frequencies: tuple[float, float] | None = None
     anchors: tuple[tuple[float, ...], ...] = ()
     members: tuple[Member, ...] = ()
+    minimise: str = "bandwidth"
+    bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
 
     def identity(self) -> dict[str, Any]:

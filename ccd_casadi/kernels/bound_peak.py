@@ -43,25 +43,37 @@ def _bound_slope(A, B, C, w, ω):
     M, right, σ, u, v = _least_direction(A, B, C, ω)
     dG = -1j * (C @ np.linalg.solve(M, right))
     dσ = np.vdot(u, dG @ v).real
-    M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
     W1, W2, W3 = squared_weights(w, ω)
-    # |W|² = (a ω² + b)/(c ω² + d) has the slope 2ω (a - c |W|²)/(c ω² + d)
-    d1 = 2.0 * ω * (1.0 / M_S**2 - W1) / (ω**2 + (ω_S * A_S) ** 2)
-    d2 = 2.0 * ω * (c_K**2 - W2) / (ω**2 + (c_K * ω_K) ** 2)
-    d3 = 2.0 * ω * (1.0 - A_u**2 * W3) / ((A_u * ω) ** 2 + ω_T**2)
+    d1, d2, d3 = squared_weight_rates(w, ω)
     R = W2 / σ**2 + W3
     dR = d2 / σ**2 - 2.0 * W2 * dσ / σ**3 + d3
     return (R / (W1 + R)) ** 2 * d1 + (W1 / (W1 + R)) ** 2 * dR
 
 
+def squared_weight_rates(w, ω):
+    """d|W|²/dω of W1, W2, W3: (a ω² + b)/(c ω² + d) has the slope 2ω (a - c|W|²)/(c ω² + d)."""
+    M_S, A_S, ω_S, c_K, ω_K, _, A_u, ω_T = w
+    W1, W2, W3 = squared_weights(w, ω)
+    return (
+        2.0 * ω * (1.0 / M_S**2 - W1) / (ω**2 + (ω_S * A_S) ** 2),
+        2.0 * ω * (c_K**2 - W2) / (ω**2 + (c_K * ω_K) ** 2),
+        2.0 * ω * (1.0 - A_u**2 * W3) / ((A_u * ω) ** 2 + ω_T**2),
+    )
+
+
 def bound_peak(A, B, C, w, start):
     """The maximiser next to `start`; `start` itself where the slope has no root within 1 %."""
-    a, fa = start, _bound_slope(A, B, C, w, start)
+    return slope_root(lambda ω: _bound_slope(A, B, C, w, ω), start)
+
+
+def slope_root(slope, start):
+    """The root of a maximum's slope next to `start`, `start` itself where there is none near."""
+    a, fa = start, slope(start)
     step = 1e-7 if fa > 0.0 else -1e-7
     b, fb = a, fa
     for _ in range(12):
         b = start * (1.0 + step)
-        fb = _bound_slope(A, B, C, w, b)
+        fb = slope(b)
         if fa * fb <= 0.0:
             break
         a, fa = b, fb
@@ -72,7 +84,7 @@ def bound_peak(A, B, C, w, start):
     for _ in range(80):
         # Illinois false position
         x = (a * fb - b * fa) / (fb - fa)
-        fx = _bound_slope(A, B, C, w, x)
+        fx = slope(x)
         if fx == 0.0 or abs(b - a) <= 1e-15 * abs(b):
             break
         if fx * fb < 0.0:

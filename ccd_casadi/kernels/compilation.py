@@ -69,6 +69,7 @@ def compile_part(part: str) -> None:
         sensitivity.sensitivity_gain(G, G, none, 1.0)
         frequency.response(G, 1.0)
         gamma.gamma_lower_bound(G, w, grid, np.ones(41))
+        squared_weights(w, grid)
         sensitivity.axis_frequencies(A, B, C, none, 1.0)
 
 

@@ -8,6 +8,11 @@ from ccd_casadi.kernels.blocks import all_finite, ascending, place
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop
 from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.disturbance_certificate import (
+    four_block_level_test,
+    four_block_loop,
+    four_block_norm,
+)
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.generalized_plant import generalized_plant
@@ -92,13 +97,56 @@ def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
 # compiled kernels together: 2 % slower in Python, and half the time to compile.
 
 
-def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=()):
+def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
+    """Certify a controller against `gamma` and fill in its figures, δ = 0 or the four blocks.
+
+    As `assess`; with δ > 0 the norm is that of [W1 I; W2 K; W3 K] S [I δG].
+    """
+    if delta == 0.0:
+        assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row)
+    else:
+        row[_CODE] = _four_block_code(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+
+
+def _four_block_code(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
+    """How it ended; the figures reached are filled in."""
+    row[Figure.GAMMA] = gamma
+    if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
+        return Code.NOT_FINITE
+    As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
+    wr, wi, info = eigenvalues(As)
+    row[Figure.MAX_REAL_POLE] = wr.max()
+    if info != 0:
+        return Code.EIGENVALUES_FAILED
+    if not wr.max() < 0.0:
+        return Code.UNSTABLE_LOOP
+    G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
+    norm, at = four_block_norm(G, K, Dk, w, delta, certificate_grid(wr, wi))
+    row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
+    if not norm <= gamma:
+        return Code.NORM_EXCEEDED
+    loop = four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
+    if not four_block_level_test(G, K, Dk, w, delta, loop, gamma):
+        return Code.LEVEL_TEST_FAILED
+    row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
+    row[Figure.PEAK], row[Figure.PEAK_FREQUENCY], confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
+    if not confirmed:
+        return Code.PEAK_NOT_CONFIRMED
+    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, As, Bs, Cs)
+    if info != 0:
+        return Code.EIGENVALUES_FAILED
+    return Code.CERTIFIED if np.isfinite(row[Figure.BANDWIDTH]) else Code.NO_BANDWIDTH
+
+
+def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0):
     """Synthesise at backoff·γ_opt, certify and measure. Returns the row, A_K, B_K, C_K.
 
     With `channels` the synthesis is done on these blocks; the certificate is the whole loop's.
-    What fails is tried once more in balanced coordinates, whole, and then counts if it passes.
+    δ > 0 makes it the four-block problem of `disturbance`, which is solved whole. What fails is
+    tried once more in balanced coordinates, whole, and then counts if it passes.
     """
-    plant = (A, B, C, w)
+    plant = (A, B, C, w, delta)
+    channels = () if delta else channels
     numbers = (grid, sigma, backoff, guess)
     first = _attempt(plant, numbers, omega_low, channels, balanced=False)
     if first[0][_CODE] in _PASSED:
@@ -111,17 +159,18 @@ _PASSED = (Code.CERTIFIED, Code.NO_BANDWIDTH)  # the certificate holds; no cross
 
 
 def _attempt(plant, numbers, omega_low, channels, balanced):
-    A, B, C, w = plant
+    A, B, C, w, delta = plant
     grid, sigma, backoff, guess = numbers
     try:
         if channels:
             row, Ak, Bk, Ck = _synthesise_channels(A, B, C, w, channels, backoff, guess)
         else:
-            row, Ak, Bk, Ck = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced)
+            row, Ak, Bk, Ck = synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta)
         row[_BALANCED] = balanced
         if row[_CODE] == 0.0:
             Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-            assess(A, B, C, Ak, Bk, Ck, Dk, w, backoff * row[_GAMMA_OPT], omega_low, row)
+            gamma = backoff * row[_GAMMA_OPT]
+            judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
     except np.linalg.LinAlgError:  # an infinite or undefined number on the way
         none = np.full((1, 1), nan)
         return failed_row(), none, none, none
@@ -167,7 +216,7 @@ def _synthesise_channels(A, B, C, w, channels, backoff, guess):
     return row, Ag + B2 @ F - B1 @ C2, B1, F
 
 
-def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=()):
+def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channels=(), delta=0.0):
     """Rows (n_S, n_T, figures) over the frequencies of W1 and W3, each warm-started.
 
     Boustrophedon order: γ_opt is guessed from the certified neighbours already done.
@@ -183,7 +232,8 @@ def sweep(A, B, C, w, omega_S, omega_T, grid, sigma, backoff, omega_low, channel
             i = step if side == 1 else omega_S.size - 1 - step
             weights[2] = omega_S[i]
             guess = _guess(found, x, y, i, j, side, step)
-            row = design(A, B, C, weights, grid, sigma, backoff, omega_low, guess, channels)[0]
+            numbers = (grid, sigma, backoff, omega_low, guess, channels, delta)
+            row = design(A, B, C, weights, *numbers)[0]
             rows[i, j] = row
             found[i, j] = log(row[_GAMMA_OPT]) if row[_CODE] == 0.0 else nan
     return rows

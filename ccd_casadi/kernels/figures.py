@@ -16,6 +16,7 @@ class Code(IntEnum):
     NO_BANDWIDTH = 7
     EIGENVALUES_FAILED = 8
     PEAK_NOT_CONFIRMED = 9
+    FILTER_FAILED = 10
 
 
 class Figure(IntEnum):

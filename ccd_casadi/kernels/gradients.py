@@ -14,7 +14,8 @@ in one unit of time and force. dK goes back through the Riccati equation of P_d:
 gradient to X, one adjoint Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F
 gives the gradient to every matrix at once, however many parameters there are. γ_opt, where X is
 infinite, has the same equation in the basis [U1; U2] of the stable subspace: only
-f = λ_min(X⁻¹) and its null vector q appear, T11 Λ + Λ T11ᵀ + qqᵀ = 0.
+f = λ_min(X⁻¹) and its null vector q appear, T11 Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0 the filter's
+solution stands in B1 and has an adjoint Lyapunov equation of its own (`disturbance_pullback`).
 
 Plain NumPy: a point is differentiated once, and compiled this took a third of the set-up.
 """
@@ -27,12 +28,19 @@ import numpy as np
 
 from ccd_casadi.kernels.bound_peak import bound_peak
 from ccd_casadi.kernels.design import design
+from ccd_casadi.kernels.disturbance import (
+    disturbance_bound,
+    disturbance_bound_gradient,
+    filter_solution,
+    innovations_plant,
+)
+from ccd_casadi.kernels.disturbance_pullback import FourBlockPullback
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
-from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
+from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.pullback import bound_gradient, gain_to_weights, to_plant, to_weights
+from ccd_casadi.kernels.pullback import MixedPullback, PlantGradients, bound_gradient
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
 from ccd_casadi.support.arrays import Array
 
@@ -50,7 +58,7 @@ class Loop(NamedTuple):
 
 
 class DesignPlant(NamedTuple):
-    """The plant that a controller is made for, its derivatives to θ, scaled weights, γ/γ_opt."""
+    """The plant that a controller is made for, its derivatives to θ, scaled weights, γ/γ_opt, δ."""
 
     A: Array
     B: Array
@@ -60,6 +68,7 @@ class DesignPlant(NamedTuple):
     dC: Array
     w: Array
     backoff: float
+    delta: float = 0.0
 
 
 def _transposed(M):
@@ -67,7 +76,7 @@ def _transposed(M):
 
 
 def _riccati_terms(T11, U1, U2, L, gp, t):
-    """Gradients of tr(Λ E) to A, B2, C1 and γ², E the Riccati's differential in the basis of U.
+    """Gradients of tr(Λ E) to the generalized plant and γ², E the differential in the basis of U.
 
     E is the stationary value of 2 pᵀẋ + zᵀz - γ² wᵀw over u and the disturbance w, so that only
     what stands in ẋ and z counts. The gradients to A and C1 are p xᵀ and z xᵀ summed over Λ; with
@@ -82,25 +91,23 @@ def _riccati_terms(T11, U1, U2, L, gp, t):
     Z[p : p + m] += d2 * F
     states, rates = U1.T, (U1 @ T11).T
     costate, output = 2.0 * (U2 @ L), 2.0 * (Z @ L)
-    A_, A_rate, B2_ = costate @ states, costate @ rates, costate @ F.T
-    return A_, A_rate, B2_, output @ states, output @ rates, -(V * (V @ L)).sum((1, 2))
+    of_plant = PlantGradients(
+        costate @ states, costate @ rates, costate @ V.T, costate @ F.T, output @ states,
+        output @ rates, np.zeros((len(L), p, len(states))),
+    )  # fmt: skip
+    return of_plant, -(V * (V @ L)).sum((1, 2))
 
 
-def gamma_gradient(A, B, C, w, gp, H0, f, gamma_opt, limited, bound_frequency):
-    """Gradients of γ_opt to A, B, C and w; and whether the Hamiltonian splits at γ_opt."""
-    if limited:
-        return *bound_gradient(A, B, C, w, bound_frequency), True
+def gamma_gradient(gp, H0, back, gamma_opt):
+    """Gradients of γ_opt = γ_X to A, B, C and the weights; whether the Hamiltonian splits there."""
     _, B1, _, C1, _, d1, _ = gp
-    n, m, p = A.shape[0], B.shape[1], C.shape[0]
     t = gamma_opt**2 - d1**2
     _, _, ok, (_, T11, U1, U2, _, _, q, _, _) = riccati_level(H0, B1, C1, d1, t, NOISE)
     Lq = lyapunov_triangular(T11, -np.outer(q, q), False)
-    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lq[None], gp, t)
-    A_, B_, C_ = to_plant(Ar, B2r, C1r, np.zeros((1, p, B1.shape[0])), f, C, m)
-    w_ = to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
+    terms, level = _riccati_terms(T11, U1, U2, Lq[None], gp, t)
     # γ moves so that f stays zero
     scale = -1.0 / (level[0] * 2.0 * gamma_opt)
-    return scale * A_[0], scale * B_[0], scale * C_[0], scale * w_[0], ok
+    return *(scale * part[0] for part in back.to_plant_and_weights(terms)), ok
 
 
 def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
@@ -122,32 +129,33 @@ def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
     lK, rK = np.linalg.solve(_transposed(Mk), Ck.T @ aG), KB @ b
     # dG/dω = -j C M⁻² B, dK/dω likewise
     slope = (1j * ((lG * rG).sum((1, 2)) + (lK * rK).sum((1, 2)))).real
-    return a, Kb, aG, lG, rG, lK, rK, slope, s[:, 0], gap
+    return a, b, Kb, aG, lG, rG, lK, rK, slope, s[:, 0], gap
 
 
-def loop_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
-    """Gradients (k, n_θ + 8) of σ_max(S(jω)) of each loop, to θ and to w, with what belongs to it.
+def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
+    """Gradients (k, n_θ + n_w) of σ_max(S(jω)) of each loop, to θ and the weights.
 
-    `gamma_slope` (n_θ + 8) is the gradient of γ_opt. Returns besides, one a loop, the gradient
+    `gamma_slope` (n_θ + n_w) is the gradient of γ_opt. Returns besides, one a loop, the gradient
     to θ with K held, the slopes dσ/dω, σ, the relative gaps (σ1 - σ2)/σ1; and whether the
     Hamiltonian splits.
     """
-    A, B, C, dA, dB, dC, w, backoff = design_plant
-    n, m, p, count = A.shape[0], B.shape[1], C.shape[0], dA.shape[0]
+    _, B, C, dA, dB, dC, _, backoff, _ = design_plant
+    m, p, count = B.shape[1], C.shape[0], dA.shape[0]
+    gp, H0, back = posed
     Ag, B1, B2, C1, C2, d1, d2 = gp
     gamma = backoff * gamma_opt
     t = gamma**2 - d1**2
     T11, U1, U2, _, ok = stable_subspace(level_hamiltonian(H0, B1, C1, d1, t))
     if not ok:
-        none = np.full((len(loops), count + 8), nan)
-        return none, none[:, 8:], none[:, 0], none[:, 0], none[:, 0], False
+        none = np.full((len(loops), gamma_slope.size), nan)
+        return none, none[:, :count], none[:, 0], none[:, 0], none[:, 0], False
     inverse = np.linalg.inv(U1)
     X = U2 @ inverse
     X = 0.5 * (X + X.T)
     F = -(B2.T @ X + d2 * C1[p : p + m]) / d2**2
     plants = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
     ω = np.array([loop.omega for loop in loops])
-    a, Kb, aG, lG, rG, lK, rK, slopes, gains, gaps = _gain_cotangents(
+    a, b, Kb, aG, lG, rG, lK, rK, slopes, gains, gaps = _gain_cotangents(
         *plants, Ag + B2 @ F - B1 @ C2, B1, F, ω
     )
     direct = -_outer(lG, rG), -_outer(lG, Kb), -_outer(a, rG)
@@ -157,19 +165,20 @@ def loop_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
     X_ = 0.5 * (X_ + _transposed(X_))
     right = -(inverse @ X_) @ inverse.T
     Lh = np.array([lyapunov_triangular(T11, part, False) for part in right])
-    Ar, Ar_rate, B2r, C1r, C1r_rate, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
+    terms, level = _riccati_terms(T11, U1, U2, Lh, gp, t)
     rate = 1j * ω[:, None, None] * rK
-    Ar -= _outer(lK, rK)
-    Ar_rate -= _outer(lK, rate)
-    B2r += _outer(XrK, h) / d2**2 - _outer(lK, F @ rK)
-    C2r = _outer(B1.T @ lK, rK)
-    through = to_plant(Ar, B2r, C1r, C2r, f, C, m)
+    through_K = terms._replace(
+        A=terms.A - _outer(lK, rK),
+        A_rate=terms.A_rate - _outer(lK, rate),
+        B1=terms.B1 - _outer(lK, b - C2 @ rK),
+        B2=terms.B2 + _outer(XrK, h) / d2**2 - _outer(lK, F @ rK),
+        C2=_outer(B1.T @ lK, rK),
+    )
+    *through, w_ = back.to_plant_and_weights(through_K)
     held = _contract(direct, [(loop.dA, loop.dB, loop.dC) for loop in loops])
     out = (2.0 * gamma * backoff * level)[:, None] * gamma_slope
     out[:, :count] += held + _contract(through, [(dA, dB, dC)])
-    out[:, count:] += to_weights(Ar, Ar_rate, C1r, C1r_rate, f, w, n, p, m)
-    of_W2 = slice(n + p, n + p + m)  # its states
-    out[:, count:] += gain_to_weights(h, rK[:, of_W2], XrK[:, of_W2], rate[:, of_W2], f, w)
+    out[:, count:] += w_ + back.gain_to_weights(h, rK, XrK, rate)
     return out, held, slopes, gains, gaps, True
 
 
@@ -191,15 +200,15 @@ def _contract(cotangents, changes):
     return np.array([change @ row for row, change in zip(rows, flat, strict=True)])
 
 
-def figure_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
+def figure_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
     """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
 
-    The first (4, n_θ + 8), to θ and to the weights; `loops` are where ω_b, the peak and ω_low
+    The first (4, n_θ + n_w), to θ and to the weights; `loops` are where ω_b, the peak and ω_low
     are taken. The fixed-K gradient (n_θ) is the paper's. With them whether the Hamiltonian
     splits; everything is NaN where it does not.
     """
     found, held, slopes, gains, gaps, ok = loop_gradients(
-        design_plant, gp, H0, f, gamma_opt, gamma_slope, loops
+        design_plant, posed, gamma_opt, gamma_slope, loops
     )
     # ω_b by the implicit function theorem; the peak's own frequency drops out (envelope)
     scale = np.array([-slopes[0], gains[1], gains[2]])
@@ -208,37 +217,38 @@ def figure_gradients(design_plant, gp, H0, f, gamma_opt, gamma_slope, loops):
 
 
 def design_with_gradients(
-    A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC, channels=()
+    A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC, channels=(), delta=0.0
 ):
     """A design, and the gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt).
 
-    Returns the row, A_K, B_K, C_K, G (4, n_θ + 8): derivatives to θ then to the scaled weight
-    vector; fixed (n_θ): the paper's dω_b/dθ with K held; gaps (3) of σ_max at the frequencies.
-    The gradients are NaN where the design is not certified, and where it needed balanced
-    coordinates: they are taken in the plant's own.
+    Returns the row, A_K, B_K, C_K, G (4, n_θ + n_w): derivatives to θ then to the scaled weight
+    vector, with δ behind it where δ > 0; fixed (n_θ): the paper's dω_b/dθ with K held; gaps (3) of
+    σ_max at the frequencies. The gradients are NaN where the design is not certified, and where it
+    needed balanced coordinates: they are taken in the plant's own.
     """
-    row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels)
-    count = dA.shape[0]
-    none = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
+    plant = DesignPlant(A, B, C, dA, dB, dC, w, backoff, delta)
+    numbers = (backoff, omega_low, guess)
+    row, Ak, Bk, Ck = design(A, B, C, w, grid, sigma, *numbers, channels, delta)
+    none = _no_gradients(plant)
     if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
         return row, Ak, Bk, Ck, *none
-    limited = bool(row[Figure.LIMITED_BY_BOUND] > 0.5)
     points = row[Figure.BANDWIDTH], row[Figure.PEAK_FREQUENCY], omega_low
-    plant = DesignPlant(A, B, C, dA, dB, dC, w, backoff)
     loops = [Loop(A, B, C, dA, dB, dC, float(point)) for point in points]
     with np.errstate(all="ignore"):  # an undefined number is seen in the result
-        at = 0.0
-        if limited:
-            at = bound_peak(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1])
-        gamma_opt, found = float(row[Figure.GAMMA_OPT]), none
-        parts = _parts(A, B, C, w)
-        *slopes, w_, ok = gamma_gradient(A, B, C, w, *parts, gamma_opt, limited, at)
+        gamma_opt, found, ok = float(row[Figure.GAMMA_OPT]), none, True
+        posed = _posed(plant)
+        if row[Figure.LIMITED_BY_BOUND] > 0.5:
+            *slopes, w_ = _bound_gradient(plant, grid, sigma)
+        else:
+            *slopes, w_, ok = gamma_gradient(*posed, gamma_opt)
         if ok:
             to_theta = _contract([part[None] for part in slopes], [(dA, dB, dC)])[0]
             gamma_slope = np.concatenate([to_theta, w_])
-            *found, ok = figure_gradients(plant, *parts, gamma_opt, gamma_slope, loops)
+            *found, ok = figure_gradients(plant, posed, gamma_opt, gamma_slope, loops)
     if not ok and channels:  # rounding put the blocks' γ_opt below the whole plant's: from that
-        return design_with_gradients(A, B, C, w, grid, sigma, backoff, omega_low, guess, dA, dB, dC)
+        return design_with_gradients(
+            A, B, C, w, grid, sigma, *numbers, dA, dB, dC, delta=delta
+        )  # fmt: skip
     return row, Ak, Bk, Ck, *(found if ok else none)
 
 
@@ -249,35 +259,54 @@ def off_design_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Arr
     `row` is the synthesis on the design plant, `gamma_slope` the gradient of its γ_opt. NaN
     where there are no three loops, or the synthesis has no gradients.
     """
-    count = design_plant.dA.shape[0]
-    none = np.full((4, count + 8), nan), np.full(count, nan), np.full(3, nan)
+    none = _no_gradients(design_plant)
     if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or len(loops) != 3:
         return none
     with np.errstate(all="ignore"):
-        gp, H0, f = _parts(design_plant.A, design_plant.B, design_plant.C, design_plant.w)
-        gamma_opt = float(row[Figure.GAMMA_OPT])
         out, fixed, gaps, ok = figure_gradients(
-            design_plant, gp, H0, f, gamma_opt, gamma_slope, loops
+            design_plant, _posed(design_plant), float(row[Figure.GAMMA_OPT]), gamma_slope, loops
         )
     return (out, fixed, gaps) if ok else none
 
 
 def peak_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Array,
                    loops: Sequence[Loop]) -> Array:  # fmt: skip
-    """Gradients (k, n_θ + 8) of ln σ_max(S(jω)) at local maxima over ω; NaN where there are none.
+    """Gradients (k, n_θ + n_w) of ln σ_max(S(jω)) at local maxima over ω; NaN where there are none.
 
     The frequency of a maximum drops out (envelope). `row` and `gamma_slope` as above.
     """
     with np.errstate(all="ignore"):
-        gp, H0, f = _parts(design_plant.A, design_plant.B, design_plant.C, design_plant.w)
         found, _, _, gains, _, ok = loop_gradients(
-            design_plant, gp, H0, f, float(row[Figure.GAMMA_OPT]), gamma_slope, loops
+            design_plant, _posed(design_plant), float(row[Figure.GAMMA_OPT]), gamma_slope, loops
         )
     return found / gains[:, None] if ok else found
 
 
-def _parts(A, B, C, w):
-    """The generalized plant, its Hamiltonian at γ = ∞ and the weights' state space."""
-    gp = generalized_plant(A, B, C, w)
+def _no_gradients(plant):
+    """NaN in the place of gradients, of the fixed-K gradient and of the gaps."""
+    count = plant.dA.shape[0]
+    total = count + plant.w.size + (plant.delta > 0.0)
+    return np.full((4, total), nan), np.full(count, nan), np.full(3, nan)
+
+
+def _bound_gradient(plant, grid, sigma):
+    """Gradients of γ_jω to A, B, C and the weights, at its peak."""
+    A, B, C, w, delta = plant.A, plant.B, plant.C, plant.w, plant.delta
+    if delta:
+        _, at, least = disturbance_bound(A, B, C, w, delta, grid)
+        *parts, w_, to_delta = disturbance_bound_gradient(A, B, C, w, delta, at, least)
+        return *parts, np.append(w_, to_delta)
+    at = bound_peak(A, B, C, w, gamma_lower_bound(prepare(A, B, C), w, grid, sigma)[1])
+    return bound_gradient(A, B, C, w, at)
+
+
+def _posed(plant):
+    """The generalized plant, its Hamiltonian at γ = ∞, and the way back to plant and weights."""
+    A, B, C, w, delta = plant.A, plant.B, plant.C, plant.w, plant.delta
+    if delta:
+        Y, _ = filter_solution(A, B, C, delta)
+        gp, back = innovations_plant(A, B, C, w, Y), FourBlockPullback(A, B, C, w, Y, delta)
+    else:
+        gp, back = generalized_plant(A, B, C, w), MixedPullback(A, B, C, w)
     H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], C.shape[0], B.shape[1])
-    return gp, H0, first_order_weights(w)
+    return gp, H0, back

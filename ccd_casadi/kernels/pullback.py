@@ -1,8 +1,43 @@
 """Gradients of the generalized plant, and of the bound γ_jω, pulled back to plant and weights."""
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ccd_casadi.kernels.generalized_plant import squared_weights
+from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
+from ccd_casadi.support.arrays import Array
+
+
+class PlantGradients(NamedTuple):
+    """Gradients (k, ...) to the generalized plant's matrices; `rate`: the sums with ẋ for x."""
+
+    A: Array
+    A_rate: Array
+    B1: Array
+    B2: Array
+    C1: Array
+    C1_rate: Array
+    C2: Array
+
+
+class MixedPullback:
+    """From [W1 S; W2 KS; W3 T] back to A, B, C and the weight vector (8,)."""
+
+    def __init__(self, A, B, C, w):
+        self.n, self.m, self.p = A.shape[0], B.shape[1], C.shape[0]
+        self.C, self.w, self.f = C, w, first_order_weights(w)
+
+    def to_plant_and_weights(self, of):
+        """Gradients to A, B, C and the weights, k in front of each."""
+        n, m, p = self.n, self.m, self.p
+        A_, B_, C_ = to_plant(of.A, of.B2, of.C1, of.C2, self.f, self.C, m)
+        w_ = to_weights(of.A, of.A_rate, of.C1, of.C1_rate, self.f, self.w, n, p, m)
+        return A_, B_, C_, w_
+
+    def gain_to_weights(self, h, x, costate, rate):
+        """As the function of this name; x, costate and rate of the controller's whole state."""
+        of_W2 = slice(self.n + self.p, self.n + self.p + self.m)
+        return gain_to_weights(h, x[:, of_W2], costate[:, of_W2], rate[:, of_W2], self.f, self.w)
 
 
 def to_plant(A_, B2_, C1_, C2_, f, C, m):

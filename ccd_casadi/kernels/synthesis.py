@@ -6,6 +6,11 @@ from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
 from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
 from ccd_casadi.kernels.bound_peak import bound_error
 from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.disturbance import (
+    disturbance_bound,
+    filter_solution,
+    innovations_plant,
+)
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma
@@ -69,27 +74,55 @@ def _synthesise(A, B, C, w, grid, sigma, backoff, guess):
 # What follows is plain NumPy: few designs come to it.
 
 
-def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced):
+def synthesise(A, B, C, w, grid, sigma, backoff, guess, balanced, delta=0.0):
     """γ_opt and the central controller at backoff·γ_opt. Returns the row, A_K, B_K, C_K.
 
     The row's code is CERTIFIED where the controller may go on to be assessed. `balanced` solves
     in balanced coordinates, with the noise of rounding measured; the controller is in the
-    plant's own ones always.
+    plant's own ones always. δ > 0 is the four-block problem of `disturbance`.
     """
+    posed = None
+    if balanced or delta:
+        posed = _posed(A, B, C, w, grid, sigma, delta)
+        if posed is None:
+            row = np.full(_COUNT, np.nan)
+            row[Figure.CODE], row[Figure.LIMITED_BY_BOUND] = float(Code.FILTER_FAILED), 0.0
+            none = np.full((1, 1), np.nan)
+            return row, none, none, none
     if balanced:
-        gp, H0, bound, at, τ = _balanced(A, B, C, w, grid, sigma)
+        gp, bound, at = posed
+        gp, H0, τ = _balanced(gp, bound)
         with np.errstate(all="ignore"):  # an undefined number is seen in the result
             noise = rounding_noise(H0)
             row, *K = _search_and_control(gp, H0, bound, backoff, guess, noise)
             K = _in_own_coordinates(*K, τ)
     else:
-        row, *K, at = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
+        if delta:
+            gp, bound, at = posed
+            row, *K = _search_and_control(gp, _hamiltonian(gp), bound, backoff, guess, NOISE)
+        else:
+            row, *K, at = _synthesise(A, B, C, w, grid, sigma, backoff, guess)
         closed = row[Figure.CODE] != Code.GAMMA_NOT_CONVERGED
         if closed and ENOUGH < row[Figure.GAMMA_ERROR] < np.inf:
-            row, *K = _with_a_better_optimum(row, K, A, B, C, w, grid, sigma, backoff)
-    if row[Figure.LIMITED_BY_BOUND]:
+            gp, bound, _ = posed or _posed(A, B, C, w, grid, sigma, delta)
+            row, *K = _with_a_better_optimum(row, K, gp, bound, backoff)
+    if row[Figure.LIMITED_BY_BOUND] and not delta:
         row[Figure.GAMMA_ERROR] += bound_error(A, B, C, w, at)
     return row, *K
+
+
+def _posed(A, B, C, w, grid, sigma, delta):
+    """The generalized plant, γ_jω and where it is; None where the filter has no solution."""
+    if delta == 0.0:
+        return generalized_plant(A, B, C, w), *gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+    Y, ok = filter_solution(A, B, C, delta)
+    if not ok:
+        return None
+    return innovations_plant(A, B, C, w, Y), *disturbance_bound(A, B, C, w, delta, grid)[:2]
+
+
+def _hamiltonian(gp):
+    return lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], gp[4].shape[0], gp[2].shape[1])
 
 
 def _in_own_coordinates(Ak, Bk, Ck, τ):
@@ -98,22 +131,18 @@ def _in_own_coordinates(Ak, Bk, Ck, τ):
     return Ak * (back / τ), Bk * back, Ck / τ
 
 
-def _balanced(A, B, C, w, grid, sigma):
-    """The generalized plant and H0 in balanced coordinates, γ_jω and where it is, and τ."""
-    p, m = C.shape[0], B.shape[1]
-    gp = generalized_plant(A, B, C, w)
-    H0 = lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m)
-    bound, at = gamma_lower_bound(prepare(A, B, C), w, grid, sigma)
+def _balanced(gp, bound):
+    """The generalized plant and H0 in balanced coordinates, and τ."""
     t = max((1.3 * bound) ** 2 - gp[5] ** 2, 1e-12)  # where the search begins
     with np.errstate(all="ignore"):
-        τ = balancing(level_hamiltonian(H0, gp[1], gp[3], gp[5], t))
+        τ = balancing(level_hamiltonian(_hamiltonian(gp), gp[1], gp[3], gp[5], t))
         gp = in_coordinates(gp, τ)
-    return gp, lqr_hamiltonian(gp[0], gp[2], gp[3], gp[6], p, m), bound, at, τ
+    return gp, _hamiltonian(gp), τ
 
 
-def _with_a_better_optimum(row, K, A, B, C, w, grid, sigma, backoff):
+def _with_a_better_optimum(row, K, gp, bound, backoff):
     """γ_opt and K from balanced coordinates where γ_opt agrees with what was found, or that."""
-    gp, H0, bound, _, τ = _balanced(A, B, C, w, grid, sigma)
+    gp, H0, τ = _balanced(gp, bound)
     gamma_opt, error = float(row[Figure.GAMMA_OPT]), float(row[Figure.GAMMA_ERROR])
     again, at_bound, more, closed, left = optimal_gamma(
         H0, gp[1], gp[3], gp[5], bound, gamma_opt, GAMMA_TOLERANCE, NOISE

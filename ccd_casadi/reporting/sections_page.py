@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import Fact, binding, theta_table, theta_words
 from ccd_casadi.reporting.page import (
     Section,
@@ -40,6 +41,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     """What the page shows between its head and its provenance."""
     verified = solution.sections
     assert verified is not None
+    assert verified.design.controller is not None
     loops = loops_of(verified.problem, verified.theta, verified.design)
     found = [
         _design(problem, solution.result),
@@ -51,7 +53,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
         body = nyquist_html(problem, verified, loops)
         found.append(Section("Nyquist plot and a step of force", body))
         found.append(Section("A move", move_html(verified)))
-    return found
+    return [*found, *budget_section(verified.problem, verified.theta, verified.design.controller)]
 
 
 def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:

@@ -14,6 +14,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
+from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.history import (
     caption_history,
@@ -118,6 +119,7 @@ def report_html(
             lambda: [_theta(problem, solution, verified, truths)],
             lambda: stage_sections(problem, stages),
             lambda: _loop(problem, solution, verified),
+            lambda: budget_section(problem, verified.theta, verified.design.controller),
             lambda: [_history(case, problem, solution, verified)],
             lambda: _trust(solution),
             lambda: [_sweep(problem, solution, verified, truths)],

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ccd_casadi.kernels.design import assess
+from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
@@ -36,7 +36,7 @@ def measure(
     row = np.full(int(Figure.COUNT), np.nan)
     row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Figure.LIMITED_BY_BOUND] = 0.0
-    assess(
+    judge(
         plant.A,
         plant.B,
         plant.C,
@@ -45,6 +45,7 @@ def measure(
         np.ascontiguousarray(controller.C / plant.force),
         np.ascontiguousarray(controller.D / plant.force),
         weights.scaled(w0),
+        weights.delta,
         gamma,
         omega_low / w0,
         row,

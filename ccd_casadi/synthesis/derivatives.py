@@ -30,7 +30,8 @@ class Sensitivities:
 
     `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt.
     `to_theta` (4, n_θ) per unit of θ; `to_weights` maps a weight's name to the derivatives (4,)
-    to its logarithm. `fixed_controller` (n_θ) is dω_b/dθ with K held fixed.
+    to its logarithm, W_d as `disturbance` where it is given. `fixed_controller` (n_θ) is dω_b/dθ
+    with K held fixed.
     `simple` tells whether σ_max is a simple singular value at the three frequencies; where it is
     not, the gradient is one of several one-sided ones.
     """
@@ -67,10 +68,12 @@ def sensitivities(
     arguments = (made_on.A, made_on.B, made_on.C, w, made_on.grid, made_on.gain, gamma_backoff)
     slopes = (made_on.dA, made_on.dB, made_on.dC)
     count = plant.dA.shape[0]
+    names = _WEIGHTS + (("disturbance",) if weights.delta else ())
+    scaled = np.append(w, weights.delta)
     figures = None
     try:
         row, *controller, gradient, fixed, gaps = design_with_gradients(
-            *arguments, omega_low / w0, guess, *slopes, made_on.channels
+            *arguments, omega_low / w0, guess, *slopes, made_on.channels, weights.delta
         )
         if plant.family is not None:
             figures, worst = over_family(plant, weights, row, tuple(controller), omega_low)
@@ -83,12 +86,12 @@ def sensitivities(
                     (plant, omega_low),
                 )
             ]
+            made_at = DesignPlant(*arguments[:3], *slopes, w, gamma_backoff, weights.delta)
             gradient, fixed, gaps = off_design_gradients(
-                DesignPlant(*arguments[:3], *slopes, w, gamma_backoff), row, gradient[3],
-                loops if figures.certified else [],
-            )  # fmt: skip
+                made_at, row, gradient[3], loops if figures.certified else []
+            )
     except np.linalg.LinAlgError:
-        row, gradient = failed_row(), np.full((4, count + 8), np.nan)
+        row, gradient = failed_row(), np.full((4, count + len(names)), np.nan)
         fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
     if figures is None:
         figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
@@ -108,7 +111,7 @@ def sensitivities(
         figures=figures,
         values=values,
         to_theta=gradient[:, :count],
-        to_weights={name: gradient[:, count + i] * w[i] for i, name in enumerate(_WEIGHTS)},
+        to_weights={name: gradient[:, count + i] * scaled[i] for i, name in enumerate(names)},
         fixed_controller=fixed * w0,
         simple=tuple(bool(gap > MULTIPLE_GAP) for gap in gaps),
     )

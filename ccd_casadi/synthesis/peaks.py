@@ -60,7 +60,15 @@ def local_peaks_with_gradients(
     slopes = (made_on.dA, made_on.dB, made_on.dC)
     try:
         row, Ak, Bk, Ck, gradient, _, _ = design_with_gradients(
-            *base, made_on.grid, made_on.gain, gamma_backoff, 1e-3, 0.0, *slopes, made_on.channels
+            *base,
+            made_on.grid,
+            made_on.gain,
+            gamma_backoff,
+            1e-3,
+            0.0,
+            *slopes,
+            made_on.channels,
+            weights.delta,
         )
     except np.linalg.LinAlgError:
         return ()
@@ -79,14 +87,14 @@ def local_peaks_with_gradients(
         for omega, at in ((omega, members[i]) for omega, i, _ in found)
     ]
     count = plant.dA.shape[0]
-    design_plant = DesignPlant(*base[:3], *slopes, w, gamma_backoff)
+    design_plant = DesignPlant(*base[:3], *slopes, w, gamma_backoff, weights.delta)
     try:
         rows = peak_gradients(design_plant, row, gradient[3], loops)
     except np.linalg.LinAlgError:
         return ()
     out = []
     for (omega, i, gain), raw in zip(found, rows, strict=True):
-        to_weights = raw[count:] * w
+        to_weights = raw[count : count + w.size] * w
         whole = np.array([*raw[:count], to_weights[2], to_weights[7]])
         if np.isfinite(whole).all():
             out.append(LocalPeak(omega * w0, i, float(np.log(gain)), whole))

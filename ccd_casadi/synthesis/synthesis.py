@@ -2,7 +2,8 @@
 
     K* = argmin ‖[W_S S; W_KS KS; W_T T]‖∞        (paper, equation (3))
 
-by one Riccati equation, at γ = gamma_backoff·γ_opt, certified from the rebuilt closed loop.
+by one Riccati equation, at γ = gamma_backoff·γ_opt, certified from the rebuilt closed loop. With
+`Weights.disturbance` the problem of reference and input disturbance, see `kernels.disturbance`.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.design import assess, design
+from ccd_casadi.kernels.design import design, judge
 from ccd_casadi.kernels.design import sweep as _sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -33,6 +34,10 @@ class Outcome(StrEnum):
     LEVEL_TEST_FAILED = "the Hamiltonian test finds a gain above gamma"
     NO_BANDWIDTH = "sigma_max(S) does not start below -3 dB and cross it"
     EIGENVALUES_FAILED = "LAPACK did not converge on an eigenvalue problem"
+    FILTER_FAILED = (
+        "the filter's Riccati equation has no stabilising solution: a mode on the axis that no "
+        "force drives or no sensor sees"
+    )
     PEAK_NOT_CONFIRMED = "the peak of S was not confirmed by the level test"
     LOST_IN_ROUNDING = (
         "the controller in SI is not certified again: the loop hangs on digits that doubles do not "
@@ -111,7 +116,8 @@ def synthesise(
     w0 = plant.omega_0
     made_on = plant if plant.family is None else plant.family.design
     arguments = (made_on.A, made_on.B, made_on.C, weights.scaled(w0), made_on.grid, made_on.gain)
-    row, Ak, Bk, Ck = design(*arguments, gamma_backoff, omega_low / w0, guess, made_on.channels)
+    numbers = (gamma_backoff, omega_low / w0, guess, made_on.channels, weights.delta)
+    row, Ak, Bk, Ck = design(*arguments, *numbers)
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     if plant.family is not None:
         figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
@@ -131,7 +137,7 @@ def sweep(
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     w = weights.scaled(w0)
-    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels)
+    numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels, weights.delta)
     if plant.family is not None:
         points = [weights.at(float(s), float(t)) for s in S for t in T]
         options = {"omega_low": omega_low, "gamma_backoff": gamma_backoff}
@@ -165,7 +171,7 @@ def over_family(
     def assessed(member: ScaledPlant, gamma: float) -> Array:
         own = row.copy()
         loop = (member.A, member.B, member.C, *controller, Dk)
-        assess(*loop, w, gamma, omega_low / w0, own)
+        judge(*loop, w, weights.delta, gamma, omega_low / w0, own)
         return own
 
     own = assessed(plant, UNBOUNDED)

@@ -15,6 +15,11 @@ class Weights:
         W3 = (s + ω_T/A_l)/(A_u s + ω_T)
 
     M_K has the unit of force over displacement (N/m); the others but the frequencies none.
+    `disturbance` W_d (N/m) > 0 makes the problem the one with input disturbance d,
+
+        ‖[W1 I; W2 K; (W3/M_K) K] S [I  W_d G]‖∞,
+
+    in which W_d newtons weigh as much as one metre of reference.
 
     >>> w = Weights(M_S=2.0, A_S=1e-4, omega_S=100.0, c_K=1e4, omega_K=600.0, M_K=2e7,
     ...             A_l=1.0, A_u=1e-2, omega_T=250.0)
@@ -31,6 +36,12 @@ class Weights:
     A_l: float
     A_u: float
     omega_T: float
+    disturbance: float = 0.0
+
+    @property
+    def delta(self) -> float:
+        """δ = W_d/M_K, the disturbance's weight in the units of the scaled plant; 0 without."""
+        return self.disturbance / self.M_K
 
     def at(self, omega_S: float, omega_T: float) -> "Weights":
         """The same weights with other break frequencies, rad/s."""
@@ -52,12 +63,16 @@ class Weights:
         )
 
     def responses(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """W1, W2, W3 at jω as rows (3, len(omega)); omega in rad/s."""
+        """The weights of S, KS and T at jω as rows (3, len(omega)); omega in rad/s.
+
+        With a disturbance that of T (one channel: KSG) is δ W3.
+        """
         s = 1j * np.asarray(omega)
+        share = self.delta or 1.0
         return np.array(
             [
                 (s / self.M_S + self.omega_S) / (s + self.omega_S * self.A_S),
                 self.c_K * (s + self.omega_K) / (self.M_K * (s + self.c_K * self.omega_K)),
-                (s + self.omega_T / self.A_l) / (self.A_u * s + self.omega_T),
+                share * (s + self.omega_T / self.A_l) / (self.A_u * s + self.omega_T),
             ]
         )

@@ -1,0 +1,181 @@
+"""The densities of error and force over frequency, and their integrals.
+
+    S_e(f) = ‖H_e(f)‖² S(f),   σ² = ∫ S_e df
+
+with H of `sources`. In a sampled loop S, T and K are those of z = e^{jωT} and the disturbed G is
+the continuous one: S_e is then the density of the samples before it is folded to below half the
+rate, and its integral over all f their variance, aliases included.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.budget.holding import Hold, held, tustin
+from ccd_casadi.budget.loops import process
+from ccd_casadi.budget.quadrature import Integral, integrate
+from ccd_casadi.budget.sources import Kind, Source
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+LOWEST, HIGHEST = 1e-9, 1e4  # of what is white: over the slowest and the fastest pole
+PER_DECADE = 6  # panels at least, so that a curve is drawn through their ends
+FLANKS = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # in half widths of a root
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A plant without feedthrough and a controller in SI, sampled where there is a hold."""
+
+    G: StateSpace
+    K: StateSpace
+    hold: Hold | None = None
+
+    @property
+    def period(self) -> float | None:
+        """T in s of a sampled loop."""
+        return None if self.hold is None else self.hold.period
+
+    def sampled(self) -> tuple[StateSpace, StateSpace]:
+        """Plant and controller as the loop has them, in s or in z."""
+        if self.hold is None:
+            return self.G, self.K
+        return sampled_plant(self.G, self.hold), tustin(self.K, self.hold.period)
+
+    def variable(self, hz: Array) -> np.ndarray:
+        """s or z at frequencies in Hz."""
+        s = 1j * HZ * np.asarray(hz, float)
+        return s if self.hold is None else np.exp(s * self.hold.period)
+
+
+def sampled_plant(G: StateSpace, hold: Hold) -> StateSpace:
+    """The plant behind hold and delay at its samples; states [x; u_{k-1}; …]."""
+    change, gains = held(G.A, G.B, hold)
+    n, m = G.B.shape
+    A = np.eye(n) + change
+    kept = len(gains) - 1
+    older = np.eye(kept * m, k=-m)
+    Ad = np.block([[A, np.hstack([np.zeros((n, 0)), *gains[1:]])],
+                   [np.zeros((kept * m, n)), older]])  # fmt: skip
+    B = np.vstack([gains[0], np.eye(kept * m, m)])
+    C = np.hstack([G.C, np.zeros((len(G.C), kept * m))])
+    return StateSpace(Ad, B, C, np.zeros((len(C), m)))
+
+
+def response(system: StateSpace, s: np.ndarray) -> np.ndarray:
+    """C (s - A)⁻¹ B + D (k, p, m)."""
+    if not len(system.A):
+        return np.broadcast_to(system.D, (len(s), *system.D.shape)).astype(complex)
+    whole = s[:, None, None] * np.eye(len(system.A)) - system.A
+    return np.asarray(system.C @ np.linalg.solve(whole, system.B + 0j) + system.D)
+
+
+@dataclass(frozen=True)
+class Responses:
+    """G and K as in the loop, the disturbed G, S = (1 + GK)⁻¹ and (1 + KG)⁻¹, (k, ·, ·)."""
+
+    G: np.ndarray
+    K: np.ndarray
+    free: np.ndarray
+    S: np.ndarray
+
+    def of(self, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+        """H_e and H_u of a source."""
+        if kind in (Kind.FORCE, Kind.FLOOR_MOTION):
+            error = -self.S @ self.free
+            return error, self.K @ error
+        if kind is Kind.SETPOINT:
+            return self.S, self.K @ self.S
+        one = np.eye(self.S.shape[1])
+        return one - self.S, -self.K @ self.S
+
+
+def responses(loop: Loop, hz: Array) -> Responses:
+    """The loop at frequencies in Hz."""
+    plant, controller = loop.sampled()
+    s = loop.variable(hz)
+    G, K = response(plant, s), response(controller, s)
+    free = G if loop.hold is None else response(loop.G, 1j * HZ * np.asarray(hz, float))
+    S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
+    return Responses(G, K, free, S)
+
+
+def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
+    """f in Hz -> (S_e, S_u) as rows, of all channels together; one-sided, m²/Hz and N²/Hz."""
+    if loop.hold is not None and source.shaped:
+        return _folded(loop, source, loop.hold.period)
+
+    def at(hz: Array) -> Array:
+        found = responses(loop, hz).of(source.kind)
+        gains = np.array([(np.abs(H) ** 2).sum((1, 2)) for H in found])
+        return np.asarray(gains * source.density(hz))
+
+    return at
+
+
+def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
+    """The densities of the samples below half the rate, with all that is folded into them."""
+    model = process(loop.G, loop.K, source, loop.hold).balanced()
+
+    def at(hz: Array) -> Array:
+        z = np.expm1(1j * HZ * hz * T)
+        resolvent = np.linalg.inv(z[:, None, None] * np.eye(len(model.A)) - model.A)
+        found = []
+        for out, direct in ((model.C, 0.0 * (model.C @ model.E)), (model.F, model.V)):
+            H = out @ resolvent
+            white = H @ model.E + direct
+            both = np.einsum("kij,jl,kil->k", H, model.Q, H.conj(), optimize=True).real
+            found.append(2.0 * T * (both + (np.abs(white) ** 2).sum((1, 2))))
+        return np.array(found)
+
+    return at
+
+
+def panels(loop: Loop, source: Source) -> Array:
+    """Rising frequencies in Hz between which the densities are smooth, from end to end.
+
+    A table's own range. What is white goes on from far below the slowest to far above the fastest
+    pole, in a sampled loop to half the rate, beyond which the noise of samples is not counted.
+    """
+    roots = np.concatenate([loop_poles(loop), np.linalg.eigvals(loop.G.A),
+                            np.linalg.eigvals(loop.K.A)])  # fmt: skip
+    sizes = np.abs(roots[np.abs(roots) > 1e-9 * np.abs(roots).max()])
+    corners = source.corners()
+    if source.shaped:
+        bends = np.concatenate([sizes, corners])
+        low, high = LOWEST * bends.min(), HIGHEST * bends.max()
+        if loop.hold is not None:
+            high = np.pi / loop.hold.period
+            low = min(low, 1e-6 * high)
+    else:
+        low, high = corners[0], corners[-1]
+    near = np.abs(roots.imag)[:, None] + np.abs(roots.real)[:, None] * FLANKS
+    steps = np.geomspace(low, high, 2 + int(PER_DECADE * np.log10(high / low)))
+    joint = np.concatenate([[low, high], steps, corners, sizes, near.ravel()])
+    joint = np.unique(joint[(joint >= low) & (joint <= high)])
+    apart = np.concatenate([[True], np.diff(joint) > 1e-9 * joint[1:]])
+    return np.asarray(joint[apart] / HZ)
+
+
+def loop_poles(loop: Loop) -> np.ndarray:
+    """Poles of the closed loop in 1/s; sampled ln(z)/T."""
+    G, K = loop.sampled()
+    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+    poles = np.linalg.eigvals(A)
+    if loop.hold is None:
+        return poles
+    sizes = np.abs(poles)
+    return np.log(poles[sizes > 1e-6] + 0j) / loop.hold.period
+
+
+def integrated(loop: Loop, source: Source, weight: Callable[[Array], Array]) -> Integral:
+    """∫ w(f) S_e df and ∫ S_u df; rows S_e, S_u and w S_e. In Hz, m² and N²."""
+    both = densities(loop, source)
+
+    def rows(hz: Array) -> Array:
+        error, force = both(hz)
+        return np.array([error, force, weight(hz) * error])
+
+    return integrate(rows, panels(loop, source))

@@ -1,0 +1,165 @@
+"""[budget] of a case file: tables of spectra with their units, checked, in SI.
+
+[budget.sensor_noise]
+unit = "nm/rtHz"
+level = 0.1                    # white; with zeros_hz and poles_hz through that filter
+[[budget.force]]               # several of a kind: double brackets
+name = "cables"
+unit = "N^2/Hz"
+psd = [[1.0, 1e-3], [100.0, 1e-6]]      # [Hz, density]; or file = "cables.csv"
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
+from ccd_casadi.cases.checks import POSITIVE, Check, number, rows, shown, text
+from ccd_casadi.cases.sections import BudgetSection
+
+Fail = Callable[[str, str], Exception]
+# Unit -> factor of a density to SI, and whether the number is its square root.
+_POSITION = {"m^2/Hz": (1.0, False), "m/rtHz": (1.0, True), "nm/rtHz": (1e-9, True)}
+_ACCELERATION = {"(m/s^2)^2/Hz": (1.0, False), "m/s^2/rtHz": (1.0, True)}
+UNITS: dict[Kind, dict[str, tuple[float, bool]]] = {
+    Kind.FORCE: {"N^2/Hz": (1.0, False), "N/rtHz": (1.0, True)},
+    Kind.FLOOR_MOTION: _POSITION | _ACCELERATION,
+    Kind.SENSOR_NOISE: _POSITION,
+    Kind.SETPOINT: _POSITION,
+}
+MOST_ROWS = 20_000  # of a table
+PATH = ("mass", "damping", "stiffness")
+
+
+def _corners(value: Any) -> str | None:
+    remedy = "give a list of Hz, or of [Hz, damping ratio], all above 0"
+    if not isinstance(value, list | tuple):
+        return f"is {shown(value)}; {remedy}"
+    for item in value:
+        parts = item if isinstance(item, list | tuple) else [item]
+        if len(parts) not in (1, 2) or any(POSITIVE(part) is not None for part in parts):
+            return f"is {shown(value)}; {remedy}"
+    return None
+
+
+_NONE_OR_MORE = number(0.0, math.inf, "give 0 or more", closed=True)
+_CHECKS: dict[str, Check] = {
+    "name": text,
+    "unit": text,
+    "level": POSITIVE,
+    "zeros_hz": _corners,
+    "poles_hz": _corners,
+    "psd": rows(2),
+    "file": text,
+    **dict.fromkeys(PATH, _NONE_OR_MORE),
+}
+
+
+def checked_budget(section: BudgetSection, folder: Path, fail: Fail) -> BudgetSection:
+    """The section with every table checked and the files of spectra read into `psd`."""
+    found: dict[str, tuple[Mapping[str, Any], ...]] = {}
+    for kind in Kind:
+        given = getattr(section, kind.value)
+        several = given if isinstance(given, list | tuple) else (given,)
+        entries = []
+        for i, entry in enumerate(several, 1):
+            place = f"budget.{kind.value}" + (f" {i}" if len(several) > 1 else "")
+            entries.append(_checked(entry, kind, place, folder, fail))
+        found[kind.value] = tuple(entries)
+    if section.window_ms is not None and not any(found.values()):
+        words = "has no spectrum to go with; add [budget.force] or another"
+        raise fail("budget.window_ms", words)
+    return replace(section, **found)  # type: ignore[arg-type]
+
+
+def error_budget(section: BudgetSection) -> ErrorBudget | None:
+    """The sources in SI; None for a case without any."""
+    sources = tuple(_source(entry, kind) for kind in Kind for entry in getattr(section, kind.value))
+    if not sources:
+        return None
+    return ErrorBudget(sources, None if section.window_ms is None else 1e-3 * section.window_ms)
+
+
+def _checked(
+    entry: Mapping[str, Any], kind: Kind, place: str, folder: Path, fail: Fail
+) -> Mapping[str, Any]:
+    for key, value in entry.items():
+        if key not in _CHECKS or (key in PATH and kind is not Kind.FLOOR_MOTION):
+            raise fail(f"{place}.{key}", f"unknown key; known are {', '.join(_CHECKS)}")
+        wrong = _CHECKS[key](value)
+        if wrong is not None:
+            raise fail(f"{place}.{key}", wrong)
+    if entry.get("unit") not in UNITS[kind]:
+        choices = ", ".join(f'"{unit}"' for unit in UNITS[kind])
+        raise fail(f"{place}.unit", f"is {shown(entry.get('unit'))}; choose one of {choices}")
+    ways = [key for key in ("level", "psd", "file") if key in entry]
+    if len(ways) != 1:
+        raise fail(place, "give one of level, psd and file, and not more")
+    for key in ("zeros_hz", "poles_hz"):
+        if key in entry and ways != ["level"]:
+            raise fail(f"{place}.{key}", "goes with level only; drop it")
+    entry = dict(entry)
+    if "file" in entry:
+        entry["psd"] = _read(folder / entry.pop("file"), place, fail)
+    try:
+        _source(entry, kind)
+    except ValueError as error:
+        raise fail(place, str(error)) from None
+    return entry
+
+
+def _source(entry: Mapping[str, Any], kind: Kind) -> Source:
+    factor, amplitude = UNITS[kind][entry["unit"]]
+    power = 2 if amplitude else 1
+    spectrum: ShapedSpectrum | TabulatedSpectrum
+    if "psd" in entry:
+        table = np.array(entry["psd"], float).reshape(-1, 2)
+        density = (factor * table[:, 1]) ** power
+        if amplitude and (table[:, 1] <= 0.0).any():
+            density = np.zeros(len(table))  # a square would hide the sign; refused below
+        spectrum = TabulatedSpectrum(tuple(table[:, 0].tolist()), tuple(density.tolist()))
+    else:
+        spectrum = ShapedSpectrum(
+            (factor * float(entry["level"])) ** power,
+            _pairs(entry.get("zeros_hz", ())),
+            _pairs(entry.get("poles_hz", ())),
+        )
+    m, c, k = (float(entry.get(name, 0.0)) for name in PATH)
+    name = entry.get("name", kind.value.replace("_", " "))
+    return Source(name, kind, spectrum, (m, c, k), entry["unit"] in _ACCELERATION)
+
+
+def _pairs(value: Any) -> tuple[tuple[float, ...], ...]:
+    return tuple(
+        tuple(map(float, item)) if isinstance(item, list | tuple) else (float(item),)
+        for item in value
+    )
+
+
+def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
+    """Rows of Hz and density: two columns of numbers, after lines that start with a letter or #."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise fail(f"{place}.file", f"{shown(path.name)} cannot be read: {reason}") from None
+    found: list[list[float]] = []
+    for number_, line in enumerate(lines, 1):
+        line = line.split("#")[0].strip()
+        if not line or (not found and line[0].isalpha()):
+            continue
+        try:
+            row = [float(part) for part in line.replace(";", ",").replace("\t", ",").split(",")]
+        except ValueError:
+            row = []
+        if len(row) != 2:
+            words = f"line {number_} of {shown(path.name)} is no pair Hz, density; mend it"
+            raise fail(f"{place}.file", words)
+        found.append(row)
+    if len(found) > MOST_ROWS:
+        raise fail(f"{place}.file", f"has more than {MOST_ROWS} rows; thin it out")
+    return found

@@ -1,0 +1,215 @@
+"""The least RMS error of a fixed structure on a set of plants, within the bounds of the bandwidth.
+
+    min ln e(κ)   s.t.  every bound of `figures` at a bandwidth of at least ω_min,
+    e² = mean over the plants of the error's variance under an `ErrorBudget`
+
+By quadratic programmes in a trust region, from a controller that meets the bounds: the gradient
+of ln e is exact (adjoint Lyapunov equations), its curvature a damped BFGS one, that of the bounds
+exact. The merit is ln e + ρ max(0, max c); a step counts only where every loop stays stable.
+A little is paid for bandwidth, so that ω_b is what the bounds leave free at this κ.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from ccd_casadi.budget import ErrorBudget
+from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
+from ccd_casadi.budget.frequency import Loop
+from ccd_casadi.budget.holding import Hold
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
+from ccd_casadi.fixed_structure.descent import Point, descend
+from ccd_casadi.fixed_structure.design import (
+    Progress,
+    SectionsDesign,
+    SectionsOutcome,
+    in_problem_units,
+    problem_for,
+)
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, assess
+from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+STEP = 1e-30  # of κ along the imaginary axis
+REWARD = 1e-3  # of ln ω_b in ln e
+ACTIVE = 1e-5
+KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
+
+
+@dataclass(frozen=True)
+class RmsError:
+    """e of a controller on SISO plants in SI, and its derivatives to κ."""
+
+    plants: tuple[StateSpace, ...]
+    structure: Structure
+    budget: ErrorBudget
+    hold: Hold | None
+
+    def at(self, kappa: Array) -> tuple[float, Array]:
+        """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
+        kappa = np.asarray(kappa, float)
+        K = state_space(self.structure, kappa)
+        stepped = state_spaces(self.structure, kappa + 1j * STEP * np.eye(len(kappa)))
+        changes = [
+            Change(None, StateSpace(*(part[i].imag / STEP for part in stepped)))
+            for i in range(len(kappa))
+        ]
+        total = None
+        for plant in self.plants:
+            found = variance_slopes(Loop(plant, K, self.hold), self.budget, changes)
+            if found is None:
+                return np.inf, np.full(len(kappa), np.nan)
+            total = found if total is None else replace(
+                total, value=total.value + found.value, gradient=total.gradient + found.gradient
+            )  # fmt: skip
+        assert total is not None
+        value, slope = rms_error_slope(total)
+        return value - 0.5 * float(np.log(len(self.plants))), slope
+
+
+@dataclass(frozen=True)
+class LeastError:
+    """A design with its RMS error in m over the set, and that of the controller it began with.
+
+    `design.multipliers`: change of ln e per ln of a bound; `design.kkt_residual` is over ‖∇ ln e‖.
+    """
+
+    design: SectionsDesign
+    error: float
+    first_error: float
+    steps: int
+
+
+def least_error(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    budget: ErrorBudget,
+    *,
+    sampling: Sampling | None = None,
+    least_bandwidth: float = 0.0,
+    progress: Progress | None = None,
+) -> LeastError:
+    """From a certified design (and its other local optima) to the least RMS error in m.
+
+    `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
+    it began with is, then. A local optimum, as any search from given starts finds.
+    """
+    structure = design.structure
+    if not isinstance(structure, Structure):
+        raise ValueError("the least RMS error is searched for one input and one output only")
+    problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
+    hold = None if sampling is None else Hold(sampling.period, sampling.delay)
+    goal = RmsError(
+        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), hold
+    )
+    model = _OnPlants(problem, goal)
+    w0 = problem.plants.omega_0
+    floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
+    tell = progress or (lambda words: None)
+    own = (design.bandwidth, tuple(map(float, design.kappa)))
+    others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
+    first = float(np.exp(goal.at(design.kappa)[0]))
+    best = LeastError(design, first, first, 0)
+    steps = 0
+    for bandwidth, kappa in [own, *others]:
+        if bandwidth < least_bandwidth:
+            continue
+        start = model.at(in_problem_units(problem, np.array(kappa)), float(np.log(bandwidth / w0)))
+        if not np.isfinite(start.value):
+            continue
+        end, count = descend(model, start, problem.box, floor, REWARD, problem.margin)
+        steps += count
+        made = _judged(problem, plants, sampling, end, design, floor)
+        error = float(np.exp(end.value))
+        tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
+             f"{made.words}")  # fmt: skip
+        if made.certified and error < best.error:
+            best = replace(best, design=made, error=error)
+    return replace(best, steps=steps)
+
+
+@dataclass(frozen=True)
+class _OnPlants:
+    """The problem as `descent` sees it."""
+
+    problem: Problem
+    goal: RmsError
+
+    def at(self, kappa: Array, tau: float) -> Point:
+        kappa = np.clip(kappa, *self.problem.box)
+        found = assess(self.problem, kappa, tau)
+        if not found.stable:
+            return Point(kappa, tau, np.inf, np.inf, np.zeros(len(kappa)), None)
+        assert found.peaks is not None
+        assert found.near is not None
+        P = self.problem.plants
+        value, slope = self.goal.at(self.problem.structure.in_units(kappa, P.omega_0, P.force))
+        parts = (found.peaks, found.near)
+        rows = Constraints(*(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")
+        ))  # fmt: skip
+        return Point(kappa, tau, found.violation, value, slope, rows)
+
+    def hessian(self, point: Point, rows: Constraints, mu: Array) -> Array:
+        return lagrangian_hessian(self.problem, point.kappa, point.tau, rows, mu)
+
+
+def _judged(
+    problem: Problem,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    end: Point,
+    design: SectionsDesign,
+    floor: float,
+) -> SectionsDesign:
+    """The end as a design: certified by the judge, with residual and multipliers."""
+    structure, P = problem.structure, problem.plants
+    kappa = structure.in_units(end.kappa, P.omega_0, P.force)
+    controller = state_space(structure, kappa)
+    judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
+    assert end.rows is not None
+    active = end.rows.only(np.abs(end.rows.value) <= ACTIVE)
+    n = len(end.kappa)
+    columns, names = [np.column_stack([active.to_kappa, active.to_tau])], []
+    for i, name in enumerate(structure.names):
+        for row, sign, word in ((0, -1.0, "lower"), (1, 1.0, "upper")):
+            if abs(end.kappa[i] - problem.box[row, i]) <= ACTIVE:
+                columns.append(sign * np.eye(n + 1)[i : i + 1])
+                names.append((name, word))
+    if abs(end.tau - floor) <= ACTIVE:
+        columns.append(-np.eye(n + 1)[n:])
+    matrix = np.concatenate(columns).T
+    goal = np.append(-end.slope, REWARD)
+    mu = nnls(matrix, goal, maxiter=100 * matrix.shape[1])[0] if matrix.shape[1] else np.zeros(0)
+    residual = float(np.abs(matrix @ mu - goal).max() / np.abs(goal).max())
+    multipliers: dict[str, float] = {}
+    for code, value in zip(active.curve, mu, strict=False):
+        if value > 0.0:
+            word = Curve(int(code)).name
+            multipliers[word] = multipliers.get(word, 0.0) + float(value)
+    count = len(active.v)
+    ends = tuple((*item, float(v)) for item, v in zip(names, mu[count:], strict=False))
+    least = float(np.exp(floor)) * P.omega_0
+    good = judged.passed and judged.bandwidth >= least / KEPT
+    return replace(
+        design,
+        outcome=SectionsOutcome.CERTIFIED if good else SectionsOutcome.NOT_CERTIFIED,
+        words=judged.words,
+        kappa=kappa,
+        controller=controller,
+        bandwidth=judged.bandwidth,
+        certificate=judged,
+        multipliers=multipliers,
+        at_box=ends,
+        kkt_residual=residual,
+        short={},
+    )

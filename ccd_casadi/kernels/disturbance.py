@@ -1,0 +1,167 @@
+"""The four-block problem: reference and input disturbance in, one filter equation, one γ search.
+
+    ‖[W1 I; W2 K; W3 K] S [I  δG]‖∞,   δ = W_d/M_K in the units of the scaled plant,
+
+bounds S, GS, KS and KSG at once (for one channel KSG = T). Every weighted output is a function of
+e and u, which the controller knows, so that the filter equation does not depend on γ,
+
+    A Y + Y Aᵀ + δ² B Bᵀ - Y CᵀC Y = 0,
+
+and with N = I + C(s - A)⁻¹YCᵀ, the spectral factor of [I δG][I δG]^~ = N N^~, the problem is one
+of a single Riccati equation for the same plant with the reference entering through B1 = -YCᵀ too:
+in it D21 = I, A - B1 C2 is the filter's own, stable, and everything of `riccati` and `gamma` holds.
+Its solution is X̂ = X(I - YX/γ²)⁻¹ with X of the four-block problem, so that X̂ >= 0 is X >= 0 and
+ρ(XY) < γ² in one (Doyle, Glover, Khargonekar & Francis 1989; Glover & Doyle 1988, for D11).
+
+Plain NumPy around the compiled search.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ccd_casadi.kernels.bound_peak import slope_root, squared_weight_rates
+from ccd_casadi.kernels.frequency import prepare, responses
+from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
+from ccd_casadi.kernels.lapack import stable_subspace
+from ccd_casadi.kernels.pullback import squared_weight_slopes
+
+EDGE = 0.95  # squared: a peak of the bound below this share of the highest is not refined
+AT_REST = np.concatenate([[0.0], np.geomspace(1e-9, 5e-6, 8)])  # over ω₀: where W1 is largest
+ZOOMS, POINTS = 4, 17  # each narrows the bracket of a peak to an eighth
+
+
+def filter_solution(A, B, C, delta):
+    """Y (n, n), and whether the filter's Hamiltonian splits: A - YCᵀC is then stable."""
+    H = np.block([[A.T, -C.T @ C], [-(delta**2) * (B @ B.T), -A]])
+    _, U1, U2, _, ok = stable_subspace(np.ascontiguousarray(H))
+    if not ok:
+        return np.full_like(A, np.nan), False
+    Y = np.linalg.solve(U1.T, U2.T)
+    return 0.5 * (Y + Y.T), True
+
+
+def innovations_plant(A, B, C, w, Y):
+    """A, B1, B2, C1, C2, d1, d of the equivalent problem; states [plant; W1; W2; W3 of u].
+
+    z = [W1 e; (d2 z2 + d3 z3)/d; (d2 z3 - d3 z2)/d] with d² = d2² + d3²: turned so that the
+    feedthrough of u is [0; d I; 0], as the kernels of the first kind take it.
+    """
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
+    f = first_order_weights(w)
+    N = n + p + 2 * m
+    i1, i2, i3 = n, n + p, n + p + m
+    Ag, B1, B2 = np.zeros((N, N)), np.zeros((N, p)), np.zeros((N, m))
+    C1, C2 = np.zeros((p + 2 * m, N)), np.zeros((p, N))
+    Ag[:n, :n], B2[:n], C2[:, :n], B1[:n] = A, B, -C, -Y @ C.T
+    Ag[i1:i2, :n], C1[:p, :n] = -f[0, 1] * C, -f[0, 3] * C
+    for k, first, last in ((0, i1, i2), (1, i2, i3), (2, i3, N)):
+        one = np.eye(last - first)
+        Ag[first:last, first:last] = -f[k, 0] * one
+        (B1 if k == 0 else B2)[first:last] = f[k, 1] * one
+    C1[:p, i1:i2] = f[0, 2] * np.eye(p)
+    d2, d3, one = f[1, 3], f[2, 3], np.eye(m)
+    d = np.hypot(d2, d3)
+    C1[p : p + m, i2:i3], C1[p : p + m, i3:] = d2 / d * f[1, 2] * one, d3 / d * f[2, 2] * one
+    C1[p + m :, i2:i3], C1[p + m :, i3:] = -d3 / d * f[1, 2] * one, d2 / d * f[2, 2] * one
+    return Ag, B1, B2, C1, C2, float(f[0, 3]), float(d)
+
+
+# ---- what no controller passes ------------------------------------------------------------------
+
+
+class BoundTerms(NamedTuple):
+    """γ_jω² at one frequency, and its partial derivatives to σ, |W1|², |W2|² + |W3|² and δ."""
+
+    value: float
+    to_sigma: float
+    to_W1: float
+    to_effort: float
+    to_delta: float
+
+
+def bound_terms(W1, effort, sigma, delta):
+    """(1 + δ²σ²)|W1|²R/(|W1|² + R), R = (|W2|² + |W3|²)/σ², along an output direction of G.
+
+    The answer of u to a reference in that direction, of the size that disturbance and reference
+    have there together, costs at least that; monotone in σ, so the largest and least σ count.
+    """
+    size, total = 1.0 + (delta * sigma) ** 2, W1 * sigma**2 + effort
+    value = size * W1 * effort / total
+    return BoundTerms(
+        value,
+        2.0 * sigma * W1 * effort * (delta**2 * effort - W1) / total**2,
+        size * (effort / total) ** 2,
+        size * W1**2 * (sigma / total) * (sigma / total),
+        2.0 * delta * sigma**2 * W1 * effort / total,
+    )
+
+
+def _bounds(G, w, delta, omega):
+    """γ_jω² (2, k) along the directions of the largest and least gain of G."""
+    g = responses(G, omega)
+    sigma = np.abs(g[:, 0]) if g.shape[1:] == (1, 1) else np.linalg.svd(g, compute_uv=False)
+    p, m = G[2].shape[0], G[1].shape[1]
+    ends = np.array([sigma[:, 0], sigma[:, -1] if m >= p else np.zeros(omega.size)])
+    W1, W2, W3 = squared_weights(w, omega)
+    return bound_terms(W1, W2 + W3, ends, delta).value
+
+
+def disturbance_bound(A, B, C, w, delta, grid):
+    """γ_jω, the ω over ω₀ where it is attained, and whether along the least gain (else largest)."""
+    G = prepare(A, B, C)
+    grid = np.concatenate([AT_REST, grid])
+    values = np.nan_to_num(_bounds(G, w, delta, grid), nan=0.0)  # a pole at 0
+    top, at = values.max(), np.unravel_index(int(values.argmax()), values.shape)
+    best = float(top), float(grid[at[1]]), bool(at[0])
+    inner = values[:, 1:-1]
+    peaks = (inner >= values[:, :-2]) & (inner > values[:, 2:]) & (inner > EDGE * top)
+    for branch, i in zip(*np.nonzero(peaks), strict=True):
+        low, high = grid[i], grid[i + 2]
+        for _ in range(ZOOMS):
+            trial = np.linspace(low, high, POINTS)
+            found = _bounds(G, w, delta, trial)[branch]
+            k = int(np.clip(found.argmax(), 1, POINTS - 2))
+            low, high = trial[k - 1], trial[k + 1]
+            if found[k] > best[0]:
+                best = float(found[k]), float(trial[k]), bool(branch)
+    return float(np.sqrt(best[0])), *best[1:]
+
+
+def disturbance_bound_gradient(A, B, C, w, delta, omega, least):
+    """Gradients of γ_jω at its peak beside ω to A, B, C, the weight vector (8,) and δ."""
+    index = C.shape[0] - 1 if least else 0
+
+    def direction(at):
+        M = 1j * at * np.eye(len(A)) - A
+        right, left = np.linalg.solve(M, B), np.linalg.solve(M.T, C.T).T
+        U, s, Vh = np.linalg.svd(C @ right)
+        return left.T @ U[:, index].conj(), right @ Vh[index].conj(), U[:, index], Vh[index], s
+
+    def slope(at):
+        ul, rv, _, _, s = direction(at)
+        terms = bound_terms(*_weights_at(w, at)[:2], s[index], delta)
+        rates = squared_weight_rates(w, at)
+        return (
+            terms.to_sigma * (-1j * (ul @ rv)).real
+            + terms.to_W1 * rates[0] + terms.to_effort * (rates[1] + rates[2])
+        )  # fmt: skip
+
+    at = slope_root(slope, omega)
+    ul, rv, u, vh, s = direction(at)
+    terms = bound_terms(*_weights_at(w, at)[:2], s[index], delta)
+    scale = 0.5 / np.sqrt(terms.value)
+    factor = scale * terms.to_sigma
+    to_squares = scale * np.repeat([terms.to_W1, terms.to_effort], [3, 5])
+    return (
+        factor * np.outer(ul, rv).real,
+        factor * np.outer(ul, vh.conj()).real,
+        factor * np.outer(u.conj(), rv).real,
+        to_squares * squared_weight_slopes(w, at),
+        scale * terms.to_delta,
+    )
+
+
+def _weights_at(w, omega):
+    W1, W2, W3 = squared_weights(w, omega)
+    return W1, W2 + W3

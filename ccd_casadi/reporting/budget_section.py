@@ -1,0 +1,115 @@
+"""The error budget on a page: a table by source, and the cumulative error over frequency."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.budget import BudgetFigures
+from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    figure_html,
+    number,
+    paragraph,
+    table_html,
+)
+from ccd_casadi.reporting.svg import BLACK, CYCLE
+
+ROWS = 30  # of the figure's table
+SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
+DECADES = 3.5  # of the error's axis
+
+
+def budget_section(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> list[Section]:
+    """Nothing for a problem without a budget."""
+    found = loop_budget(problem, theta, controller)
+    if found is None:
+        return []
+    if found.model is None:
+        words = "The loop with the model is not stable: it has no stationary error."
+        return [Section("Error budget", paragraph(words))]
+    return [Section("Error budget", _table(found, found.model) + _figure(found.model))]
+
+
+def _table(found: LoopBudget, model: BudgetFigures) -> str:
+    windowed = model.window is not None
+    head = ["source", "enters as", "RMS error (µm)", "of the variance (%)"]
+    head += ["MA (µm)", "MSD (µm)"] if windowed else []
+    head += ["RMS force (N)"]
+    rows = []
+    for item in model.sources:
+        share = 100.0 * (item.error / model.error) ** 2 if model.error > 0.0 else 0.0
+        moving = (1e6 * item.average, 1e6 * item.deviation) if windowed else ()
+        kind = item.source.kind.value.replace("_", " ")
+        rows.append((item.source.name, kind, 1e6 * item.error, share, *moving, item.force))
+    moving = (1e6 * model.average, 1e6 * model.deviation) if windowed else ()
+    rows.append(("together", "", 1e6 * model.error, 100.0, *moving, model.force))
+    words = "The error of the true position, r - y"
+    words += " at the samples" if found.hold is not None else ""
+    if found.plants > 1:
+        words += (
+            f", on the model; on the {found.plants} plants of the set at most "
+            f"{number(1e6 * found.largest_error, 4)} µm and {number(found.largest_force, 4)} N"
+        )
+    if windowed:
+        words += (
+            f". MA and MSD: moving average and moving standard deviation over "
+            f"{number(1e3 * (model.window or 0.0))} ms"
+        )
+    exact = [item for item in model.sources if item.source.shaped]
+    tables = [item for item in model.sources if not item.source.shaped]
+    if exact:
+        worst = max(item.disagreement for item in exact)
+        words += (
+            ". Filters by Lyapunov's equation, which the integral over frequency confirms to "
+            f"{number(worst, 1)}"
+        )
+    if tables:
+        worst = max(item.disagreement for item in tables)
+        words += f". Tables by quadrature, relative error {number(worst, 1)} by its own estimate"
+    return paragraph(words + ".") + table_html(Table(tuple(head), tuple(rows)))
+
+
+def _figure(model: BudgetFigures) -> str:
+    shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
+    hz = np.unique(np.concatenate([item.hz for item in shown]))
+    parts = [
+        np.interp(hz, item.hz, item.cumulative, left=0.0, right=item.cumulative[-1])
+        for item in shown
+    ]
+    whole = np.sum(parts, axis=0)
+    low = float(hz[np.searchsorted(whole, SHOWN**2 * whole[-1])])
+    high = float(hz[min(np.searchsorted(whole, (1.0 - 1e-6) * whole[-1]), len(hz) - 1)])
+    x = (low, max(2.0 * high, 10.0 * low))
+    curves = [
+        Curve(hz, 1e6 * np.sqrt(part), item.source.name, CYCLE[i % (len(CYCLE) - 1)],
+              "-" if i < len(CYCLE) - 1 else "--")
+        for i, (item, part) in enumerate(zip(shown, parts, strict=True))
+    ]  # fmt: skip
+    total = Curve(hz, 1e6 * np.sqrt(whole), "together", BLACK, width=1.8)
+    top = 1e6 * float(np.sqrt(whole[-1]))
+    panel = Panel("frequency (Hz)", "RMS error up to it (µm)", (*curves, total), log_x=True,
+                  log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top),
+                  legend="best")  # fmt: skip
+    svg = figure_lines([[panel]], key="error-budget", heights=(3.4,),
+                       title="Cumulative RMS error over frequency by source")  # fmt: skip
+    grid = np.geomspace(*x, ROWS)
+    table = Table(
+        ("Hz", *(f"{item.source.name} µm" for item in shown), "together µm"),
+        tuple(
+            (float(f), *(1e6 * float(np.sqrt(np.interp(f, hz, part))) for part in (*parts, whole)))
+            for f in grid
+        ),
+    )
+    words = (
+        "Dynamic error budget: the RMS error that has come together up to each frequency, by "
+        "source; the squares of the curves add up to the black one's. Where a curve rises is "
+        "where its source is felt."
+    )
+    return figure_html(svg, words, table)

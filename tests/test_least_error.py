@@ -1,0 +1,94 @@
+"""The least RMS error of a fixed structure: its gradient, its bounds, its optimality."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from case_documents import TWO_MASS
+from fixed_structure_loops import BOUNDS, FAST, loop, plant
+
+from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
+from ccd_casadi.budget.holding import Hold
+from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.fixed_structure import Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.least_error import RmsError, least_error
+from ccd_casadi.support.units import HZ
+
+BUDGET = ErrorBudget((
+    Source("cable", Kind.FORCE, ShapedSpectrum(1e-4)),
+    Source("encoder", Kind.SENSOR_NOISE, TabulatedSpectrum((1.0, 1e3), (2.5e-21, 2.5e-21))),
+))  # fmt: skip
+PID = Structure(biquads=0)
+KEPT = replace(BOUNDS, compliance_max=None)
+
+
+def test_the_error_of_a_set_has_its_gradient() -> None:
+    plants = [plant(-0.01), plant(0.02)]
+    problem, kappa = loop(3, PID, FAST, (-0.01, 0.02))
+    kappa = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    hold = Hold(FAST.period, FAST.delay)
+    goal = RmsError(tuple(p.plant_si() for p in plants), PID, BUDGET, hold)
+    value, slope = goal.at(kappa)
+    each = [RmsError((one,), PID, BUDGET, hold).at(kappa)[0] for one in goal.plants]
+    assert np.exp(2.0 * value) == pytest.approx(np.mean(np.exp(2.0 * np.array(each))))
+    rng = np.random.default_rng(0)
+    way, h = rng.normal(size=len(slope)), 1e-4
+    ends = [goal.at(kappa + sign * h * way)[0] for sign in (1.0, -1.0)]
+    assert slope @ way == pytest.approx((ends[0] - ends[1]) / (2.0 * h), abs=1e-6)
+
+
+@pytest.mark.slow
+def test_the_least_error_keeps_bounds_and_bandwidth_and_is_stationary() -> None:
+    plants = [plant(0.01)]
+    problem, kappa = loop(3, PID, FAST)
+    initial = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    first = synthesise_sections(plants, PID, KEPT, sampling=FAST, initial=[initial],
+                                only_initial=True)  # fmt: skip
+    assert first.certified
+    floor = 0.85 * first.bandwidth
+    found = least_error(plants, KEPT, first, BUDGET, sampling=FAST, least_bandwidth=floor)
+    design = found.design
+    assert found.error < found.first_error
+    assert design.bandwidth >= floor * (1.0 - 1e-5)
+    assert design.controller is not None
+    again = certify(plants, design.controller, KEPT, FAST)
+    assert again.passed
+    assert design.kkt_residual < 1e-4
+    goal = RmsError(tuple(p.plant_si() for p in plants), PID, BUDGET,
+                    Hold(FAST.period, FAST.delay))  # fmt: skip
+    assert np.exp(goal.at(design.kappa)[0]) == pytest.approx(found.error)
+    # What may be slower need not err more.
+    slower = least_error(plants, KEPT, first, BUDGET, sampling=FAST, least_bandwidth=0.9 * floor)
+    assert slower.error <= found.error * (1.0 + 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("inner", "added", "words"),
+    [
+        ('minimise = "rms_error"', '[controller]\nstructure = "sections"', "no spectrum says"),
+        ("bandwidth_least_hz = 3.0", '[controller]\nstructure = "sections"', "rms_error"),
+        ('minimise = "rms_error"', "", 'controller.structure = "sections" only'),
+        ('minimise = "energy"', '[controller]\nstructure = "sections"', "choose one of"),
+    ],
+)
+def test_mistakes_in_the_case(tmp_path: Path, inner: str, added: str, words: str) -> None:
+    path = tmp_path / "case.toml"
+    path.write_text(TWO_MASS.read_text().replace("[inner]", f"[inner]\n{inner}") + "\n" + added)
+    with pytest.raises(CaseError, match="inner") as caught:
+        load_case(path)
+    assert words in str(caught.value)
+
+
+def test_a_case_asks_for_the_least_error(tmp_path: Path) -> None:
+    path = tmp_path / "case.toml"
+    text = TWO_MASS.read_text().replace(
+        "[inner]", '[inner]\nminimise = "rms_error"\nbandwidth_least_hz = 10.0'
+    )
+    added = (
+        '\n[controller]\nstructure = "sections"\n[budget.force]\nunit = "N/rtHz"\nlevel = 0.01\n'
+    )
+    path.write_text(text + added)
+    sections = problem_of(load_case(path)).sections
+    assert sections is not None
+    assert (sections.minimise, sections.bandwidth_least) == ("rms_error", 10.0 * HZ)

@@ -1,0 +1,146 @@
+"""Measured frequency responses: read, judged and designed on as the model they came from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from fixed_structure_loops import BOUNDS, FAST, loop, plant
+from scipy.io import savemat
+
+from ccd_casadi.fixed_structure import Sampling, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.measured import (
+    MeasuredResponse,
+    from_control,
+    judge,
+    read_frequency_response,
+)
+from ccd_casadi.fixed_structure.measured_design import _OnLines, design_on_data
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+
+PID = Structure(biquads=0)
+KEPT = replace(BOUNDS, compliance_max=None)  # which no PID meets
+
+
+def measured(sampling: Sampling | None, lines: int = 2000) -> MeasuredResponse:
+    """Case study 1 as a spectrum analyser would give it, hold and delay in it."""
+    P = plant_set([plant()], sampling)
+    hz = np.geomspace(0.3, 4900.0, lines)
+    G = P.responses(np.zeros(lines, int), P.variable(HZ * hz / P.omega_0))[0] / P.force
+    return MeasuredResponse(hz, G)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_judge_on_lines_agrees_with_the_one_on_the_model(sampling: Sampling | None) -> None:
+    """Stability always; figures to what lies between lines, which the stated bound covers."""
+    found = measured(sampling)
+    period = None if sampling is None else sampling.period
+    for seed in range(3):
+        problem, kappa = loop(seed, PID, sampling)
+        P = problem.plants
+        K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+        for factor in (1.0, 30.0):
+            own = StateSpace(K.A, K.B, factor * K.C, factor * K.D)
+            model = certify([plant()], own, BOUNDS, sampling).plants[0]
+            lines = judge(found, own, BOUNDS, period=period)
+            assert lines.sure, lines.words
+            assert lines.stable == model.stable
+            if not model.stable:
+                assert lines.right_half_plane > 0
+                continue
+            assert max(lines.S_peak / model.S_peak, lines.KS / model.KS) <= 1.0 + 1e-6
+            assert model.S_peak / lines.S_between <= 1.0 + 1e-6
+            assert lines.bandwidth == pytest.approx(model.bandwidth, rel=1e-4)
+            np.testing.assert_allclose(lines.GS, model.GS, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_design_on_lines_is_that_on_the_model() -> None:
+    found = design_on_data(measured(FAST), PID, KEPT, period=FAST.period)
+    assert found.usable, found.words
+    assert found.figures is not None
+    assert all(ratio <= 1.0 + 1e-5 for ratio in found.figures.over(KEPT).values())
+    model = synthesise_sections([plant()], PID, KEPT, sampling=FAST, starts=2)
+    assert model.certified
+    assert found.bandwidth == pytest.approx(model.bandwidth, rel=1e-2)
+
+
+def test_rows_on_lines_have_their_derivatives() -> None:
+    structure = Structure(biquads=1)
+    problem, kappa = loop(3, structure)
+    kappa = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    model = _OnLines(measured(None, 60), structure, BOUNDS, None, 0, None)
+    tau = float(np.log(2.0 * HZ * 1.013))
+    point = model.at(kappa, tau)
+    assert point.rows is not None
+    rng = np.random.default_rng(0)
+    way, h = rng.normal(size=len(kappa) + 1), 1e-6
+    ends = [model.at(kappa + s * h * way[:-1], tau + s * h * way[-1]).rows for s in (1.0, -1.0)]
+    assert ends[0] is not None
+    assert ends[1] is not None
+    assert len(ends[0].value) == len(ends[1].value) == len(point.rows.value)
+    difference = (ends[0].value - ends[1].value) / (2.0 * h)
+    slope = point.rows.to_kappa @ way[:-1] + point.rows.to_tau * way[-1]
+    np.testing.assert_allclose(slope, difference, atol=1e-6)
+
+
+def test_what_the_data_do_not_show_is_said() -> None:
+    whole = measured(None)
+    problem, kappa = loop(0, PID)
+    P = problem.plants
+    K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+    assert judge(whole, K, BOUNDS).sure
+    cut = MeasuredResponse(whole.hz[whole.hz < 20.0], whole.G[whole.hz < 20.0])
+    assert "not small" in judge(cut, K, BOUNDS).words
+    high = MeasuredResponse(whole.hz[whole.hz > 40.0], whole.G[whole.hz > 40.0])
+    assert not judge(high, K, BOUNDS).sure
+    # An unstable pole that is told moves the count by as many.
+    assert judge(whole, K, BOUNDS, unstable_poles=2).right_half_plane == 2
+
+
+def test_files_of_every_kind_hold_the_same_response(tmp_path: Path) -> None:
+    found = measured(None, 20)
+    hz, G = found.hz, found.G
+    angle = np.angle(G)
+    tables = {
+        "f_hz,re,im": (hz, G.real, G.imag),
+        "f_hz, magnitude, phase_deg": (hz, np.abs(G), np.rad2deg(angle)),
+        "# a comment\nf_hz,magnitude_db,phase_rad": (hz, 20.0 * np.log10(np.abs(G)), angle),
+    }
+    read = []
+    for number, (head, columns) in enumerate(tables.items()):
+        path = tmp_path / f"{number}.csv"
+        rows = [",".join(repr(float(v)) for v in row) for row in zip(*columns, strict=True)]
+        path.write_text("\n".join([head, *rows]) + "\n")
+        read.append(read_frequency_response(path))
+    savemat(tmp_path / "G.mat", {"f_hz": hz, "G": G})
+    read.append(read_frequency_response(tmp_path / "G.mat"))
+    read.append(from_control(control.FRD(G, HZ * hz)))
+    for one in read:
+        np.testing.assert_allclose(one.hz, hz, rtol=1e-12)
+        np.testing.assert_allclose(one.G, G, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("f_hz,re\n1,2\n2,3\n3,4\n4,5\n5,6\n", "needs re and im"),
+        ("re,im\n1,2\n", "no column f_hz"),
+        ("f_hz,re,im\n1,2,x\n", "no table of numbers"),
+        ("f_hz,re,im\n1,2,3\n2,3,4\n", "five lines"),
+        ("f_hz,re,im\n" + "1,2,3\n" * 6, "have to rise"),
+        ("", "no table of numbers"),
+    ],
+)
+def test_mistakes_in_files(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "G.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=words):
+        read_frequency_response(path)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_frequency_response(tmp_path / "none.csv")
