@@ -111,9 +111,8 @@ def prove(
     def without(outcome: ProofOutcome) -> Proof:
         return Proof(outcome, slack, names)
 
-    if not isinstance(structure, Structure) or any(
-        system.B.shape[1] != 1 or system.C.shape[0] != 1 for system in uncertain.options
-    ):
+    several = any(system.B.shape[1] != 1 or len(system.C) != 1 for system in uncertain.options)
+    if several or isinstance(structure, ChannelStructure):
         return without(ProofOutcome.SEVERAL_CHANNELS)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)
