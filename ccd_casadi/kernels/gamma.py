@@ -1,8 +1,8 @@
 """γ_opt = max(γ_X, γ_jω): the root of the Riccati level, or the bound that no controller passes.
 
 In 1/t the Hamiltonian is affine and f nearly straight, so that Newton's method needs fewer
-steps in 1/t than in t. Near the root the power series of the stable subspace takes its place: a
-step of order four and more from one Schur form, whose own terms tell when it is good enough.
+steps in 1/t than in t. Near the root the third-order expansion of the stable subspace takes its
+place: a step of order four from one Schur form, whose own terms tell when it is good enough.
 """
 
 import numpy as np
@@ -15,7 +15,6 @@ from ccd_casadi.kernels.lapack import lyapunov_triangular
 from ccd_casadi.kernels.refine import narrow, next_trial
 from ccd_casadi.kernels.riccati import riccati_level, root_nearby
 
-ABOVE = 1.005  # times the guess: from above the series alone may close the search
 BACKWARD = 8.0 * 2.0**-52  # |δH|/|H| of a Schur form; 6 eps was measured, N up to 35
 
 
@@ -124,7 +123,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
     # γ_jω itself puts eigenvalues on the axis: the test is made a hair above it.
     t_jw = max(gamma_jw**2 * (1 + 1e-7) - d1**2, 1e-12 * d1**2)
     t_low, t_high = t_jw, np.inf
-    start = ABOVE * guess if guess > 0.0 else 1.3 * gamma_jw
+    start = guess if guess > 0.0 else 1.3 * gamma_jw
     t = max(start**2 - d1**2, t_jw)
     tested = False
     for forms in range(1, 61):
@@ -143,9 +142,7 @@ def optimal_gamma(H0, B1, C1, d1, gamma_jw, guess, tolerance, noise):
             step = f / (slope * t * t)  # Newton's, in 1/t
             error = abs(step)
             if error * t < 0.3:
-                # from below another direction of X may have a root beyond the one that is near
-                enough = 2.0 * tolerance * (t + d1**2) / t**2 if f > 0.0 else np.inf
-                better, estimate = root_nearby(B1, C1, d1, frame, step, enough)
+                better, estimate = root_nearby(B1, C1, d1, frame, step)
                 if abs(better - step) < 0.5 * abs(step):
                     step, error = better, estimate
             new = t / (1.0 + step * t) if step * t > -1.0 else np.inf

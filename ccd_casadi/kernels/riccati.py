@@ -23,7 +23,6 @@ from ccd_casadi.kernels.blocks import (
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
 
-TERMS = 10  # of the series of the stable subspace: what more of them take, a Schur form costs
 NOISE = 1e-7  # |λ(X)| below which its sign may be rounding: see `riccati_level`
 
 
@@ -125,39 +124,15 @@ def _singularity(U1, U2, Z, q, p):
 
 
 @compiled
-def _root(U1, U2, Z, q, p, c, δ):
-    """The δ at which U1 - U2 Σ Z_k δᵏ is singular, by the secant method from 0 and the given one.
-
-    c: the singular value at 0. Z (terms, N, N) from Z_1 on.
-    """
-    δ0, g0 = 0.0, -c
-    for _ in range(8):
-        total = np.zeros(U1.shape)
-        for k in range(Z.shape[0]):
-            add(total, 0, 0, δ ** (k + 1), Z[k])
-        g = _singularity(U1, U2, total, q, p)
-        if g == g0 or δ == δ0:
-            break
-        new = δ - g * (δ - δ0) / (g - g0)
-        if abs(new - δ) > abs(δ - δ0):  # steps shrink until g is rounding
-            break
-        δ0, g0, δ = δ, g, new
-        if abs(δ - δ0) <= 1e-8 * abs(δ):  # the step after it would be 1e-8 times as small
-            break
-    return δ
-
-
-@compiled
-def root_nearby(B1, C1, d1, frame, δ, enough):
+def root_nearby(B1, C1, d1, frame, δ):
     """Where X is infinite, as a change of 1/t from the frame's, and an estimate of its error.
 
     In the coordinates of [[U1, -U2], [U2, U1]] the stable subspace at 1/t + δ is [I; Z(δ)] with
 
         T11ᵀ Z + Z T11 = -δ (V + W Z)ᵀ(V + W Z) - Z G Z,   W = [Sᵀ B1ᵀ][-U2; U1].
 
-    Z is a power series, one triangular Lyapunov equation a term: three terms, and up to `TERMS`
-    where the error can be brought to `enough` with them. The root of the smooth scalar that
-    vanishes with det(U1 - U2 Z) is found by the secant method, from the estimate δ; NaN where
+    Z is taken to δ³, one triangular Lyapunov equation a term, and the root of the smooth scalar
+    that vanishes with det(U1 - U2 Z) found by the secant method, from the estimate δ; NaN where
     that scalar cannot be had.
     """
     H, T11, U1, U2, V, Z1, q, p, c = frame
@@ -171,31 +146,27 @@ def root_nearby(B1, C1, d1, frame, δ, enough):
     place(right, 0, 0, -1.0, U2)
     place(right, N, 0, 1.0, U1)
     G, VW = left @ (H @ right), transposed(V) @ W
-    Z, GZ = np.empty((TERMS, N, N)), np.empty((TERMS, N, N))
-    WZ, sizes = np.empty((TERMS, outputs, N)), np.empty(TERMS)
-    place(Z[0], 0, 0, 1.0, Z1)
-    sizes[0], first, error, count = frobenius(Z1), abs(np.dot(q, Z1 @ q)), np.inf, 0
-    for k in range(1, TERMS):
-        place(GZ[k - 1], 0, 0, 1.0, G @ Z[k - 1])
-        place(WZ[k - 1], 0, 0, 1.0, W @ Z[k - 1])
-        # half of the right-hand side's coefficient of δᵏ⁺¹; the other half is its transpose
-        M = VW @ Z[k - 1]
-        for i in range((k + 1) // 2):
-            j = k - 1 - i
-            add(M, 0, 0, 0.5 if i == j else 1.0, Z[i] @ GZ[j])
-        for i in range(k // 2):
-            j = k - 2 - i
-            add(M, 0, 0, 0.5 if i == j else 1.0, transposed(WZ[i]) @ WZ[j])
-        place(Z[k], 0, 0, 1.0, lyapunov_triangular(T11, symmetric_part(M, -1.0), True))
-        sizes[k], count = frobenius(Z[k]), k + 1
-        if k == 1:
-            continue
-        if k == 2:
-            δ = _root(U1, U2, Z[:3], q, p, c, δ)
-        ratio = abs(δ) * max(sizes[k] / sizes[k - 1], sizes[k - 1] / sizes[k - 2])
-        error = abs(δ) ** (k + 1) * sizes[k] / first * ratio if ratio < 0.5 else np.inf
-        if error <= enough or not error * ratio ** (TERMS - 1 - k) <= enough:
+    WZ, GZ = W @ Z1, G @ Z1
+    M = VW @ Z1
+    add(M, 0, 0, 0.5, Z1 @ GZ)
+    Z2 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
+    M = VW @ Z2
+    add(M, 0, 0, 0.5, transposed(WZ) @ WZ)
+    add(M, 0, 0, 1.0, Z2 @ GZ)
+    Z3 = lyapunov_triangular(T11, symmetric_part(M, -1.0), True)
+    δ0, g0 = 0.0, -c
+    for _ in range(8):
+        Z = np.zeros((N, N))
+        add(Z, 0, 0, δ, Z1)
+        add(Z, 0, 0, δ**2, Z2)
+        add(Z, 0, 0, δ**3, Z3)
+        g = _singularity(U1, U2, Z, q, p)
+        if g == g0 or δ == δ0:
             break
-    if count > 3:
-        δ = _root(U1, U2, Z[:count], q, p, c, δ)
-    return δ, error
+        δ0, g0, δ = δ, g, δ - g * (δ - δ0) / (g - g0)
+        if abs(δ - δ0) <= 1e-8 * abs(δ):  # the step after it would be 1e-8 times as small
+            break
+    n1, n2, n3 = frobenius(Z1), frobenius(Z2), frobenius(Z3)
+    first = abs(np.dot(q, Z1 @ q))
+    ratio = abs(δ) * max(n3 / n2, n2 / n1)
+    return δ, abs(δ) ** 3 * n3 / first * ratio if ratio < 0.5 else np.inf
