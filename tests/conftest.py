@@ -80,7 +80,7 @@ def two_mass_run(solved: Callable[[str], Path]) -> Path:
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """`solve` draws no report: for tests that look at none, it is half of a small solve."""
-    monkeypatch.setattr("ccd_casadi.reporting.solve_page.write_report", lambda *_: None)
+    monkeypatch.setattr("ccd_casadi.reporting.solve_page.write_report", lambda *_, **__: None)
 
 
 @pytest.fixture(scope="module")

@@ -91,7 +91,7 @@ def test_a_block_that_fails_is_how_the_design_ends(which: int, monkeypatch) -> N
 
     def failing(*arguments):  # type: ignore[no-untyped-def]
         found = whole(*arguments)
-        balanced = arguments[-1]
+        balanced = arguments[8]
         if len(made) == which or balanced:  # nor does the second attempt help
             found[0][design.Figure.CODE] = design.Code.GAMMA_NOT_CONVERGED
         made.append(found)

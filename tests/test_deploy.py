@@ -165,7 +165,7 @@ def test_the_command_leaves_a_controller_that_can_be_built(
     np.testing.assert_array_equal(table["A"], K.system.A)
     page = _Plain()
     page.feed((out / "report.html").read_text(encoding="utf-8"))
-    assert (page.figures, page.foreign) == (2, [])
+    assert (page.figures, page.foreign) == (3, [])  # loop, step, move
     if shutil.which("cc"):
         line = next(x for x in (out / "controller_test.c").read_text().splitlines() if " cc " in x)
         subprocess.run(line.split()[1:], cwd=out, check=True)

@@ -83,7 +83,7 @@ def test_a_wrong_option_is_one_line_with_a_remedy(key: str, value: object, words
         "plant": {"model": "rib_stage", "outputs": "rigid", key: value},
         "theta": {p.name: {"lower": p.lower, "upper": p.upper} for p in case.theta},
         "objective": vars(case.objective),
-        "weights": vars(case.weights),
+        "weights": {key: v for key, v in vars(case.weights).items() if v is not None},
         "inner": {key: v for key, v in vars(case.inner).items() if v is not None},
     }
     with pytest.raises(CaseError) as caught:

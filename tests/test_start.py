@@ -64,7 +64,7 @@ def test_the_result_is_told_and_on_disk_before_the_report_is_drawn(
 ) -> None:
     seen = []
 
-    def drawn(folder: Path, *rest: object) -> None:
+    def drawn(folder: Path, *rest: object, **more: object) -> None:
         seen.append(((folder / "result.json").exists(), "status" in capsys.readouterr().out))
 
     monkeypatch.setattr("ccd_casadi.reporting.solve_page.write_report", drawn)
