@@ -54,7 +54,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     moved = None
-    with Progress(channels + count + 3, "deploying", options.quiet) as bar:
+    with Progress(channels + count + 2 + (options.saturation is not None), "deploying", options.quiet) as bar:
         found = deploy(
             finished, timing, saturation=options.saturation, seed=options.seed,
             progress=lambda words: bar.advance(note=words),

@@ -122,6 +122,7 @@ def test_a_rate_below_twice_the_peak_is_one_line(
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_robustness_judges_the_deployed_controller_on_the_same_plants(
     robust_run: Path, deployed: tuple[FinishedRun, Deployment], tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ def test_three_mass_axis_is_designed_between_its_bounds(tmp_path: Path) -> None:
     assert (run.plant.B.shape[1], run.plant.C.shape[0]) == (1, 1)
 
 
+@pytest.mark.slow
 def test_gantry_is_designed_from_its_table_alone_and_holds_on_the_true_model(
     tmp_path: Path,
 ) -> None:

@@ -83,26 +83,31 @@ def parameter(name: str, low: float, high: float, unit: str = "") -> str:
 
 TWO = parameter("m", 10, 20, "kg") + parameter("e", 15, 25, "kg")
 CASES = {  # name: function, parameters, sampling and outer, formulation
-    "one": ("one", parameter("m", 10, 20, "kg"), "points = 4", "nested"),
+    "one": ("one", parameter("m", 10, 20, "kg"), "points = 4\n[outer]\nbox_points = 4", "nested"),
     "three": (
         "three",
         parameter("m", 10, 20, HOSTILE_UNIT) + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
-        "points = 2\n[outer]\nmax_refinements = 0\ntolerance = 1e-9",
+        "points = 2\n[outer]\nbox_points = 4\nmax_refinements = 0\ntolerance = 1e-9",
         "nested",
     ),
     "three_lifted": (
         "three",
         parameter("m", 10, 20, "kg") + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
-        "lifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1",
+        "lifted_points = 12\n[outer]\nbox_points = 4\nstarts = 2\nmax_refinements = 1",
         "lifted",
     ),
-    "two_nested": ("two", TWO, "points = 3\n[outer]\nstarts = 4", "nested"),
-    "two_direct": ("two", TWO, "[outer]\ndirect_starts = 1", "direct"),
-    "one_direct": ("one", parameter("m", 10, 20, "kg"), "[outer]\ndirect_starts = 1", "direct"),
+    "two_nested": ("two", TWO, "points = 3\n[outer]\nbox_points = 4\nstarts = 4", "nested"),
+    "two_direct": ("two", TWO, "[outer]\nbox_points = 4\ndirect_starts = 1", "direct"),
+    "one_direct": (
+        "one",
+        parameter("m", 10, 20, "kg"),
+        "[outer]\nbox_points = 4\ndirect_starts = 1",
+        "direct",
+    ),
     "mimo": (
         "mimo",
         parameter("a", 0.5, 1.5) + parameter("b", 0.5, 1.5),
-        "lifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1",
+        "lifted_points = 12\n[outer]\nbox_points = 4\nstarts = 2\nmax_refinements = 1",
         "lifted",
     ),
 }

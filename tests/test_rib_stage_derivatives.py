@@ -56,7 +56,10 @@ def test_slopes_are_differences(theta: tuple[float, ...], index: int) -> None:
     assert worst(STAGES["corners"], theta, np.eye(6)[index]) < TOLERANCE
 
 
-@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(s, marks=pytest.mark.slow) if s == "lopsided" else s for s in STAGES],
+)
 def test_slopes_along_a_mixed_direction(name: str) -> None:
     stage = STAGES[name]
     assert worst(stage, MIDDLE, np.array([0.7, -0.5, 1.0, 0.6, -0.8, 0.3])) < TOLERANCE

@@ -356,6 +356,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
     script = tmp_path / "pool.py"
     script.write_text(POOL)

@@ -98,6 +98,7 @@ def test_three_formulations_agree_and_a_resumed_run_is_the_same(tmp_path: Path) 
         assert again.result[key] == nested.result[key]
 
 
+@pytest.mark.slow
 def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) -> None:
     """The judge on two hundred plants between and beside those that were designed for."""
     theta = anchored.start

@@ -32,7 +32,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
-POINTS_A_START = 4  # points looked at for every local solve: each costs as much as an inner problem
+POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large

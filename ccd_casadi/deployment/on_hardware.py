@@ -38,7 +38,7 @@ class OnHardware:
     """The setpoint, the gains of feedforward (5, m, p) or None, the ways; None: no limit was tried.
 
     `least_limit`: share of the unlimited peak force; NaN where the unlimited move itself does not
-    end in its window.
+    end in its window, and where no limit is given.
     """
 
     profile: Setpoint
@@ -86,9 +86,9 @@ def on_hardware(
         ways.append(Way("limited, with back-calculation", made(realisation, forward)))
     if hardware is not None and not hardware.ideal:
         ways.append(Way("with the electronics", made(realisation, forward, hardware)))
-    progress("least force")
     peak, least = float(np.abs(unlimited.force).max()), np.nan
-    if np.isfinite(unlimited.settled):
+    if realisation.saturation is not None and np.isfinite(unlimited.settled):
+        progress("least force")
         least = 1.0
         for share in SHARES:
             held = limited(replace(free, saturation=share * peak), bandwidth)

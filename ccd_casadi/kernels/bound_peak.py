@@ -13,11 +13,16 @@ DEVIATIONS = 4.0  # standard deviations of the rounding that `bound_error` admit
 
 
 def _least_direction(A, B, C, ω):
-    """M = jω - A, M⁻¹B, and σ_p of G = C M⁻¹ B with its singular vectors u, v."""
-    p = C.shape[0]
+    """M = jω - A, M⁻¹B, and σ_p of G = C M⁻¹ B with its singular vectors u, v.
+
+    With fewer inputs than outputs σ_p is 0, and so is v.
+    """
+    p, m = C.shape[0], B.shape[1]
     M = 1j * ω * np.eye(A.shape[0]) - A
     right = np.linalg.solve(M, B)
     U, s, Vh = np.linalg.svd(C @ right)
+    if m < p:
+        return M, right, 0.0, U[:, p - 1], np.zeros(m, complex)
     return M, right, s[p - 1], U[:, p - 1], Vh[p - 1].conj()
 
 
@@ -41,6 +46,8 @@ def bound_error(A, B, C, w, ω):
 def _bound_slope(A, B, C, w, ω):
     """dγ_jω²(ω)/dω of γ_jω² = |W1|² R/(|W1|² + R), R = |W2|²/σ² + |W3|², dσ = Re(u* dG v)."""
     M, right, σ, u, v = _least_direction(A, B, C, ω)
+    if σ == 0.0:  # the bound is |W1|
+        return squared_weight_rates(w, ω)[0]
     dG = -1j * (C @ np.linalg.solve(M, right))
     dσ = np.vdot(u, dG @ v).real
     W1, W2, W3 = squared_weights(w, ω)

@@ -62,6 +62,8 @@ def move_html(found: OnHardware) -> str:
 
 def _limit_words(found: OnHardware) -> str:
     words = "" if found.forward is not None else "The plant holds no position: no feedforward. "
+    if len(found.ways) < 3:
+        return words + "Give --saturation to see the move with the force that there is."
     if np.isnan(found.least_limit):
         return words + (
             "The unlimited move itself does not end in its window within the time watched: ask for "
