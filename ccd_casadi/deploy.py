@@ -54,7 +54,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     moved = None
-    with Progress(channels + count + 2 + (options.saturation is not None), "deploying", options.quiet) as bar:
+    steps = channels + count + 2 + (options.saturation is not None)
+    with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
             finished, timing, saturation=options.saturation, seed=options.seed,
             progress=lambda words: bar.advance(note=words),
