@@ -17,6 +17,9 @@ from ccd_casadi.solve import main
 EXAMPLE = Path(__file__).parent.parent / "examples" / "planar_stage"
 
 
+pytestmark = pytest.mark.slow  # another example is solved in test_own_examples
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     """The example without the look over the box, which finds nothing here and is half the work."""

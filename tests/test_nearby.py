@@ -30,6 +30,7 @@ def test_without_derivatives_the_matrices_are_the_same_to_the_bit() -> None:
     assert [len(item) for item in bare.derivatives] == [0] * 5
 
 
+@pytest.mark.slow
 def test_a_reduced_basis_gives_the_matrices_within_its_reach() -> None:
     names = ("H", "h", "t_o", "t_i", "t_c", "x_i")  # in another order than the stage's own
     theta = np.array([THETA[4], *THETA[:4], THETA[5]])

@@ -90,6 +90,7 @@ def test_a_budget_too_small_for_anything_is_refused(tmp_path: Path) -> None:
         retrain(tmp_path, Camel(tmp_path), Settings(budget=3))
 
 
+@pytest.mark.slow
 def test_points_without_truth_do_not_hold_it_up(tmp_path: Path) -> None:
     truth: Any = Camel(tmp_path, hole=True)
     outcome = retrain(tmp_path, truth, Settings(budget=60))

@@ -27,6 +27,7 @@ from surrogates.retrain import main
 from surrogates.retraining import Settings, retrain
 from surrogates.versions import Versions
 
+pytestmark = pytest.mark.slow  # a study of half a minute; its parts are tested apart
 ROOT = Path(__file__).parent.parent
 TWO_MASS = ROOT / "runs" / "two_mass.toml"
 

@@ -39,7 +39,10 @@ def test_comparison_of_lines_can_fail() -> None:
     assert not same("status        verified", "status        not_verified")
 
 
-@pytest.mark.parametrize(("stage", "count"), [("my_stage", 5), ("my_robust", 2)])
+@pytest.mark.parametrize(
+    ("stage", "count"),
+    [("my_stage", 5), pytest.param("my_robust", 2, marks=pytest.mark.slow)],
+)
 def test_every_command_gives_what_the_page_shows(tmp_path: Path, stage: str, count: int) -> None:
     """The commands on one of the page's two cases; together they are all of them."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
