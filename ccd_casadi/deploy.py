@@ -17,7 +17,7 @@ from surrogates.options import number, positive
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
     from ccd_casadi.deployment.on_hardware import OnHardware
-    from ccd_casadi.deployment.pipeline import Deployment
+    from ccd_casadi.deployment.outcome import Deployment
 
 LEADS = {"auto": None, "on": True, "off": False}
 
@@ -54,6 +54,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     moved = None
+    if finished.problem.sections is not None:  # taken as they are; one way where a rate was given
+        channels, count = 0, 1 if finished.problem.sections.sampling else count
     steps = channels + count + 2 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(

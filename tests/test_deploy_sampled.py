@@ -107,7 +107,7 @@ def test_an_unstable_loop_has_no_figures() -> None:
     assert not found.stable
     assert found.spectral_radius > 1.0
     assert np.isnan(found.bandwidth)
-    assert not Target(1e9, found.bandwidth, 1e9).met(found)
+    assert not Target(1e9, 0.05, found.bandwidth, 1e9).met(found)
 
 
 @pytest.mark.parametrize("channels", [1, 2])

@@ -15,6 +15,7 @@ from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
+from ccd_casadi.deployment.pipeline import Timing, deploy
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, kept
@@ -70,6 +71,8 @@ starts = 4
 [loop]
 rate_hz = 8000.0
 delay_us = 80.0
+[robust]
+gain = 0.02
 [sampling]
 points = 2
 """
@@ -114,6 +117,36 @@ def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (deployed["rate_hz"], deployed["delay"]) == pytest.approx((8000.0, 8e-5))
     assert deployed["sampled"]["bandwidth_hz"] >= result["bandwidth_hz"] * (1.0 - 1e-6)
     assert deployed["sampled"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+    # the whole set that the case names, with its ends, and none above S_max
+    gains = [member["gain"] for member in deployed["robust"]["members"]]
+    assert min(gains) == pytest.approx(-0.02)
+    assert max(gains) == pytest.approx(0.02)
+    assert deployed["robust"]["worst"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+
+
+def test_a_rate_that_only_the_nominal_plant_stands_is_not_verified(folder: Path) -> None:
+    """At half the rate that the loop was designed for, the plant of the largest gain tells."""
+    run = read_run(folder / "run")
+    found = deploy(run, Timing(rate_hz=4000.0))
+    nominal = max(found.sampled.sensitivity_peak, run.problem.inner.S_max)
+    assert found.stable
+    assert not found.passed
+    assert found.worst.figures.sensitivity_peak > nominal
+    assert "gain +2 %" in found.shortfalls[0]
+
+
+def test_a_run_that_is_not_verified_deploys_as_such(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(folder / "run", tmp_path / "run"))
+    result = json.loads((run / "result.json").read_text())
+    result |= {"status": "not_verified", "reason": "failed: robust"}
+    (run / "result.json").write_text(json.dumps(result))
+    assert deploy_main([str(run), *COMMON]) == 4
+    assert "failed: robust" in capsys.readouterr().err
+    assert deploy_main([str(run), *COMMON, "--unverified"]) == 4
+    deployed = json.loads((run / "deploy" / "deploy.json").read_text())
+    assert deployed["status"] == "not_verified"
 
 
 def test_robustness_is_of_the_loop_as_it_runs(folder: Path) -> None:

@@ -83,11 +83,17 @@ def discretise(
 
 @dataclass(frozen=True)
 class Target:
-    """What a sampled loop has to keep: ‖S‖∞ <= peak and |ω_b/bandwidth - 1| <= tolerance."""
+    """What a sampled loop keeps: ‖S‖∞ <= (1 + excess) S_max, |ω_b/bandwidth - 1| <= tolerance."""
 
-    peak: float
+    S_max: float
+    excess: float
     bandwidth: float  # rad/s
     tolerance: float
+
+    @property
+    def peak(self) -> float:
+        """The largest ‖S‖∞ that is let pass."""
+        return self.S_max * (1.0 + self.excess)
 
     def met(self, figures: SampledFigures) -> bool:
         """Whether it does; an unstable loop does not."""

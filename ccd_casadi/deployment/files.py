@@ -6,9 +6,9 @@ from typing import Any
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import versions, write_json
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
-from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduced
-from ccd_casadi.deployment.robust_set import MemberLoop
+from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
 from ccd_casadi.deployment.sections import Root, Section, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.scaling import StateSpace
@@ -129,9 +129,10 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
 
 def _member(item: MemberLoop) -> dict[str, Any]:
     f = item.figures
-    return {
-        "shift": item.at.shift,
-        "damping": item.at.damping,
+    place: dict[str, Any] = {"shift": item.at.shift, "damping": item.at.damping}
+    if isinstance(item.at, SetPlace):
+        place |= {"modes": list(item.at.modes), "gain": item.at.gain, "option": item.at.option}
+    return place | {
         "stable": f.stable,
         "spectral_radius": f.spectral_radius,
         "sensitivity_peak": f.sensitivity_peak,

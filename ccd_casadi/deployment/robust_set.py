@@ -7,14 +7,28 @@ are the nominal plant's.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verify import DENSE
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.deployment.sampled import SampledFigures
+from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem, uncertain_plant
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+
+LATTICE = 41  # plants of a box that a deployed loop of sections is looked at on, besides its set
+
+
+@dataclass(frozen=True)
+class SetPlace(Perturbation):
+    """A place in the set of sections: besides, an option set of the plant (0: none) and a gain."""
+
+    option: int = 0
+    gain: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,10 @@ def place_words(at: Perturbation) -> str:
     """
     parts = [f"resonances {100.0 * at.shift:+.3g} %"] if at.shift else []
     parts += [f"damping x {at.damping:.3g}"] if at.damping != 1.0 else []
+    parts += [f"mode {i} {100.0 * s:+.3g} %" for i, s in enumerate(at.modes, 1) if s]
+    if isinstance(at, SetPlace):
+        parts += [f"gain {100.0 * at.gain:+.3g} %"] if at.gain else []
+        parts += [f"option set {at.option}"] if at.option else []
     return ", ".join(parts) or "the nominal plant"
 
 
@@ -70,6 +88,27 @@ def members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
         for at in places
         if at != Perturbation()
     )
+
+
+def section_members(run: FinishedRun, *, dense: bool = False) -> tuple[Member, ...]:
+    """The same of a run with sections: corners of its box, its own set, `dense`: a lattice too."""
+    sections = sections_of_problem(run.problem)
+    uncertain = uncertain_plant(run.problem, run.theta)
+    points = [*uncertain.corners(), *((i, np.array(p)) for i, p in sections.members)]
+    if dense:
+        points += lattice(uncertain, LATTICE, sections.seed)
+    found: dict[SetPlace, Member] = {}
+    for option, point in points:
+        if option == 0 and np.array_equal(point, uncertain.nominal):
+            continue
+        values = dict(zip(uncertain.names, np.asarray(point, float).tolist(), strict=True))
+        modes = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, uncertain.modes + 1))
+        place = SetPlace(
+            values.get("resonance_shift", 0.0), values.get("damping", 1.0),
+            modes if any(modes) else (), option, values.get("gain", 0.0),
+        )  # fmt: skip
+        found.setdefault(place, Member(place, uncertain.plant(point, option)))
+    return tuple(found.values())
 
 
 class WorstFirst:

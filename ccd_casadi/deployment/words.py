@@ -1,7 +1,7 @@
 """A deployment's verdict in words: what is kept, by how much, and on which plant."""
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.pipeline import SAMPLED_PEAK, Deployment
+from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
 
 
@@ -22,7 +22,7 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
     over = 100.0 * (worst.figures.sensitivity_peak / S_max - 1.0)
     where = f" ({place_words(worst.at)})" if found.members else ""
     if over > 0.0:
-        allowed = 100.0 * (SAMPLED_PEAK - 1.0)
+        allowed = 100.0 * found.target.excess
         parts.append(
             f"within {allowed:.2g} % of S_max = {S_max:g}: hold and delay bring the peak of S "
             f"{over:.2f} % above it{where}"

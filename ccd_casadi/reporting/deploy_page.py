@@ -9,7 +9,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.on_hardware import OnHardware
-from ccd_casadi.deployment.pipeline import ChannelOrders, Deployment
+from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors

@@ -1,0 +1,115 @@
+"""Sections are deployed as they were designed: nothing is reduced, and the rate is the case's."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.anti_windup import limited
+from ccd_casadi.deployment.channels import split
+from ccd_casadi.deployment.discretise import (
+    FASTEST,
+    Conversion,
+    Target,
+    discretise,
+    loop_at,
+    needed_rate,
+    nice_rate,
+)
+from ccd_casadi.deployment.judgement import SampledSet, statics_of, unverified
+from ccd_casadi.deployment.outcome import (
+    SAMPLED_BANDWIDTH,
+    SAMPLED_EXCESS,
+    ChannelOrders,
+    Deployment,
+    Trial,
+)
+from ccd_casadi.deployment.rate_choice import conversions_of
+from ccd_casadi.deployment.realisation import realise
+from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction
+from ccd_casadi.deployment.robust_set import WorstFirst, section_members
+from ccd_casadi.deployment.sampled import SampledFigures
+from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+
+DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
+
+
+def deploy_as_designed(
+    run: FinishedRun,
+    sections: SectionsProblem,
+    timing: Timing,
+    saturation: float | None,
+    seed: int,
+    progress: Callable[[str], None],
+) -> Deployment:
+    """The sections as they are: nothing is reduced, at the case's rate and delay by Tustin's rule.
+
+    Where the case gives no rate, the one that is needed is searched as for any controller.
+    """
+    inner, full, K = run.problem.inner, run.figures, run.controller
+    channel = split(run.plant, K)[0]
+    G, designed = run.plant.plant_si(), sections.sampling
+    whole = Reduced(len(K.A), Reduction.NONE, K, full)
+    limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
+    tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
+    if designed is None:
+        progress("rate")
+        bandwidth, conversions = full.bandwidth, conversions_of(timing, tustin.warp)
+        target = Target(inner.S_max, SAMPLED_EXCESS, bandwidth, SAMPLED_BANDWIDTH)
+    else:
+        # What was designed is the sampled loop: that is what a given rate or delay is held against.
+        conversions = [tustin]
+        own = loop_at(G, K, tustin, designed.period, designed.delay)
+        bandwidth = own.bandwidth
+        target = Target(inner.S_max, DESIGNED_EXCESS, bandwidth, SAMPLED_BANDWIDTH)
+        timing = replace(timing, rate_hz=timing.rate_hz or designed.rate_hz)
+        if timing.delay is None and timing.delay_samples == Timing.delay_samples:
+            timing = replace(timing, delay=designed.delay)
+    trials = []
+    family, dense = section_members(run), section_members(run, dense=True)
+    for conversion in conversions:
+        progress(f"rate for {conversion.label}")
+        order = WorstFirst(family)
+
+        def met(
+            rate: float, conversion: Conversion = conversion, order: WorstFirst = order
+        ) -> bool:
+            def loop(plant: StateSpace) -> SampledFigures:
+                return loop_at(plant, K, conversion, 1.0 / rate, timing.delay_at(rate))
+
+            return target.met(loop(G)) and order.all(
+                lambda member: target.held(loop(member.plant.plant_si()))
+            )
+
+        if designed is None:
+            also = () if timing.rate_hz is None else (timing.rate_hz,)
+            trials.append(Trial(conversion, needed_rate(met, bandwidth / HZ, also)))
+        else:
+            given = timing.rate_hz or designed.rate_hz
+            trials.append(Trial(conversion, given if met(given) else designed.rate_hz))
+    best = min(trials, key=lambda t: float("inf") if t.needed_hz is None else t.needed_hz)
+    if timing.rate_hz is None and best.needed_hz is None:
+        words = f"no sampling rate up to {FASTEST * bandwidth / HZ:.3g} Hz keeps S_max to 5 %"
+        remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
+        raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
+    rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
+    delay, period = timing.delay_at(rate), 1.0 / rate
+    single = discretise(K, best.conversion, period, delay)
+    realisation = limited(realise([channel], [single], saturation), full.bandwidth)
+    plants = SampledSet(run, dense, period, delay)
+    sampled, checked = plants.figures(realisation)
+    progress("simulation")
+    worst = [max(checked, key=lambda item: item.badness).at] if checked else []
+    stable = sampled.stable and all(item.figures.stable for item in checked)
+    measured, simulated = plants.simulated(realisation, worst, seed) if stable else (None, ())
+    orders = (ChannelOrders(channel, (whole,), whole, whole),)
+    return Deployment(
+        orders, limits, K, full, tuple(trials), target, rate, delay, best.conversion,
+        plants.nominal, realisation, sampled, measured, checked, simulated, unverified(run),
+        statics_of(run, realisation.system),
+    )  # fmt: skip

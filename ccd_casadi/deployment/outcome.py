@@ -1,0 +1,134 @@
+"""A deployment: what was found out on the way from a run's controller, and what it keeps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.deployment.channels import Channel
+from ccd_casadi.deployment.discretise import Conversion, Target
+from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.deployment.reduction import Limits, Reduced
+from ccd_casadi.deployment.robust_set import MemberLoop, place_words
+from ccd_casadi.deployment.sampled import DiscreteStateSpace, SampledFigures
+from ccd_casadi.deployment.simulation import MeasuredSensitivity
+from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.statics import Statics
+from ccd_casadi.synthesis.synthesis import DesignFigures
+
+# The sampled loop keeps S_max to 5 % and ω_b to 3 %.
+SAMPLED_EXCESS, SAMPLED_BANDWIDTH = 0.05, 0.03
+
+
+@dataclass(frozen=True)
+class ChannelOrders:
+    """A channel's controllers of every order; the one chosen, and the least that keeps S_max."""
+
+    channel: Channel
+    rows: tuple[Reduced, ...]
+    chosen: Reduced
+    strict: Reduced
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A way to discretise, the rate in Hz that it needs (None: no rate will do).
+
+    `there` is the worst loop of the set at a rate that was given, None where none was.
+    """
+
+    conversion: Conversion
+    needed_hz: float | None
+    there: SampledFigures | None = None
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """Everything that was found out on the way from a run's controller to the deployed one.
+
+    `sampled` are the exact figures of the sampled loop on the nominal plant, `measured` those of
+    its simulation (None where it is unstable on any plant); `members` and `measured_members` those
+    on every other plant of the run's [robust] set. `unverified`: why the run itself is not
+    verified, empty where it is.
+    """
+
+    orders: tuple[ChannelOrders, ...]
+    limits: Limits
+    reduced: StateSpace
+    reduced_figures: DesignFigures
+    trials: tuple[Trial, ...]
+    target: Target
+    rate_hz: float
+    delay: float
+    conversion: Conversion
+    plant: DiscreteStateSpace
+    realisation: Realisation
+    sampled: SampledFigures
+    measured: MeasuredSensitivity | None
+    members: tuple[MemberLoop, ...] = ()
+    measured_members: tuple[tuple[Perturbation, MeasuredSensitivity], ...] = ()
+    unverified: str = ""
+    statics: Statics | None = None
+
+    @property
+    def order(self) -> int:
+        """States of the reduced controller."""
+        return len(self.reduced.A)
+
+    @property
+    def needed_hz(self) -> float | None:
+        """The rate that the chosen method needs."""
+        return next(t.needed_hz for t in self.trials if t.conversion == self.conversion)
+
+    @property
+    def stable(self) -> bool:
+        """Whether the sampled loop is stable on every plant."""
+        return self.sampled.stable and all(item.figures.stable for item in self.members)
+
+    @property
+    def worst(self) -> MemberLoop:
+        """The plant with the largest peak of the sampled S, the nominal one among them."""
+        nominal = MemberLoop(Perturbation(), self.sampled)
+        return max((nominal, *self.members), key=lambda item: item.badness)
+
+    @property
+    def shortfalls(self) -> tuple[str, ...]:
+        """What is not kept, on which plant, with its figure; empty where all is."""
+        found = []
+        for item in (MemberLoop(Perturbation(), self.sampled), *self.members):
+            nominal = item.at == Perturbation()
+            if not (self.target.met if nominal else self.target.held)(item.figures):
+                found.append((item.badness, f"{_fault(self, item)} ({place_words(item.at)})"))
+        words = [w for _, w in sorted(found, key=lambda pair: -pair[0])]
+        if words or self.measured is None:
+            return tuple(words)
+        pairs = [(Perturbation(), self.measured), *self.measured_members]
+        return tuple(
+            f"the simulation has a peak of S of {m.sensitivity_peak:.6g} and a bandwidth of "
+            f"{m.bandwidth / HZ:.6g} Hz ({place_words(at)})"
+            for at, m in pairs
+            if not (self.target.met if at == Perturbation() else self.target.held)(_as_figures(m))
+        )
+
+    @property
+    def passed(self) -> bool:
+        """Whether every sampled loop keeps its target, exactly and simulated, of a verified run."""
+        return not self.shortfalls and not self.unverified
+
+
+def _fault(found: Deployment, item: MemberLoop) -> str:
+    f = item.figures
+    if not f.stable:
+        return f"unstable: spectral radius {f.spectral_radius:.6g}"
+    if f.sensitivity_peak > found.target.peak:
+        return f"peak of S {missed_by(f.sensitivity_peak, found.target.S_max)}"
+    change = 100.0 * (f.bandwidth / found.target.bandwidth - 1.0)
+    return f"bandwidth {f.bandwidth / HZ:.6g} Hz ({change:+.2f} %)"
+
+
+def _as_figures(m: MeasuredSensitivity) -> SampledFigures:
+    return SampledFigures(
+        True, np.nan, m.sensitivity_peak, m.sensitivity_peak_frequency, m.bandwidth
+    )
