@@ -50,7 +50,8 @@ GROUPS = (
     ),
     Group(
         _kernels("gradients", "pullback", "bound_peak"),
-        ("tests/test_gradient_parts.py", "tests/test_derivatives.py", "tests/test_channels.py"),
+        ("tests/test_gradient_parts.py", "tests/test_derivatives.py", "tests/test_channels.py",
+         "tests/test_gamma_error.py"),
         "not both_limits",
         interpreted=True,
     ),
