@@ -10,9 +10,11 @@ Names are imported when they are first used: this module alone loads neither num
 
 import sys
 from importlib import import_module
+from pathlib import PurePath
 from types import ModuleType
 
-if sys.argv[:1] == ["-m"]:  # a command is starting, not a library: its first import is this
+# a command is starting, not a library: its first import is this
+if sys.argv[:1] == ["-m"] or PurePath(sys.argv[0] if sys.argv else "").stem == "ccd":
     import surrogates as _surrogates  # takes care of Ctrl-C while the rest is imported
 
     del _surrogates

@@ -22,11 +22,17 @@ _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
 
+def program(command: str) -> str:
+    """How a person called a module's command: `ccd solve` or `python -m ccd_casadi.solve`."""
+    called = Path(sys.argv[0]).stem if sys.argv else ""
+    return f"ccd {command.rpartition('.')[2]}" if called == "ccd" else f"python -m {command}"
+
+
 def parser(
     command: str, description: str, *, case_required: bool = False
 ) -> argparse.ArgumentParser:
     """A parser with the positional CASE and --out, --workers, --seed, --quiet."""
-    result = Parser(prog=f"python -m {command}", description=description)
+    result = Parser(prog=program(command), description=description)
     if case_required:
         result.add_argument("case", metavar="CASE.toml", type=Path, help="the case file")
     else:
@@ -65,7 +71,7 @@ def run_parser(
     about: str = "the folder of a finished solve",
 ) -> argparse.ArgumentParser:
     """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
-    result = Parser(prog=f"python -m {command}", description=description)
+    result = Parser(prog=program(command), description=description)
     result.add_argument("run", metavar=metavar, type=Path, help=about)
     _shared(result)
     return result

@@ -1,0 +1,105 @@
+"""`ccd WORD ...`: every command under one name; `ccd new NAME` begins a stage of your own."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.resources import files
+from pathlib import Path
+
+from ccd_casadi.support.command_line import ExitCode
+from surrogates.interrupts import begun
+from surrogates.options import one_line
+
+# word -> the module of its `main`, and what it does
+COMMANDS = {
+    "check": ("ccd_casadi.check", "looks at a case's plant before anything is designed"),
+    "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
+    "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
+    "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
+    "retrain": ("surrogates.retrain", "adds true samples to a run where they help most"),
+    "insight": ("ccd_casadi.insight", "weight against bandwidth; what the optimum answers to"),
+    "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
+    "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
+    "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
+}
+TEMPLATE = ("plant.py", "case.toml")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command that the first word names; without one, say what there is to do here."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words and words[0] in COMMANDS:
+        return int(import_module(COMMANDS[words[0]][0]).main(words[1:]))
+    begun()
+    if not words or words in (["--help"], ["-h"], ["help"]):
+        print(overview(Path()))
+        return ExitCode.DONE
+    if words == ["--version"]:
+        import ccd_casadi
+
+        print(f"ccd-casadi {ccd_casadi.__version__}")
+        return ExitCode.DONE
+    if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
+        return new(Path(words[1]))
+    if words[0] == "new":
+        wrong = "new takes one name, that of the folder to make, as in: ccd new my_stage"
+    else:
+        wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, 'new'))}"
+    print(one_line(wrong), file=sys.stderr)
+    return ExitCode.BAD_INPUT
+
+
+def new(folder: Path) -> int:
+    """Write a plant and a case to begin with into a folder; one that is there already is kept."""
+    there = [name for name in TEMPLATE if (folder / name).exists()]
+    if there:
+        words = f"{folder}: {' and '.join(there)} would be overwritten; choose another name"
+        print(one_line(words), file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in TEMPLATE:
+            text = (files("ccd_casadi") / "templates" / name).read_text(encoding="utf-8")
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        words = f"{folder}: cannot be written: {error.strerror}; choose another name"
+        print(one_line(words), file=sys.stderr)
+        return ExitCode.BAD_INPUT
+    case = folder / "case.toml"
+    print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted\nnext: ccd check {case}")
+    return ExitCode.DONE
+
+
+def overview(folder: Path) -> str:
+    """The commands, and the cases and finished runs that lie in a folder."""
+    lines = ["ccd WORD ..., each with --help:"]
+    lines += [f"  {word:12} {does}" for word, (_, does) in COMMANDS.items()]
+    lines += [f"  {'new':12} a plant and a case to begin with, in a folder of that name"]
+    cases = [path for path in _toml(folder) if _is_case(path)]
+    runs = [path.parent for path in sorted(folder.glob("*/result.json"))]
+    runs += [path.parent for path in sorted(folder.glob("*/*/result.json"))]
+    lines += ["", "cases here", *(f"  ccd solve {path}" for path in cases)] if cases else []
+    lines += ["", "runs here", *(f"  ccd robustness {path}" for path in runs)] if runs else []
+    if not cases:
+        lines += ["", "no case file here; begin with: ccd new my_stage"]
+    return "\n".join(lines)
+
+
+def _toml(folder: Path) -> list[Path]:
+    return [*sorted(folder.glob("*.toml")), *sorted(folder.glob("*/*.toml"))]
+
+
+def _is_case(path: Path) -> bool:
+    """Whether a TOML file reads like a case that a person wrote: not a run's resolved copy."""
+    if (path.parent / "result.json").exists():
+        return False
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    heads = [line.split("#")[0].strip() for line in text.splitlines()]
+    return "[plant]" in heads and "[objective]" in heads
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
