@@ -1,10 +1,12 @@
 """`ccd WORD ...`: every command under one name; `ccd new NAME` begins a stage of your own."""
 
+import json
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
+from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
 from surrogates.interrupts import begun
@@ -23,6 +25,12 @@ COMMANDS = {
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
 }
 TEMPLATE = ("plant.py", "case.toml")
+SCHEMA = "case.schema.json"
+OWN = {
+    "new": "a plant and a case to begin with, in a folder of that name",
+    "keys": "every table and key of a case file, as Markdown",
+    "schema": "the same as JSON Schema, for an editor",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,14 +47,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"ccd-casadi {ccd_casadi.__version__}")
         return ExitCode.DONE
+    if words == ["keys"]:
+        print(_schema().keys_page(), end="")
+        return ExitCode.DONE
+    if words == ["schema"]:
+        print(json.dumps(_schema().case_schema(), indent=1))
+        return ExitCode.DONE
     if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
         return new(Path(words[1]))
     if words[0] == "new":
         wrong = "new takes one name, that of the folder to make, as in: ccd new my_stage"
+    elif words[0] in OWN:
+        wrong = f"{words[0]} takes nothing more, as in: ccd {words[0]}"
     else:
-        wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, 'new'))}"
+        wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, *OWN))}"
     print(one_line(wrong), file=sys.stderr)
     return ExitCode.BAD_INPUT
+
+
+def _schema() -> ModuleType:
+    return import_module("ccd_casadi.cases.schema")  # loads the models of the package
 
 
 def new(folder: Path) -> int:
@@ -61,12 +81,15 @@ def new(folder: Path) -> int:
         for name in TEMPLATE:
             text = (files("ccd_casadi") / "templates" / name).read_text(encoding="utf-8")
             (folder / name).write_text(text, encoding="utf-8")
+        schema = json.dumps(_schema().case_schema(), indent=1)
+        (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:
         words = f"{folder}: cannot be written: {error.strerror}; choose another name"
         print(one_line(words), file=sys.stderr)
         return ExitCode.BAD_INPUT
     case = folder / "case.toml"
-    print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted\nnext: ccd check {case}")
+    print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted")
+    print(f"{folder / SCHEMA}: its keys, for an editor\nnext: ccd check {case}")
     return ExitCode.DONE
 
 
@@ -74,7 +97,7 @@ def overview(folder: Path) -> str:
     """The commands, and the cases and finished runs that lie in a folder."""
     lines = ["ccd WORD ..., each with --help:"]
     lines += [f"  {word:12} {does}" for word, (_, does) in COMMANDS.items()]
-    lines += [f"  {'new':12} a plant and a case to begin with, in a folder of that name"]
+    lines += [f"  {word:12} {does}" for word, does in OWN.items()]
     cases = [path for path in _toml(folder) if _is_case(path)]
     runs = [path.parent for path in sorted(folder.glob("*/result.json"))]
     runs += [path.parent for path in sorted(folder.glob("*/*/result.json"))]

@@ -1,13 +1,16 @@
 """`ccd`: one name for every command, and a stage to begin with."""
 
+import json
 import tomllib
 from importlib import import_module
 from pathlib import Path
 
+import jsonschema
 import pytest
 
-from ccd_casadi.__main__ import COMMANDS, main, overview
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.__main__ import COMMANDS, OWN, main, overview
+from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
+from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,13 +40,17 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
     built = lines[:begin] + [line.removeprefix("# ") for line in lines[begin:]]
     (folder / "built.toml").write_text("\n".join(built))
     assert problem_of(load_case(folder / "built.toml")).sections is not None
+    schema = json.loads((folder / "case.schema.json").read_text())
+    jsonschema.validate(tomllib.loads(case.read_text()), schema)
 
     assert str(case.relative_to(tmp_path)) in overview(tmp_path).replace(f"{tmp_path}/", "")
     assert main(["new", str(folder)]) == 2
     assert "would be overwritten" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", [["sovle"], ["new"], ["new", "a", "b"], ["new", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["sovle"], ["new"], ["new", "a", "b"], ["new", "--help"], ["keys", "x"]]
+)
 def test_a_wrong_word_is_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -52,6 +59,44 @@ def test_a_wrong_word_is_one_line(words: list[str], capsys: pytest.CaptureFixtur
 def test_alone_it_says_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     said = capsys.readouterr().out
-    assert all(word in said for word in (*COMMANDS, "new"))
+    assert all(word in said for word in (*COMMANDS, *OWN))
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("ccd-casadi ")
+
+
+CASES = [*sorted((ROOT / "runs").glob("*.toml")), *sorted((ROOT / "examples").glob("*/*.toml"))]
+
+
+@pytest.mark.parametrize("path", CASES, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_every_case_of_the_project_is_one_by_its_schema(path: Path) -> None:
+    jsonschema.validate(tomllib.loads(path.read_text()), case_schema())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"inner": {"S_maxx": 2.0}},
+        {"inner": {"S_max": "2"}},
+        {"objective": {"w2": 1.0}},
+        {"controller": {"structure": "pid"}},
+        {"theta": {"m1": {"lower": 1.0}}},
+        {"budget": {"force": {"level": 1.0, "unit": "lbf"}}},
+        {"typo": {}},
+    ],
+    ids=str,
+)
+def test_what_the_schema_refuses_the_checks_refuse(change: dict[str, dict[str, object]]) -> None:
+    data = tomllib.loads((ROOT / "runs/two_mass.toml").read_text())
+    changed = data | {name: data.get(name, {}) | table for name, table in change.items()}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(changed, case_schema())
+    with pytest.raises(CaseError):
+        parse_case(changed, ROOT / "runs/two_mass.toml")
+
+
+def test_the_page_of_all_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["keys"]) == 0
+    page = capsys.readouterr().out
+    assert page == (ROOT / "docs/case_file.md").read_text(), "ccd keys > docs/case_file.md"
+    assert main(["schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(case_schema()))

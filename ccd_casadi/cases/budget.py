@@ -46,13 +46,14 @@ def _corners(value: Any) -> str | None:
     return None
 
 
+CORNERS = Check(_corners, {"type": "array"})
 _NONE_OR_MORE = number(0.0, math.inf, "give 0 or more", closed=True)
-_CHECKS: dict[str, Check] = {
+TABLE_CHECKS: dict[str, Check] = {
     "name": text,
     "unit": text,
     "level": POSITIVE,
-    "zeros_hz": _corners,
-    "poles_hz": _corners,
+    "zeros_hz": CORNERS,
+    "poles_hz": CORNERS,
     "psd": rows(2),
     "file": text,
     **dict.fromkeys(PATH, _NONE_OR_MORE),
@@ -88,9 +89,9 @@ def _checked(
     entry: Mapping[str, Any], kind: Kind, place: str, folder: Path, fail: Fail
 ) -> Mapping[str, Any]:
     for key, value in entry.items():
-        if key not in _CHECKS or (key in PATH and kind is not Kind.FLOOR_MOTION):
-            raise fail(f"{place}.{key}", f"unknown key; known are {', '.join(_CHECKS)}")
-        wrong = _CHECKS[key](value)
+        if key not in TABLE_CHECKS or (key in PATH and kind is not Kind.FLOOR_MOTION):
+            raise fail(f"{place}.{key}", f"unknown key; known are {', '.join(TABLE_CHECKS)}")
+        wrong = TABLE_CHECKS[key](value)
         if wrong is not None:
             raise fail(f"{place}.{key}", wrong)
     if entry.get("unit") not in UNITS[kind]:

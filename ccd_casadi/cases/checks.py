@@ -1,12 +1,34 @@
 """Checks of single values in a case file: None where a value is good, else what is wrong and what
-to give instead."""
+to give instead. Each carries what JSON Schema can say of the same, for editors (`schema`)."""
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-Check = Callable[[Any], str | None]
+
+@dataclass(frozen=True)
+class Check:
+    """A check, called with a value, and its JSON Schema, which may let more pass."""
+
+    test: Callable[[Any], str | None]
+    schema: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, value: Any) -> str | None:
+        """What is wrong with the value, None where nothing is."""
+        return self.test(value)
+
+
+def _with(schema: Mapping[str, Any]) -> Callable[[Callable[[Any], str | None]], Check]:
+    return lambda test: Check(test, schema)
+
+
 LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
+
+
+def _list(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> dict[str, Any]:
+    schema: dict[str, Any] = {"type": "array", "items": items, "minItems": least}
+    return schema if most is None else schema | {"maxItems": most}
 
 
 def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Check:
@@ -23,7 +45,12 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
             return f"is {value:g}; give a size from {SMALLEST:g} to {LARGEST:g}, in another unit"
         return None
 
-    return check
+    schema: dict[str, Any] = {"type": "number"}
+    if math.isfinite(low):
+        schema["minimum" if closed else "exclusiveMinimum"] = low
+    if math.isfinite(high):
+        schema["exclusiveMaximum"] = high
+    return Check(check, schema)
 
 
 def count(least: int) -> Check:
@@ -33,7 +60,7 @@ def count(least: int) -> Check:
             return None
         return f"is {shown(value)}; give a whole number of at least {least}"
 
-    return check
+    return Check(check, {"type": "integer", "minimum": least})
 
 
 def choice(*names: str) -> Check:
@@ -42,17 +69,20 @@ def choice(*names: str) -> Check:
             return None
         return f"is {shown(value)}; choose one of {', '.join(names)}"
 
-    return check
+    return Check(check, {"enum": list(names)})
 
 
+@_with({"type": "string"})
 def text(value: Any) -> str | None:
     return None if isinstance(value, str) else f"is {shown(value)}; give a text in quotes"
 
 
+@_with({"type": "boolean"})
 def flag(value: Any) -> str | None:
     return None if isinstance(value, bool) else f"is {shown(value)}; give true or false"
 
 
+@_with(_list({"type": "number", "exclusiveMinimum": 0.0}, 2, 2))
 def interval(value: Any) -> str | None:
     remedy = "give two positive numbers [low, high] with low < high"
     if not isinstance(value, list | tuple) or len(value) != 2:
@@ -63,6 +93,7 @@ def interval(value: Any) -> str | None:
     return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
 
 
+@_with(_list({"type": "integer", "minimum": 2}, 2, 2))
 def points(value: Any) -> str | None:
     good = isinstance(value, list | tuple) and len(value) == 2
     if good and all(count(2)(item) is None for item in value):
@@ -70,34 +101,40 @@ def points(value: Any) -> str | None:
     return f"is {shown(value)}; give two whole numbers of at least 2"
 
 
+@_with(_list({"type": "number", "exclusiveMinimum": 0.0, "exclusiveMaximum": 1.0}, 1))
 def steps(value: Any) -> str | None:
     if isinstance(value, list | tuple) and value and all(FRACTION(v) is None for v in value):
         return None
     return f"is {shown(value)}; give a list of numbers between 0 and 1, both exclusive"
 
 
+@_with(_list({"type": "number", "exclusiveMinimum": 0.0}))
 def factors(value: Any) -> str | None:
     if isinstance(value, list | tuple) and all(POSITIVE(v) is None for v in value):
         return None
     return f"is {shown(value)}; give a list of numbers above 0"
 
 
+@_with(_list({"type": "number"}, 1))
 def direction(value: Any) -> str | None:
     if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
         return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
     return f"is {shown(value)}; give a list of numbers, one for each"
 
 
+@_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
     return None if good else f"is {shown(value)}; write tables of that name"
 
 
+@_with(_list({"type": "string", "minLength": 1}))
 def files(value: Any) -> str | None:
     good = isinstance(value, list | tuple) and all(isinstance(v, str) and v for v in value)
     return None if good else f"is {shown(value)}; give a list of file names in quotes"
 
 
+@_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
 def tables(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     good = all(isinstance(item, Mapping) for item in several)
@@ -116,7 +153,7 @@ def rows(width: int) -> Check:
         )
         return None if good else f"is {shown(value)}; give a list of rows of {width} numbers"
 
-    return check
+    return Check(check, _list(_list({"type": "number"}, width, width)))
 
 
 def too_large(value: Any) -> bool:

@@ -1,0 +1,166 @@
+"""The keys of a case file for an editor (JSON Schema) and for a person (a page), from one source.
+
+Both are made of the definitions that check a case (`sections`), so that they cannot say otherwise.
+The schema lets more pass than the checks do: what hangs on several keys is left to them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, fields
+from typing import Any
+
+from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
+from ccd_casadi.cases.sections import SECTIONS, ChannelSection
+from ccd_casadi.plants.registry import BUILDERS, MODELS
+
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_NUMBER = {"type": "number"}
+_THETA = {
+    "lower": ("number", "the least that may be chosen, in `unit`"),
+    "upper": ("number", "the most that may be chosen"),
+    "start": ("number", "where descents start; default: the middle"),
+    "unit": ("string", "for tables and pages; what the plant function takes"),
+}
+_PLANT = {
+    "model": "a model of the package; or give function",
+    "function": '"my_plant.py:model", relative to the case file: a Python function of θ',
+}
+
+
+def case_schema() -> dict[str, Any]:
+    """The JSON Schema of a case file."""
+    tables: dict[str, Any] = {
+        "plant": {
+            "type": "object",
+            "description": "The plant; every other key goes to the model or function.",
+            "properties": {
+                "model": {"enum": sorted({**MODELS, **BUILDERS}), "description": _PLANT["model"]},
+                "function": {
+                    "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],
+                },
+            },
+            "oneOf": [{"required": ["model"]}, {"required": ["function"]}],
+        },
+        "theta": {
+            "type": "object",
+            "description": "A table [theta.NAME] for each hardware parameter.",
+            "minProperties": 1,
+            "additionalProperties": {
+                "type": "object",
+                "properties": {
+                    key: {"type": kind, "description": says} for key, (kind, says) in _THETA.items()
+                },
+                "required": ["lower", "upper"],
+                "additionalProperties": False,
+            },
+        },
+    }  # fmt: skip
+    tables |= {name: _table(kind) for name, kind in SECTIONS.items()}
+    channels = tables["controller"]["properties"]["channel"]
+    channels["additionalProperties"] = _table(ChannelSection)
+    for kind, units in UNITS.items():
+        spectrum = {
+            "type": "object",
+            "properties": {key: dict(check.schema) for key, check in TABLE_CHECKS.items()},
+            "required": ["unit"],
+            "additionalProperties": False,
+        }
+        spectrum["properties"]["unit"] = {"enum": list(units)}  # type: ignore[index]
+        entry = tables["budget"]["properties"][kind.value]
+        entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
+    required = [name for name, kind in SECTIONS.items() if any(_required(f) for f in fields(kind))]
+    return {
+        "$schema": DRAFT,
+        "title": "A case of ccd-casadi",
+        "type": "object",
+        "properties": tables,
+        "required": ["plant", "theta", *required],
+        "additionalProperties": False,
+    }
+
+
+def keys_page() -> str:
+    """Every key of a case file in tables, as Markdown."""
+    lines = [
+        "# The case file",
+        "",
+        "Every table and key, made by `ccd keys` from the definitions that check a case.",
+        "An unknown key is an error. `ccd schema` prints the same as JSON Schema, for an editor",
+        "that completes and checks TOML while you write: `ccd new` puts it beside its case.",
+        "",
+        "## [plant]",
+        "",
+        *_rows([(key, "", "", says) for key, says in _PLANT.items()]),
+        "",
+        "Every other key goes to the model or the function as a keyword.",
+        "",
+        "## [theta.NAME]",
+        "",
+        *_rows(
+            [
+                (key, "required" if key in ("lower", "upper") else "", "", says)
+                for key, (_, says) in _THETA.items()
+            ]
+        ),
+    ]
+    for name, kind in {**SECTIONS, "controller.channel.NAME": ChannelSection}.items():
+        lines += ["", f"## [{name}]", ""]
+        lines += _rows(
+            [
+                (
+                    item.name,
+                    "required" if _required(item) else _shown(item.default),
+                    item.metadata["unit"],
+                    item.metadata["says"] + _values(item.metadata["check"].schema),
+                )
+                for item in fields(kind)
+            ]
+        )
+        if name == "budget":
+            lines += ["", "A spectrum is a table, or several in double brackets, with the keys "
+                      + ", ".join(f"`{key}`" for key in TABLE_CHECKS)
+                      + "; see [error budgets](error_budget.md)."]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def _table(kind: type) -> dict[str, Any]:
+    found = {}
+    for item in fields(kind):
+        unit = item.metadata["unit"]
+        says = item.metadata["says"] + (f", in {unit}" if unit else "")
+        found[item.name] = dict(item.metadata["check"].schema) | {"description": says}
+        if item.default not in (MISSING, None, ()):
+            found[item.name]["default"] = item.default
+    return {
+        "type": "object",
+        "properties": found,
+        "required": [item.name for item in fields(kind) if _required(item)],
+        "additionalProperties": False,
+    }
+
+
+def _required(item: Field[Any]) -> bool:
+    return item.default is MISSING
+
+
+def _shown(default: Any) -> str:
+    if default is None or default == ():
+        return "absent"
+    if isinstance(default, tuple):
+        return str(list(default))
+    if isinstance(default, bool):
+        return str(default).lower()
+    return f'"{default}"' if isinstance(default, str) else str(default)
+
+
+def _values(schema: Mapping[str, Any]) -> str:
+    names = ", ".join(f'"{value}"' for value in schema.get("enum", ()))
+    return f" (one of {names})" if names else ""
+
+
+def _rows(rows: list[tuple[str, str, str, str]]) -> list[str]:
+    head = ["| key | default | unit | |", "|---|---|---|---|"]
+    # a bar in the words would end the cell
+    return head + [
+        f"| `{key}` | {default} | {unit} | {says.replace('|', chr(92) + '|')} |"
+        for key, default, unit, says in rows
+    ]
