@@ -175,7 +175,7 @@ def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
         return np.nan
     kappa = structure.in_units(centre, plant.omega_0, plant.force)
     figures = judged(plant, state_space(structure, kappa), bounds, None, True)
-    worst = max(figures.over(bounds).values())
+    worst = max(bounds.shares(figures).values())
     assert worst < 1.0 + 2e-3, f"the grid's frequencies miss a peak: {worst}"
     return figures.bandwidth / HZ
 

@@ -143,7 +143,7 @@ def test_the_judge_finds_the_peaks_of_the_search(sampling: Sampling | None) -> N
         K = state_space(problem.structure, si)
         judged = certify([plant(-0.02), plant(0.02)], K, BOUNDS, sampling)
         for i, figures in enumerate(judged.plants):
-            over = figures.over(BOUNDS)
+            over = BOUNDS.shares(figures)
             assert figures.stable
             assert figures.confirmed
             for code, name in enumerate(("S_max", None, "S_low", "KS", "T", "GS")):

@@ -64,7 +64,7 @@ def test_the_design_on_lines_is_that_on_the_model() -> None:
     found = design_on_data(measured(FAST), PID, KEPT, period=FAST.period)
     assert found.usable, found.words
     assert found.figures is not None
-    assert all(ratio <= 1.0 + 1e-5 for ratio in found.figures.over(KEPT).values())
+    assert all(ratio <= 1.0 + 1e-5 for ratio in KEPT.shares(found.figures).values())
     model = synthesise_sections([plant()], PID, KEPT, sampling=FAST, starts=2)
     assert model.certified
     assert found.bandwidth == pytest.approx(model.bandwidth, rel=1e-2)

@@ -1,6 +1,7 @@
 """What a loop has to keep on every plant of a set."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from ccd_casadi.synthesis.weights import Weights
 
@@ -34,3 +35,28 @@ class Bounds:
             raise ValueError(f"shape is {self.shape}; below 1 no loop reaches -3 dB at ω_b")
         if self.weighted_level is not None and self.weights is None:
             raise ValueError("weighted_level needs the weights that KS and T are weighted with")
+
+    def shares(self, found: "Peaks") -> dict[str, float]:
+        """Every bound's figure over the bound; above 1 where it is not met."""
+        shares = {"S_max": found.S_peak / self.S_max, "S_low": found.S_low / self.S_low}
+        if self.weighted_level is not None:
+            shares["KS"] = found.weighted_KS / self.weighted_level
+            shares["T"] = found.weighted_T / self.weighted_level
+        if self.compliance_max is not None:
+            shares["GS"] = found.GS / self.compliance_max
+        return shares
+
+
+class Peaks(Protocol):
+    """What is held against bounds: the largest values over frequency, S_low at ω_low."""
+
+    @property
+    def S_peak(self) -> float: ...
+    @property
+    def S_low(self) -> float: ...
+    @property
+    def weighted_KS(self) -> float: ...
+    @property
+    def weighted_T(self) -> float: ...
+    @property
+    def GS(self) -> float: ...

@@ -54,16 +54,6 @@ class PlantFigures:
     static_compliance: float
     confirmed: bool
 
-    def over(self, bounds: Bounds) -> dict[str, float]:
-        """Every bound's figure over the bound; above 1 where it is not met."""
-        found = {"S_max": self.S_peak / bounds.S_max, "S_low": self.S_low / bounds.S_low}
-        if bounds.weighted_level is not None:
-            found["KS"] = self.weighted_KS / bounds.weighted_level
-            found["T"] = self.weighted_T / bounds.weighted_level
-        if bounds.compliance_max is not None:
-            found["GS"] = self.GS / bounds.compliance_max
-        return found
-
 
 @dataclass(frozen=True)
 class Certificate:
@@ -102,7 +92,7 @@ def certify(
     bandwidth = float(np.min([figures.bandwidth for figures in found]))
     worst: dict[str, float] = {}
     for figures in found:
-        for name, ratio in figures.over(bounds).items():
+        for name, ratio in bounds.shares(figures).items():
             worst[name] = max(worst.get(name, 0.0), ratio)
     broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip

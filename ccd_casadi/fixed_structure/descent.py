@@ -7,24 +7,19 @@ the model's own. Steps count only where loops are stable; ρ grows while a bound
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Protocol
 
-import casadi as ca
 import numpy as np
 
+from ccd_casadi.fixed_structure.elastic_programme import FLAT, ROWS, Answer, solve_elastic
 from ccd_casadi.fixed_structure.figures import Constraints
-from ccd_casadi.fixed_structure.trust_region import OPTIONS
 from ccd_casadi.support.arrays import Array
 
 PENALTIES = (20.0, 200.0, 2000.0)  # the next one where a bound is left passed
 FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.2, 1.0, 1e-7
 LEAST_GAIN = 1e-9
-FLAT = 1e-4  # least curvature
 CONVEXIFYING = 10.0  # times AᵀA of the active rows
 MOST = 200  # steps with one penalty
-ROWS = (64, 128, 300)  # sizes of programmes, so that few solvers are made
-KEPT = 1e-7  # by how much a programme's answer may miss its own rows
 
 
 @dataclass(frozen=True)
@@ -76,15 +71,17 @@ def _with_penalty(
     def merit(at: Point) -> float:
         return at.value - reward * at.tau + penalty * at.violation
 
-    def solved(rows: Constraints, value: Array, hessian: Array) -> tuple | None:
+    def solved(rows: Constraints, value: Array, hessian: Array) -> Answer | None:
         low, high = np.full(n + 1, -radius), np.full(n + 1, radius)
         low[:n] = np.minimum(np.maximum(box[0] - point.kappa, -radius), 0.0)
         high[:n] = np.maximum(np.minimum(box[1] - point.kappa, radius), 0.0)
         low[n] = min(max(floor - point.tau, -radius), 0.0)
         cost = np.append(point.slope, -reward)
         slopes = np.column_stack([rows.to_kappa, rows.to_tau])
-        found = _programme(slopes, value, cost, hessian, low, high, penalty)
-        return None if found is None else (*found[:2], found[2] + penalty * point.violation)
+        found = solve_elastic(slopes, value, cost, hessian, low, high, penalty)
+        if found is None:
+            return None
+        return found._replace(gain=found.gain + penalty * point.violation)
 
     for turn in range(1, MOST + 1):
         steps = turn
@@ -146,39 +143,3 @@ def _chosen(point: Point, radius: float) -> Constraints:
     slack = rows.value + radius * (np.abs(rows.to_kappa).sum(1) + np.abs(rows.to_tau))
     chosen = np.flatnonzero(slack > 0.0)
     return rows.only(chosen[np.argsort(-slack[chosen], kind="stable")[: ROWS[-1]]])
-
-
-def _programme(
-    slopes: Array,
-    value: Array,
-    cost: Array,
-    hessian: Array,
-    low: Array,
-    high: Array,
-    penalty: float,
-) -> tuple[Array, Array, float] | None:
-    """p, the multipliers of value + slopes·p <= σ, and -(cost·p + ½ pᵀHp + ρ σ)."""
-    m, n = slopes.shape
-    size = next(size for size in ROWS if size >= m)
-    A = np.zeros((size, n + 1))
-    A[:m, :n], A[:m, n] = slopes, -1.0
-    upper = np.ones(size)
-    upper[:m] = -value
-    H = np.zeros((n + 1, n + 1))
-    H[:n, :n], H[n, n] = hessian, FLAT
-    ends = np.append(low, 0.0), np.append(high, 1e4)
-    for name in ("daqp", "ipqp"):
-        solver = _solver(name, n + 1, size)
-        found = solver(h=H, g=np.append(cost, penalty), a=A, lba=-np.inf, uba=upper,
-                       lbx=ends[0], ubx=ends[1])  # fmt: skip
-        x = np.array(found["x"]).ravel()
-        if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
-            mu = np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
-            return x[:n], mu, -float(found["cost"])
-    return None
-
-
-@lru_cache(maxsize=32)
-def _solver(name: str, n: int, rows: int) -> ca.Function:
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-    return ca.conic("programme", name, shapes, {"error_on_fail": False, **OPTIONS[name]})

@@ -86,16 +86,6 @@ class MeasuredFigures:
     weighted_T: float
     words: str
 
-    def over(self, bounds: Bounds) -> dict[str, float]:
-        """Every bound's figure over the bound; above 1 where it is not met."""
-        found = {"S_max": self.S_peak / bounds.S_max, "S_low": self.S_low / bounds.S_low}
-        if bounds.weighted_level is not None:
-            found["KS"] = self.weighted_KS / bounds.weighted_level
-            found["T"] = self.weighted_T / bounds.weighted_level
-        if bounds.compliance_max is not None:
-            found["GS"] = self.GS / bounds.compliance_max
-        return found
-
 
 def read_frequency_response(path: str | Path) -> MeasuredResponse:
     """A CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or

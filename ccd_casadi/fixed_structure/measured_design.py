@@ -102,7 +102,7 @@ def design_on_data(
         measured, controller, bounds, period=period, unstable_poles=unstable_poles,
         poles_at_zero=poles_at_zero, integrator=structure.integrator,
     )  # fmt: skip
-    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in figures.over(bounds).items()
+    broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in bounds.shares(figures).items()
               if figures.stable and not ratio <= 1.0 + 1e-5]  # fmt: skip
     words = figures.words
     if broken:

@@ -10,32 +10,22 @@ CasADi's DAQP, or by its interior-point method where that one fails.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.elastic_programme import FLAT, ROWS, solve_elastic
 from ccd_casadi.fixed_structure.figures import Assessment, Constraints, LoopProblem, assess
 from ccd_casadi.support.arrays import Array
 
 FIRST_RADIUS = 0.2
 LARGEST_RADIUS = 1.5
 PENALTY = 20.0  # above the sum of multipliers: a per cent of a bound is worth so many of ω_b
-ROWS = (64, 128, 256, 400)  # sizes of programmes, so that few solvers are made
-FLAT = 1e-4  # least curvature, which leaves a linear programme one
 ENOUGH = 0.7  # of the predicted gain: with it a model is trusted further
 STEADY = 3  # steps at one radius, each of a middling gain, after which a larger one is tried
 WIDER = 10.0
 PROGRAMMES = 6  # around each other, for one step
 SETTLED = 1e-2  # of the radius: a step that moves less from one programme to the next
-KEPT = 1e-7  # by how much a programme's answer may miss its own rows
-# The dual active-set method is fast, the interior-point method misses nothing.
-OPTIONS: dict[str, dict[str, Any]] = {
-    "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}},
-    "ipqp": {"print_iter": False, "print_header": False, "print_info": False},
-}
 CONVEXIFYING = 10.0  # times AᵀA of the active rows: changes nothing along them
 
 
@@ -192,36 +182,17 @@ def _programme(
     penalty: float,
 ) -> tuple[Array, Array] | None:
     """p and the multipliers of the rows value + slopes·p <= σ; H acts on p less the centre."""
-    m, n = slopes.shape
-    size = next(size for size in ROWS if size >= m)
-    A = np.zeros((size, n + 1))
-    A[:m, :n], A[:m, n] = slopes, -1.0
-    upper = np.ones(size)
-    upper[:m] = -value
-    H = np.zeros((n + 1, n + 1))
-    H[:n, :n], H[n, n] = hessian, FLAT
-    cost = np.concatenate([-hessian @ centre, [penalty]])
+    n = slopes.shape[1]
+    cost = -hessian @ centre
     cost[n - 1] -= 1.0
-    low, high = np.full(n + 1, -radius), np.full(n + 1, radius)
+    low, high = np.full(n, -radius), np.full(n, radius)
     low[: n - 1] = np.minimum(np.maximum(problem.box[0] - point.kappa, -radius), 0.0)
     high[: n - 1] = np.maximum(np.minimum(problem.box[1] - point.kappa, radius), 0.0)
     # Where nothing bounds ω_b it stops at the end of the grid instead of running away.
     room = float(np.log(problem.plants.frequency(problem.base[-1]))) - point.tau
     high[n - 1] = max(min(radius, room), -radius)
-    low[n], high[n] = 0.0, 1e4
-    for name in ("daqp", "ipqp"):
-        solver = _solver(name, n + 1, size)
-        found = solver(h=H, g=cost, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
-        x = np.array(found["x"]).ravel()
-        if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
-            return x[:n], np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
-    return None
-
-
-@lru_cache(maxsize=64)
-def _solver(name: str, n: int, rows: int) -> ca.Function:
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-    return ca.conic("programme", name, shapes, {"error_on_fail": False, **OPTIONS[name]})
+    found = solve_elastic(slopes, value, cost, hessian, low, high, penalty)
+    return None if found is None else found[:2]
 
 
 def _rows(found: Assessment, radius: float) -> tuple[Constraints, np.ndarray]:
