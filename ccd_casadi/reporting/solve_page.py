@@ -96,7 +96,9 @@ def report_html(
     """The report's text; the bar counts its sections."""
     result = solution.result
     status = result["status"]
-    title = f"Co-design of {case.path.stem}"
+    # what `ccd new` makes is named by its folder
+    named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
+    title = f"Co-design of {named}"
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
     head = header(
         title,
