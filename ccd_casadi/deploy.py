@@ -105,7 +105,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
     if run.problem.sections is not None:
-        orders = f"{orders.partition(' of ')[0]}, as designed"
+        orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
         ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),

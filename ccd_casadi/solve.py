@@ -72,6 +72,14 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
     return [f"design plant  {robust['design_at']}{beside}"]
 
 
+def _gains(controller: Mapping[str, Any]) -> str:
+    """`4.7e+05 N/m`, of several channels one after the other by name."""
+    channels = controller.get("channels")
+    if channels is None:
+        return f"{controller['gain']:.4g} N/m"
+    return ", ".join(f"{item['name']} {item['gain']:.4g} N/m" for item in channels)
+
+
 def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
     from ccd_casadi.codesign.budget_result import budget_lines
@@ -89,7 +97,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant   predicted "
         f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
-        f"controller    order {controller['order']}, gain {controller['gain']:.4g} N/m",
+        f"controller    order {controller['order']}, gain {_gains(controller)}",
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
         f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deployment.anti_windup import limited
-from ccd_casadi.deployment.channels import split
+from ccd_casadi.deployment.channels import Channel, split
 from ccd_casadi.deployment.discretise import (
     FASTEST,
     Conversion,
@@ -31,10 +32,14 @@ from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction
 from ccd_casadi.deployment.robust_set import WorstFirst, section_members
 from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.timing import Discretisation, Timing
+from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.inner_problem.sections_bandwidth import structure_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import measure
 
 DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 
@@ -52,9 +57,8 @@ def deploy_as_designed(
     Where the case gives no rate, the one that is needed is searched as for any controller.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
-    channel = split(run.plant, K)[0]
     G, designed = run.plant.plant_si(), sections.sampling
-    whole = Reduced(len(K.A), Reduction.NONE, K, full)
+    orders = _channels(run)
     limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
     tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
     if designed is None:
@@ -99,17 +103,40 @@ def deploy_as_designed(
         raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
     rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
     delay, period = timing.delay_at(rate), 1.0 / rate
-    single = discretise(K, best.conversion, period, delay)
-    realisation = limited(realise([channel], [single], saturation), full.bandwidth)
+    singles = [discretise(item.channel.controller, best.conversion, period, delay)
+               for item in orders]  # fmt: skip
+    channels = [item.channel for item in orders]
+    realisation = limited(realise(channels, singles, saturation), full.bandwidth)
     plants = SampledSet(run, dense, period, delay)
     sampled, checked = plants.figures(realisation)
     progress("simulation")
     worst = [max(checked, key=lambda item: item.badness).at] if checked else []
     stable = sampled.stable and all(item.figures.stable for item in checked)
     measured, simulated = plants.simulated(realisation, worst, seed) if stable else (None, ())
-    orders = (ChannelOrders(channel, (whole,), whole, whole),)
     return Deployment(
         orders, limits, K, full, tuple(trials), target, rate, delay, best.conversion,
         plants.nominal, realisation, sampled, measured, checked, simulated, unverified(run),
         statics_of(run, realisation.system),
     )  # fmt: skip
+
+
+def _channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:
+    """The sections of every channel as they are; figures of each on its own entry of the plant."""
+    structure, kappa = structure_of(run.problem), run.kappa
+    assert kappa is not None
+    if isinstance(structure, Structure):
+        channel = split(run.plant, run.controller)[0]
+        whole = Reduced(len(run.controller.A), Reduction.NONE, run.controller, run.figures)
+        return (ChannelOrders(channel, (whole,), whole, whole, (structure, kappa)),)
+    found = []
+    for i, (own, values) in enumerate(structure.split(kappa)):
+        u, v = structure.decoupling.outputs[:, [i]], structure.decoupling.inputs[:, [i]]
+        plant = replace(run.plant, B=run.plant.B @ v, C=u.T @ run.plant.C, channels=())
+        K = state_space(own, values)
+        channel = Channel(structure.decoupling.names[i], u, v, plant, K)
+        figures = measure(
+            plant, K, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
+        )
+        alone = Reduced(len(K.A), Reduction.NONE, K, figures)
+        found.append(ChannelOrders(channel, (alone,), alone, alone, (own, values)))
+    return tuple(found)

@@ -163,7 +163,7 @@ def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
         "method": item.chosen.method.value,
         "smallest_order_at_S_max": item.strict.order,
         "orders": [_row(row) for row in item.rows],
-        "sections": _sections(K, run) if scalar else None,
+        "sections": _sections(item, run) if scalar else None,
     }
 
 
@@ -174,10 +174,10 @@ def _row(row: Reduced) -> dict[str, Any]:
     )
 
 
-def _sections(K: StateSpace, run: FinishedRun) -> dict[str, Any]:
-    if run.problem.sections is not None and run.kappa is not None:
-        return sections_dict(run.problem.sections.structure, run.kappa)
-    found = sections_of(K, run.figures.bandwidth)
+def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
+    if item.designed is not None:
+        return sections_dict(*item.designed)
+    found = sections_of(item.chosen.controller, run.figures.bandwidth)
     return {
         "gain": found.gain,
         "gain_at_bandwidth": found.gain_at_bandwidth,

@@ -11,9 +11,11 @@ from ccd_casadi.deployment.reduction import Limits, Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
 from ccd_casadi.deployment.sampled import DiscreteStateSpace, SampledFigures
 from ccd_casadi.deployment.simulation import MeasuredSensitivity
+from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -24,12 +26,16 @@ SAMPLED_EXCESS, SAMPLED_BANDWIDTH = 0.05, 0.03
 
 @dataclass(frozen=True)
 class ChannelOrders:
-    """A channel's controllers of every order; the one chosen, and the least that keeps S_max."""
+    """A channel's controllers of every order; the one chosen, and the least that keeps S_max.
+
+    `designed`: structure and κ (SI) of sections, which are deployed as they are.
+    """
 
     channel: Channel
     rows: tuple[Reduced, ...]
     chosen: Reduced
     strict: Reduced
+    designed: tuple[Structure, Array] | None = None
 
 
 @dataclass(frozen=True)

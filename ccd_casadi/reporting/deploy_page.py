@@ -14,7 +14,6 @@ from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
 from ccd_casadi.deployment.words import reason_words
-from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.deploy_move import move_html
@@ -280,6 +279,9 @@ def _orders(item: ChannelOrders, run: FinishedRun) -> str:
             row.order, row.method.value, f.sensitivity_peak, f.bandwidth / HZ, f.sensitivity_low,
             f.gamma / run.figures.gamma if f.certified else float("nan"), result,
         ))  # fmt: skip
+    if item.designed is not None:
+        words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
+        return paragraph(words)
     words = (
         f"Channel {item.channel.name}: of {item.rows[0].order} states {item.chosen.order} are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
@@ -294,8 +296,8 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
     if K.D.shape != (1, 1):
         words = "This controller does not fall apart into scalar channels: no sections."
         return paragraph(words)
-    if run.problem.sections is not None and run.kappa is not None:
-        return _as_designed(run.problem.sections.structure, run.kappa)
+    if item.designed is not None:
+        return _as_designed(item)
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
@@ -309,10 +311,15 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
     return paragraph(words) + table_html(Table(head, rows))
 
 
-def _as_designed(structure: Structure, kappa: Array) -> str:
+def _as_designed(item: ChannelOrders) -> str:
+    assert item.designed is not None
+    structure, kappa = item.designed
     parts = section_words(structure, kappa)
     rows = tuple((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in parts)
-    words = f"Gain {number(gain_of(kappa), 6)} N/m; the sections as they were designed."
+    words = (
+        f"Channel {item.channel.name}: gain {number(gain_of(kappa), 6)} N/m; the sections as they "
+        "were designed."
+    )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
     return paragraph(words) + table_html(Table(head, rows))
 

@@ -112,15 +112,20 @@ def gains_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Lo
         return Panel("frequency (Hz)", label, (curve,), (band,), levels=tuple(levels), log_x=True,
                      log_y=True, x_range=x, legend="lower right")  # fmt: skip
 
+    def gain(of: str) -> str:  # of several channels the largest singular value
+        return f"|{of}|" if len(loops.L) else f"σ_max({of})"
+
     at = Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz", True)
-    S = panel("|S| (–)", loops.S, (Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
-              Level(2**-0.5, "-3 dB", colour=GREY), at))  # fmt: skip
-    KS, T = panel("|KS| (N/m)", loops.KS, (at,)), panel("|T| (–)", loops.T, (at,))
+    asked = Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY)
+    S = panel(f"{gain('S')} (–)", loops.S, (asked, Level(2**-0.5, "-3 dB", colour=GREY), at))
+    KS = panel(f"{gain('KS')} (N/m)", loops.KS, (at,))
+    T = panel(f"{gain('T')} (–)", loops.T, (at,))
     svg = figure_lines([[S], [KS, T]], key="sections-loop", heights=(3.4, 2.6),
                        title="S, KS and T of every plant of the set over frequency")  # fmt: skip
     rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
     table = Table(
-        ("Hz", "|S| model", "|S| least", "|S| largest", "|KS| largest N/m", "|T| largest"),
+        ("Hz", f"{gain('S')} model", f"{gain('S')} least", f"{gain('S')} largest",
+         f"{gain('KS')} largest N/m", f"{gain('T')} largest"),
         tuple(
             (float(loops.hz[i]), float(abs(loops.S[0, i])), float(np.abs(loops.S[:, i]).min()),
              float(np.abs(loops.S[:, i]).max()), float(np.abs(loops.KS[:, i]).max()),
