@@ -1,15 +1,7 @@
-"""What is prompt on a machine that others use too."""
+"""How long a test waits for another process: until something happens, never how long it takes.
 
-import subprocess
-import sys
-import time
+The machine may be busy. Where a process must end without waiting for its work, that work sleeps
+for much longer than this.
+"""
 
-
-def prompt(seconds: float = 2.0) -> float:
-    """`seconds` of an idle machine here and now, by the start of a Python: 0.05 s where idle.
-
-    Measured after what is judged, under the same load; never less than `seconds`.
-    """
-    began = time.monotonic()
-    subprocess.run([sys.executable, "-S", "-c", ""], check=True)
-    return seconds * max(1.0, (time.monotonic() - began) / 0.05)
+HANGS = 300.0  # seconds without what is waited for, after which the other process is taken to hang

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import pytest
-from busy import prompt
 from rows import sample
 
 from ccd_casadi.cases.case import load_case, problem_of
@@ -173,8 +172,7 @@ def test_a_lock_that_lasts_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         began = time.monotonic()
         with pytest.raises(SampleStoreError, match="another process holds it; wait or stop"):
             store.put([sample("c")])
-        waited = time.monotonic() - began
-        assert 0.15 < waited < prompt(5.0)
+        assert time.monotonic() - began > 0.15, "it waited for as long as it was told"
         with pytest.raises(SampleStoreError, match="another process holds it"):
             SampleStore(path)
         assert store.count() == 2, "readers are not held up by a writer"

@@ -97,21 +97,21 @@ def _objective(problem: CoDesignProblem, x: Array) -> float:
 def front(tmp_path_factory: pytest.TempPathFactory) -> Front:
     problem = problem_of(load_case(TWO_MASS))
     with SampleStore(tmp_path_factory.mktemp("front") / "samples.sqlite") as store:
-        return pareto_front(Sampler(problem, store, Workers(1)), points=5)
+        return pareto_front(Sampler(problem, store, Workers(1)), points=4)
 
 
 def test_front_is_verified_and_spans_the_costs(front: Front) -> None:
-    assert [point.verified for point in front.points] == [True] * 5
+    assert [point.verified for point in front.points] == [True] * 4
     costs = [point.hardware_cost for point in front.points]
-    assert costs == pytest.approx(np.linspace(110.0, 140.0, 5), abs=1e-6)
+    assert costs == pytest.approx(np.linspace(110.0, 140.0, 4), abs=1e-6)
     assert front.points[0].bandwidth / (2.0 * np.pi) == pytest.approx(72.0452, abs=1e-3)
 
 
 def test_no_other_masses_of_the_same_sum_are_faster(front: Front) -> None:
     problem = problem_of(load_case(TWO_MASS))
-    for point in front.points[1:4]:
+    for point in front.points[1:3]:
         low, high = max(55.0, point.hardware_cost - 70.0), min(70.0, point.hardware_cost - 55.0)
-        for m1 in np.linspace(low, high, 9):
+        for m1 in np.linspace(low, high, 5):
             other = true_inner(problem, (m1, point.hardware_cost - m1)).bandwidth
             assert not other > point.bandwidth * (1.0 + 1e-3)
 

@@ -47,7 +47,9 @@ def test_the_optimum_is_found_past_designs_without_derivatives(
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("formulation", ["direct", "lifted", "nested"])
+@pytest.mark.parametrize(
+    "formulation", ["direct", "lifted", pytest.param("nested", marks=pytest.mark.slow)]
+)
 def test_without_any_derivatives_nothing_is_claimed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -58,7 +58,7 @@ def test_a_repeated_job_does_nothing(camel_copy: Path) -> None:
     assert after == before
 
 
-@pytest.mark.parametrize("after", [3, 10])
+@pytest.mark.parametrize("after", [pytest.param(3, marks=pytest.mark.slow), 10])
 def test_an_interrupted_job_resumes(
     camel_run: tuple[Path, Any, Outcome], tmp_path: Path, after: int
 ) -> None:

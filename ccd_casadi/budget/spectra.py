@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
-from scipy.signal import tf2ss
 
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -109,6 +108,8 @@ class ShapedSpectrum:
         top = np.trim_zeros(np.atleast_1d(top), "f") * np.sqrt(self.level)
         if len(top) > len(bottom):
             raise ValueError("a shaping filter needs as many poles as zeros; give more poles")
+        from scipy.signal import tf2ss  # slow to import, and every command imports this module
+
         A, B, C, D = tf2ss(top, bottom)
         if len(bottom) == 1:
             A, B, C = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))

@@ -10,7 +10,6 @@ numbers.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import control
 import numpy as np
 
 from ccd_casadi.deployment.channels import Channel, assemble
@@ -63,7 +62,9 @@ def realise(
 def _block_diagonal(K: DiscreteStateSpace) -> tuple[StateSpace, list[int]]:
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
-    A, T, sizes = control.bdschur(K.A, condmax=CONDITION)
+    from control import bdschur  # it takes a second to import, and reports import this module
+
+    A, T, sizes = bdschur(K.A, condmax=CONDITION)
     B, C = np.linalg.solve(T, K.B), K.C @ T
     start = 0
     for size in sizes:

@@ -13,15 +13,17 @@ theta_names, theta_units. `ss(K.A, K.B, K.C, K.D, K.Ts)` makes it a system.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 import scipy.io
 
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+
+if TYPE_CHECKING:
+    import control  # a second to import: where it is called, and not before
 
 PARTS = ("A", "B", "C", "D")
 LONGEST_NAME = 63  # of a variable in MATLAB
@@ -60,8 +62,10 @@ def named_controller(controller: StateSpace, period: float = 0.0) -> NamedSystem
     return NamedSystem(controller, inputs, outputs, "m", "N", period)
 
 
-def to_control(named: NamedSystem, name: str = "") -> control.StateSpace:
+def to_control(named: NamedSystem, name: str = "") -> "control.StateSpace":
     """The same matrices as `control.StateSpace`, signals named, dt = period."""
+    import control
+
     parts = [getattr(named.system, part).copy() for part in PARTS]
     signals: dict[str, Any] = {"inputs": list(named.inputs), "outputs": list(named.outputs)}
     if name:
@@ -74,6 +78,8 @@ def from_control(system: Any) -> tuple[StateSpace, float]:
 
     Raises UserError where it is no linear system, or is discrete without a sampling period.
     """
+    import control
+
     if not isinstance(system, control.StateSpace | control.TransferFunction):
         words = "is no control.StateSpace or control.TransferFunction; convert it with control.ss"
         raise UserError(f"{type(system).__name__}: {words}")
