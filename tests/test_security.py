@@ -43,6 +43,7 @@ BY_NAME = {
     "ccd_casadi/kernels/compilation.py",
     "ccd_casadi/kernels/compiled.py",
     "ccd_casadi/__init__.py",
+    "ccd_casadi/__main__.py",
 }
 TRAP = """
 import pathlib
