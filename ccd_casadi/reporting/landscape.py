@@ -13,7 +13,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 
-GRID = 33  # points per parameter of a landscape
+GRID = 25  # points per parameter of a landscape
 MANY = 80  # samples with gradients above which the landscape's grid is made coarser
 TABLE_STEP = 4  # of the grid, in the table
 
