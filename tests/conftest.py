@@ -1,6 +1,7 @@
 """One BLAS thread: the matrices are small, and figures then repeat to the last digit."""
 
 import fcntl
+import gc
 import os
 import shutil
 import signal
@@ -32,6 +33,12 @@ for profile, repeat in (("same", True), ("study", False)):
         suppress_health_check=[HealthCheck.too_slow],
     )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+
+def pytest_collection_finish() -> None:
+    """What is collected lasts: without this the garbage collector walks it a thousand times."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 @pytest.fixture(scope="session")

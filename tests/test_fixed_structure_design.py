@@ -162,7 +162,7 @@ def test_pid_alone_is_the_best_of_a_grid() -> None:
     problem = problem_for([plant()], structure, bounds)
     centre = in_problem_units(problem, made.kappa)
     tau = np.log(made.bandwidth / problem.plants.omega_0)
-    axes = [np.linspace(-0.4, 0.4, 7)] * 3
+    axes = [np.linspace(-0.4, 0.4, 5)] * 3
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     better = tau + np.log(1.005)
     values = [assess(problem, np.clip(centre + d, *problem.box), better).violation for d in grid]
@@ -170,11 +170,11 @@ def test_pid_alone_is_the_best_of_a_grid() -> None:
 
 
 def test_what_cannot_be_had_is_said(design) -> None:
-    none = synthesise_sections([plant()], SMALL, replace(EASY, S_low=1e-5), starts=3)
+    none = synthesise_sections([plant()], SMALL, replace(EASY, S_low=1e-5), starts=1)
     assert none.outcome is SectionsOutcome.BOUND_NOT_MET
     assert "S_LOW" in none.short
     turned = replace(plant(), B=-plant().B)
-    lost = synthesise_sections([turned], Structure(lead=0, biquads=0, roll_off=1), EASY, starts=2)
+    lost = synthesise_sections([turned], Structure(lead=0, biquads=0, roll_off=1), EASY, starts=1)
     assert lost.outcome is SectionsOutcome.NO_STABLE_START
     assert lost.controller is None
 

@@ -107,7 +107,9 @@ def check_against_dense_sweep(theta: tuple[float, float], points: int) -> float:
     return 1.0 - best / dense
 
 
-@pytest.mark.parametrize("theta", [(60.0, 60.0), (58.33, 55.0)])
+@pytest.mark.parametrize(
+    "theta", [(60.0, 60.0), pytest.param((58.33, 55.0), marks=pytest.mark.slow)]
+)
 def test_optimum_is_not_below_a_dense_sweep(theta: tuple[float, float]) -> None:
     assert check_against_dense_sweep(theta, 60) < 1e-6
 

@@ -20,6 +20,7 @@ from ccd_casadi.codesign.outer_problem import (
     nested_program,
     solve_program,
 )
+from ccd_casadi.codesign.sequential import design_hardware, first_resonance
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
 
 W1, W2 = 0.0995, -0.9950
@@ -234,3 +235,13 @@ def test_lambda_and_the_bounds_on_s_are_kept_together(tmp_path: Path) -> None:
     assert best.x[2] == pytest.approx(np.log(60.0 * HZ) + np.log(1.75) / 0.3, rel=1e-8)
     assert best.multipliers_g[0] > 1.0
     assert best.multipliers_g[2] == pytest.approx(W1 - W2, rel=1e-6)
+
+
+def test_hardware_of_a_first_resonance_is_the_equal_masses_that_have_it() -> None:
+    """From equal masses, by symmetry: the lightest pair beside them that is stiff enough."""
+    case = problem(start=(66.0, 66.0))
+    wanted = first_resonance(case, np.array([62.0, 62.0]))[0]
+    found = design_hardware(case, wanted, starts=0)
+    assert found.met
+    assert found.theta == pytest.approx((62.0, 62.0), rel=1e-6)
+    assert found.first_resonance == pytest.approx(wanted, rel=1e-6)

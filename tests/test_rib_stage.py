@@ -216,7 +216,7 @@ def quadrature_matrices(mesh: Mesh, theta: Array, material: Material) -> tuple[A
 
 
 def test_the_affine_sum_is_the_matrix_assembled_by_quadrature() -> None:
-    order = plain(3, 2, 2)
+    order = plain(2, 2, 2)
     stage = RibStage(order=order)
     disc, theta = discretisation(stage), np.array(MIDDLE)
     K, M = quadrature_matrices(build_mesh(order, 0.3), theta, Material())

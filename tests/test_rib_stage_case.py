@@ -142,6 +142,7 @@ def test_the_references_judge_the_same_controller(problem: CoDesignProblem) -> N
     )
 
 
+@pytest.mark.slow
 def test_the_least_mass_at_a_first_resonance(problem: CoDesignProblem) -> None:
     hardware = design_hardware(problem, HZ * 250.0, starts=0)
     assert hardware.met

@@ -51,6 +51,7 @@ def lines(theta: np.ndarray, bay: int, rib: int, layers: list[int]) -> tuple[np.
     return np.append(np.concatenate(parts), edges[-1]), z
 
 
+@pytest.mark.slow
 def test_scikit_fem_has_the_same_frequencies_on_the_same_mesh() -> None:
     """27-node elements of scikit-fem on the whole stage, order two everywhere here."""
     skfem = pytest.importorskip("skfem")

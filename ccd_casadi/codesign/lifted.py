@@ -31,6 +31,7 @@ REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated
 # IPOPT aims this far inside ln S_max and ln S_low: about the surrogates' error at the end, so
 # that the truth is feasible there and has nothing left to be polished.
 MARGIN = 1e-7
+FRESH = 4  # of the starts, one in so many is new in a round after the first
 FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 
@@ -91,7 +92,9 @@ def solve_lifted(
         program = lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
         spread = design("sobol", lower, upper, options.starts, seed + round_number)
         if incumbent is not None:
-            spread = np.vstack([incumbent.x, spread[: options.starts // 2]])
+            # One sample moves the surrogates' optima, and seldom makes one: the last round's lead.
+            known = [] if solution is None else [optimum.x for optimum in solution.optima]
+            spread = np.vstack([incumbent.x, *known, spread[: options.starts // FRESH]])
         try:
             solution = solve_program(program, spread)
         except OuterFailure as error:

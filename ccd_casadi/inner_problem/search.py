@@ -33,7 +33,6 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
     points = [np.array([a, b]) for a in grids[0] for b in grids[1]]
     designs = [_design(plant, weights, problem, bounds, point) for point in points]
     fine = np.linspace(0.0, 1.0, FINE)
-    mesh = np.stack(np.meshgrid(fine, fine, indexing="ij"), axis=-1).reshape(-1, 2)
     for _ in range(ADDED):
         usable = [i for i, design in enumerate(designs) if design.figures.certified]
         if not usable:
@@ -41,7 +40,7 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
         X = np.array([points[i] for i in usable])
         Y = np.array([_values(designs[i]) for i in usable])
         dY = np.array([_slopes(designs[i], width) for i in usable])
-        new = _next_point(problem, mesh, _interpolate(X, Y, dY, mesh), X, designs)
+        new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), X, designs)
         if new is None:
             break
         points.append(new)
@@ -89,47 +88,51 @@ def _slopes(design: Sensitivities, width: Array) -> Array:
     return slopes * width
 
 
-def _interpolate(X: Array, Y: Array, dY: Array, at: Array) -> Array:
-    """Gaussian radial-basis interpolant of values and gradients; columns of Y at the points.
+def _interpolate(X: Array, Y: Array, dY: Array, fine: Array) -> Array:
+    """Gaussian radial-basis interpolant of values and gradients (n, q) on the mesh, (q, f, f).
 
-    Its lengths are given, and one factor serves all outputs, so that the covariance alone is
-    taken from `surrogates`.
+    A Gaussian of two variables is the product of one of each: on a mesh φ = e_1 e_2ᵀ, and
+    cov(f, ∂_j f_b) = z_j φ, so that matrix products of (f, n) give every point. The lengths are
+    given, and one factor serves all outputs.
     """
     x, one = X / LENGTHS, np.ones(X.shape[1])
     K = covariance(Kernel.RBF, x, x, one, gradients_of_a=True, gradients_of_b=True)
     K[np.diag_indices_from(K)] += 1e-8
     mean = Y.mean(axis=0)
     data = np.vstack([Y - mean] + [dY[:, :, i] * LENGTHS[i] for i in range(X.shape[1])])
-    weights = cho_solve(cho_factor(K), data)
-    return mean + covariance(Kernel.RBF, at / LENGTHS, x, one, gradients_of_b=True) @ weights
+    by_value, by_S, by_T = cho_solve(cho_factor(K), data).T.reshape(-1, 3, 1, len(X)).swapaxes(0, 1)
+    z_S, z_T = (fine[:, None] / LENGTHS[i] - x[:, i] for i in range(2))
+    e_S, e_T = np.exp(-0.5 * z_S**2), np.exp(-0.5 * z_T**2)
+    found = (e_S * (by_value + z_S * by_S)) @ e_T.T + (e_S * by_T) @ (z_T * e_T).T
+    return mean[:, None, None] + found
 
 
 def _next_point(
-    problem: InnerProblem, mesh: Array, predicted: Array, X: Array, designs: list[Sensitivities]
+    problem: InnerProblem, fine: Array, predicted: Array, X: Array, designs: list[Sensitivities]
 ) -> Array | None:
     """The best predicted point over the connected parts of the predicted feasible set.
 
     None when every part's best is no better than the incumbent or next to a known design.
     """
     levels = np.log([problem.S_max, problem.S_low])
-    inside = ((predicted[:, 1:3] <= levels).all(axis=1)).reshape(FINE, FINE)
+    excess = (predicted[1:] - levels[:, None, None]).max(axis=0)
+    inside = excess <= 0.0
     best = max(
         (np.log(d.figures.bandwidth) for d in designs if problem.feasible(d.figures)),
         default=-np.inf,
     )
     if not inside.any():
-        excess = (predicted[:, 1:3] - levels).max(axis=1)
-        candidates = [int(np.argmin(excess))] if best == -np.inf else []
+        least = np.unravel_index(int(np.argmin(excess)), excess.shape)
+        candidates = [least] if best == -np.inf else []
     else:
         from scipy.ndimage import label, maximum_position  # slow to import
 
         parts, count = label(inside)
-        merit = predicted[:, 0].reshape(FINE, FINE)
-        places = maximum_position(merit, parts, range(1, count + 1))
-        candidates = [int(i * FINE + j) for i, j in places]
-        candidates = [i for i in candidates if predicted[i, 0] > best + 1e-4]
-        candidates.sort(key=lambda i: -predicted[i, 0])
-    for index in candidates:
-        if np.abs(X - mesh[index]).max(axis=1).min() > 0.6 / (FINE - 1):
-            return mesh[index]
+        places = maximum_position(predicted[0], parts, range(1, count + 1))
+        candidates = [place for place in places if predicted[0][place] > best + 1e-4]
+        candidates.sort(key=lambda place: -predicted[0][place])
+    for place in candidates:
+        point = fine[list(place)]
+        if np.abs(X - point).max(axis=1).min() > 0.6 / (FINE - 1):
+            return point
     return None

@@ -13,8 +13,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
 
-GRID = 33  # points per parameter of a landscape
-MANY = 80  # samples with gradients above which the landscape's grid is made coarser
+GRID = 25  # points per parameter of a landscape
+COARSER = 17  # the same where there are many samples
+MANY = 80  # samples with gradients above which it is that
 TABLE_STEP = 4  # of the grid, in the table
 
 
@@ -46,7 +47,7 @@ def landscape_data(
 ) -> Landscape:
     """The landscape over two parameters; `radius` (a share of the box) of the trust region."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
-    count = GRID if not processes or len(processes[0].X) <= MANY else GRID // 2 + 1
+    count = GRID if not processes or len(processes[0].X) <= MANY else COARSER
     axes = [np.linspace(lower[k], upper[k], count) for k in range(2)]
     thetas = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     field = np.empty((0, 0))
