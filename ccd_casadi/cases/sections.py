@@ -57,10 +57,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ObjectiveSection:
-    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s."""
+    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; of `minimise = "rms_error"` w2 e, m."""
 
     w1: float = _key(number(0.0, math.inf, "give 0 or more: J is minimised", closed=True))
-    w2: float = _key(number(-math.inf, 0.0, "give a negative number: J must reward bandwidth"))
+    w2: float = _key(number(-math.inf, math.inf, "give a negative number: J must reward bandwidth"))
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.statics import Statics, sampled_statics
+from ccd_casadi.synthesis.statics import Statics, statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
 # A reduced controller keeps S_max to 0.5 % (it binds at most optima, where any change passes it a
@@ -251,8 +251,10 @@ def _unverified(run: FinishedRun) -> str:
 
 
 def _statics(run: FinishedRun, K: DiscreteStateSpace) -> Statics:
-    at = K.response(np.array([run.figures.bandwidth]))[0]
-    return sampled_statics(run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), at)
+    return statics(
+        run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), bandwidth=run.figures.bandwidth,
+        omega_low=run.problem.inner.omega_low, period=K.period,
+    )  # fmt: skip
 
 
 class _Loops:
