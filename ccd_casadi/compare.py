@@ -36,10 +36,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.comparison import compare, comparison_dict
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.inner_problem.problem import plant_of
+    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
 
     case = load_case(options.case)
     problem = problem_of(case)
+    require_bandwidth(problem, "compare")
     plant_of(problem)
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)

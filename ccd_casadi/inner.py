@@ -99,6 +99,7 @@ def _sections(
         judged_widely,
         prepared,
         sections_of_problem,
+        too_slow,
         with_range,
         worst_members,
     )
@@ -112,16 +113,17 @@ def _sections(
         answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
         _print(answer, (), options, began)
         return ExitCode.INFEASIBLE
-    if sections.minimise == "rms_error":
-        if made.bandwidth < sections.bandwidth_least:
-            words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
-            words += f", inner.bandwidth_least_hz asks for {sections.bandwidth_least / HZ:.4g} Hz"
+    value = made.bandwidth
+    if sections.of_error:
+        if not too_slow(asked, made).certified:
+            words = too_slow(asked, made).words
             answer = head | {"status": "infeasible", "reason": words, "syntheses": 1}
             _print(answer, (), options, began)
             return ExitCode.INFEASIBLE
         fastest = made.bandwidth
         asked, least = least_error_at(asked, theta, made, tell)
         made = least.design
+        value = least.error if problem.w2 > 0.0 else made.bandwidth
         head["least_error"] = {
             "error_rms_of_set": least.error,
             "error_rms_at_largest_bandwidth": least.first_error,
@@ -136,7 +138,7 @@ def _sections(
         **design_dict(asked, made),
         "active": active_of(made),
         "feasible": True,
-        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * made.bandwidth,
+        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * value,
         "robust": {
             "plants": checked,
             "passed": wide.passed,
@@ -158,10 +160,11 @@ def _design(
     problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
 ) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
     from ccd_casadi.codesign.budget_result import budget_entry
-    from ccd_casadi.codesign.result import clean, controller_dict, figures_dict
+    from ccd_casadi.codesign.result import clean, compliance_dict, controller_dict, figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.inner_problem.sweep import active_constraints
     from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
+    from ccd_casadi.synthesis.statics import statics
     from ccd_casadi.synthesis.synthesis import synthesise
 
     plant = scaled_plant(problem, theta)
@@ -170,14 +173,23 @@ def _design(
         problem.weights.at(*point),
         omega_low=problem.inner.omega_low,
         gamma_backoff=problem.inner.gamma_backoff,
+        compliance=True,
     )
     made = handed_out(plant, made, problem.inner.omega_low)
     figures = made.figures
     feasible = problem.inner.feasible(figures)
+    compliance: dict[str, Any] = {}
+    if figures.certified:
+        rest = statics(
+            plant.plant_si(), made.controller, bandwidth=figures.bandwidth,
+            omega_low=problem.inner.omega_low,
+        )  # fmt: skip
+        compliance = compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
     status = "verified" if figures.certified else "not_verified"
     answer = {
         "status": status,
         **clean(figures_dict(figures)),
+        **compliance,
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [

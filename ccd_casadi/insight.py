@@ -24,13 +24,14 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.post_optimal import post_optimal
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_insight import sections_front, sections_responses
-    from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
 
     began = perf_counter()
     done = read_run(options.run)
+    require_bandwidth(done.problem, "insight")
     folder = run_folder(options.run, options.out or options.run)
     theta, tolerance = np.array(done.theta), done.case.outer.tolerance
     with (

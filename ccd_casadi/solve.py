@@ -45,6 +45,7 @@ def summary(solution: "Solution") -> str:
         f"omega_T = {result['omega_T_hz']:.5g} Hz",
         f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        f"compliance    {result.get('compliance_words', 'not known')}",
         f"certificate   {'passed' if result['certificate']['passed'] else 'FAILED'}: norm "
         f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
@@ -95,14 +96,12 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         *terminal_lines(result),
         f"theta         {theta}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
-        f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant   predicted "
-        f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
+        *inner_value_lines(result),
         f"controller    order {controller['order']}, gain {_gains(controller)}",
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
         f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
-        f"compliance    {1e6 * result['compliance_max']:.4g} um/N at most, "
-        f"{1e6 * result['static_compliance']:.4g} um/N static",
+        f"compliance    {result['compliance_words']}",
         f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
         f"{certificate['plants']} plants: {certificate['norm']:.7g} of a bound at most, poles left "
         f"of {certificate['max_real_pole']:.4g} 1/s",
@@ -119,6 +118,19 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
+    """What J counts of the controller, and what was predicted of it."""
+    error = f"(error {result['verification_error']:.1e})"
+    bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant"
+    if result.get("minimise") != "rms_error":
+        return [f"{bandwidth}   predicted {result['surrogate_bandwidth_hz']:.4f} Hz {error}"]
+    nm = [1e9 * result[key] for key in ("error_rms_of_set", "surrogate_error_rms")]
+    return [
+        f"RMS error     {nm[0]:.6g} nm over the set   predicted {nm[1]:.6g} nm {error}",
+        bandwidth,
+    ]
 
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:

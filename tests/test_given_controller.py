@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
-from ccd_casadi.synthesis.statics import statics
+from ccd_casadi.synthesis.statics import Statics, statics
 
 TABLE = """
 gain = 3.0e5
@@ -80,10 +80,16 @@ def test_a_loop_that_it_does_not_hold_is_refused(two_mass_run: Path, tmp_path: P
         with_controller(read_run(two_mass_run), tmp_path / "k.toml")
 
 
+def at_rest(run: FinishedRun, K: StateSpace) -> Statics:
+    return statics(
+        run.plant.plant_si(), K, bandwidth=run.figures.bandwidth,
+        omega_low=run.problem.inner.omega_low,
+    )  # fmt: skip
+
+
 def test_the_loop_at_rest_is_the_limit_of_low_frequencies(two_mass_run: Path) -> None:
     run = read_run(two_mass_run)
-    at = responses(run.plant, run.controller, np.array([run.figures.bandwidth]))[1][0]
-    found = statics(run.plant.plant_si(), run.controller, at)
+    found = at_rest(run, run.controller)
     G, K, S = responses(run.plant, run.controller, np.array([1e-4 * HZ]))
     assert found.stiffness == pytest.approx(abs(K[0, 0, 0]), rel=1e-3)
     assert found.compliance == pytest.approx(abs((S @ G)[0, 0, 0]), rel=1e-3)
@@ -95,6 +101,8 @@ def test_an_integrator_is_infinitely_stiff(two_mass_run: Path, tmp_path: Path) -
     run = read_run(two_mass_run)
     (tmp_path / "k.toml").write_text(TABLE)
     K = read_controller(tmp_path / "k.toml").system
-    found = statics(run.plant.plant_si(), K, np.eye(1))
+    found = at_rest(run, K)
     assert found.compliance == 0.0
+    low = responses(run.plant, K, np.array([run.problem.inner.omega_low]))
+    assert found.low == pytest.approx(abs((low[2] @ low[0])[0, 0, 0]), rel=1e-9)
     assert not found.differentiates

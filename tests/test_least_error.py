@@ -38,7 +38,6 @@ def test_the_error_of_a_set_has_its_gradient() -> None:
     assert slope @ way == pytest.approx((ends[0] - ends[1]) / (2.0 * h), abs=1e-6)
 
 
-@pytest.mark.slow
 def test_the_least_error_keeps_bounds_and_bandwidth_and_is_stationary() -> None:
     plants = [plant(0.01)]
     problem, kappa = loop(3, PID, FAST)

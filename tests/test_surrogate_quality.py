@@ -117,7 +117,7 @@ def test_lifted_fits_the_kernel_that_the_case_names(two_mass_run: Path) -> None:
     problem = problem_of(load_case(two_mass_run / "case.toml"))
     with SampleStore(two_mass_run / "samples.sqlite") as store:
         rows = stored_designs(store, problem)[:20]
-    samples = [quantity_sample(tuple(x), row, len(problem.names)) for x, row in rows]
+    samples = [quantity_sample(tuple(x), row, problem.inner) for x, row in rows]
     named = fit_quantities(problem, samples, 0, kind="rbf")
     assert {p.kernel.value for p in named} == {"rbf"}
     plain = fit_quantities(problem, samples, 0)

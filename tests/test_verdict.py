@@ -36,6 +36,7 @@ from ccd_casadi.reporting import verdict as shown
 from ccd_casadi.sampling.sampler import BandwidthSample
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
+from ccd_casadi.synthesis.statics import Statics
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
 from surrogates import design
 
@@ -51,9 +52,7 @@ SOUND = Survival(
     delay=1e-3,
     modulus=0.6,
     unstable_poles_hz=(),
-    static_stiffness=1e6,
-    static_compliance=1e-6,
-    static_share=0.5,
+    statics=Statics(1e6, 1e-6, 0.5, 2e-6, 1.0),
 )
 
 
@@ -118,7 +117,8 @@ def test_its_own_set_or_an_unstable_closer_model_fails() -> None:
 
 
 def test_a_differentiator_is_said_to_be_one() -> None:
-    words = v.survives(replace(SOUND, static_share=1e-3, static_compliance=4e-5), S_max=2.0).words
+    soft = replace(SOUND, statics=replace(SOUND.statics, share=1e-3, compliance=4e-5))
+    words = v.survives(soft, S_max=2.0).words
     assert "differentiator" in words
     assert "4e-05 m" in words
     assert "differentiator" not in v.survives(SOUND, S_max=2.0).words
@@ -193,9 +193,9 @@ def test_static_figures_are_those_of_the_loop_at_rest() -> None:
     )
     K = made.controller
     K0 = (K.D - K.C @ np.linalg.solve(K.A, K.B)).item()
-    assert found.static_stiffness == pytest.approx(abs(K0), rel=1e-6)
+    assert found.statics.stiffness == pytest.approx(abs(K0), rel=1e-6)
     # the suspension's spring adds little to a stage of 110 kg at 0.1 Hz
-    assert found.static_compliance == pytest.approx(1.0 / K0, rel=0.02)
+    assert found.statics.compliance == pytest.approx(1.0 / K0, rel=0.02)
 
 
 @pytest.mark.parametrize("robust", [None, RobustSet(0.001, 3, (), 0.001)])

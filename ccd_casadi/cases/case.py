@@ -409,6 +409,10 @@ def problem_of(case: Case) -> CoDesignProblem:
             omega_T=(HZ * inner.omega_T_hz[0], HZ * inner.omega_T_hz[1]),
             gamma_backoff=inner.gamma_backoff,
             sweep_points=inner.sweep_points,
+            # sections bound it themselves, on every plant of theirs
+            compliance_max=None
+            if case.controller.structure == "sections"
+            else inner.compliance_max,
         ),
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,

@@ -34,7 +34,7 @@ _OF_SECTIONS = {
     "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
     "robust": ("mode_shift", "gain", "plants"),
-    "inner": ("shape", "compliance_max", "minimise", "bandwidth_least_hz"),
+    "inner": ("shape", "minimise", "bandwidth_least_hz"),
 }
 _OF_H_INFINITY = {
     "robust": ("shifts", "design_at"),
@@ -55,6 +55,12 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     if controller.structure != WITH_DISTURBANCE and sections["weights"].disturbance is not None:
         words = f'has an effect with controller.structure = "{WITH_DISTURBANCE}" only; drop it, '
         raise fail("weights.disturbance", words + "or choose that structure")
+    w2, of_error = sections["objective"].w2, sections["inner"].minimise == "rms_error"
+    if w2 == 0.0 or (w2 > 0.0 and not (structured and of_error)):
+        remedy_of_w2 = "give a negative number: J must reward bandwidth"
+        if structured and of_error:
+            remedy_of_w2 = "give a positive number: J counts the RMS error in m"
+        raise fail("objective.w2", f"is {w2!r}; {remedy_of_w2}")
     for name, keys in other.items():
         table = sections[name]
         for item in fields(table):
@@ -63,7 +69,6 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     if not structured:
         return
     inner, budget = sections["inner"], sections["budget"]
-    of_error = inner.minimise == "rms_error"
     if of_error and not any(getattr(budget, kind.value) for kind in Kind):
         words = 'is "rms_error", and no spectrum says what moves the stage; add [budget.force]'
         raise fail("inner.minimise", f"{words} or another")

@@ -158,13 +158,14 @@ def with_function(
             for item in result["robust"]["set"]
         )
         seed = int(result["seed"])
+        of_error = tuple(tuple(map(float, k)) for k in result.get("error_anchors", ()))
     except (KeyError, TypeError, ValueError):
         words = "anchors, robust.set and seed are not those of a solve; solve the case again"
         raise UserError(f"{path}: {words}") from None
     own = len(structure_of(problem).names)
-    if any(len(kappa) != own for kappa in anchors):
+    if any(len(kappa) != own for kappa in (*anchors, *of_error)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
-    found = replace(sections, anchors=anchors, members=members, seed=seed)
+    found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=of_error)
     return with_range(replace(problem, sections=found))
 
 

@@ -59,16 +59,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ObjectiveSection:
-    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s."""
+    """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; of `minimise = "rms_error"` w2 e, m."""
 
     w1: float = _key(
         number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
         says="what a unit of the hardware cost f(θ) weighs in J",
     )
     w2: float = _key(
-        number(-math.inf, 0.0, "give a negative number: J must reward bandwidth"),
-        says="what bandwidth is worth in J; negative",
-        unit="1/(rad/s)",
+        number(-math.inf, math.inf, "give a negative number: J must reward bandwidth"),
+        says="what bandwidth is worth in J, negative, in 1/(rad/s); of an RMS error positive, 1/m",
     )
 
 

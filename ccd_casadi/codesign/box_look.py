@@ -149,7 +149,7 @@ def _spread(
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
         more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
         solve: list[Array] = list(more)
-        if more and len(processes) == 3 and _trustworthy(processes, seed):
+        if more and len(processes) > 1 and _trustworthy(processes, seed):
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
             order = np.argsort(hopes)
             keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
@@ -195,7 +195,7 @@ def _optimistic_objective(
     lower, upper = lifted_bounds(problem)
     axes = [np.linspace(lower[k], upper[k], MESH) for k in (-2, -1)]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    levels = np.log([problem.inner.S_max, problem.inner.S_low])
+    levels = problem.inner.levels
     plant = plant_of(problem)
     out = np.empty(len(thetas))
     for i, theta in enumerate(thetas):

@@ -17,7 +17,7 @@ from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
-from ccd_casadi.inner_problem.sweep import missed_by
+from ccd_casadi.inner_problem.sweep import LABELS, missed_by
 from ccd_casadi.plants.plant import theta_words
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
@@ -190,14 +190,10 @@ def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
 
 
 def missed_words(problem: CoDesignProblem, figures: DesignFigures) -> str:
-    """Which of S_max and S_low a design misses, and by how much; empty where it keeps both."""
-    inner = problem.inner
+    """Which bounds a design misses, and by how much; empty where it keeps them all."""
     found = [
-        f"{label} {missed_by(value, bound)} where {name} = {bound:g} is asked"
-        for name, label, value, bound in (
-            ("S_max", "peak of S", figures.sensitivity_peak, inner.S_max),
-            ("S_low", "|S(j omega_low)|", figures.sensitivity_low, inner.S_low),
-        )
-        if value > bound
+        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is asked"
+        for name, (of, bound) in problem.inner.bounds.items()
+        if (value := getattr(figures, of)) > bound
     ]
     return " and ".join(found)

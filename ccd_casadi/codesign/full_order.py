@@ -160,6 +160,7 @@ def _climbed(
     problem: CoDesignProblem, sections: SectionsProblem, kappa: Array, theta: Sequence[float]
 ) -> float:
     """ω_b in rad/s where the climbs from the design and the anchors end on another set or loop."""
+    sections = replace(sections, minimise="bandwidth")
     asked = joined(replace(problem, sections=sections), kappa, ())
     value = sections_value(asked, theta)
     return value.bandwidth if value.feasible else float("nan")

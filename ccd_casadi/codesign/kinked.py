@@ -102,7 +102,7 @@ def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) 
         return None
     gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
     g = g.copy()
-    g[:2] += INSIDE
+    g[: len(problem.inner.bounds)] += INSIDE
     peaks = other_peaks(problem, x, design, BAND)
     tags = [(name, 0.0, 0) for name in names]
     tags[0] = ("peak", float(np.log(design.figures.sensitivity_peak_frequency)), -1)

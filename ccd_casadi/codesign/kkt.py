@@ -3,8 +3,9 @@
     min J(x) = w1 f(θ) + w2 ω_b(x),  x = (θ, ln ω_S, ln ω_T),
     g(x) = (ln‖S‖∞ - ln S_max, ln σ_max(S(jω_low)) - ln S_low, λ(θ)) <= 0,  bounds,
 
-with the total derivatives of the true synthesis. Variables are scaled to the unit box, and the
-residual to the gradient of J: r = ‖∇J + Aᵀμ‖∞/‖∇J‖∞ with μ >= 0 by non-negative least squares.
+and ln‖GS‖∞ - ln compliance_max where that is given, with the total derivatives of the true
+synthesis. Variables are scaled to the unit box, and the residual to the gradient of J: r = ‖∇J +
+Aᵀμ‖∞/‖∇J‖∞ with μ >= 0 by non-negative least squares.
 
 ‖S‖∞ has a kink where two local peaks are equal (or two plants of a robust set), and ω_b jumps where
 a local maximum of σ_max(S) below it reaches -3 dB. Where the plain conditions fail, every such peak
@@ -185,12 +186,11 @@ def lagrangian_parts(
     gradient = problem.w2 * total[0]
     gradient[:count] += problem.w1 * df.ravel()
     lam_values = np.array(plant.hardware(theta)[1]).ravel()
-    levels = np.log([problem.inner.S_max, problem.inner.S_low])
-    g = np.concatenate([design.values[1:3] - levels, lam_values])
+    g = np.concatenate([design.values[1:-1] - problem.inner.levels, lam_values])
     jacobian = np.vstack(
-        [total[1:3], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])]
+        [total[1:-1], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])]
     )
-    names = ("S_max", "S_low", *plant.constraint_names)
+    names = (*problem.inner.bounds, *plant.constraint_names)
     return gradient * width, g, jacobian * width, names
 
 

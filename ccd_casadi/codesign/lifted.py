@@ -32,6 +32,7 @@ REFIT = 1.25  # growth of the samples at which the hyperparameters are estimated
 # that the truth is feasible there and has nothing left to be polished.
 MARGIN = 1e-7
 FRESH = 4  # of the starts, one in so many is new in a round after the first
+OUTPUTS = ("bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low", "ln_compliance")
 FEASIBLE = 1e-6  # slack in ln S_max and ln S_low for a candidate that the polish then mends
 
 
@@ -116,7 +117,7 @@ def solve_lifted(
         if agreed and (iterate.step <= STEP or settled):
             break
     if incumbent is None:
-        message = "no design near the predicted optima meets S_max and S_low"
+        message = "no design near the predicted optima meets " + ", ".join(problem.inner.bounds)
         return FormulationResult(None, None, tuple(iterates), processes, solution, False, message)
     x = np.array(incumbent.x)
     message = "" if agreed else "prediction and truth did not agree within the budget"
@@ -130,11 +131,11 @@ def fit_quantities(
     gradients: bool = True,
     kind: str = "matern52",
 ) -> tuple[GaussianProcess, ...]:
-    """Processes of ω_b (rad/s), ln‖S‖∞ and ln σ_max(S(jω_low)) over x = (θ, ln ω_S, ln ω_T)."""
+    """Processes of ω_b (rad/s) and ln of each bounded figure over x = (θ, ln ω_S, ln ω_T)."""
     lower, upper = lifted_bounds(problem)
     X = np.array([sample.x for sample in samples])
-    Y = np.array([sample.values[:3] for sample in samples])
-    dY = np.array([sample.gradients[:3] for sample in samples]) if gradients else None
+    Y = np.array([sample.values[:-1] for sample in samples])
+    dY = np.array([sample.gradients[:-1] for sample in samples]) if gradients else None
     found = [
         fit_outputs(X, Y, lower=lower, upper=upper, dY=dY, seed=seed, starts=1, kernel=kernel)
         for kernel in kernels_of(kind)
@@ -171,10 +172,10 @@ def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
 
 
 def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
-    """Largest violation of ln S_max, ln S_low and λ."""
-    levels = np.log([problem.inner.S_max, problem.inner.S_low]) - MARGIN
+    """Largest violation of λ and, in ln, of a bound."""
+    levels = problem.inner.levels - MARGIN
     lam = constraint_values(plant_of(problem), sample.x[: len(problem.names)])
-    return float(np.concatenate([sample.values[1:3] - levels, lam]).max())
+    return float(np.concatenate([sample.values[1:-1] - levels, lam]).max())
 
 
 def _better(
@@ -196,13 +197,13 @@ def _iterate(
     sample: QuantitySample,
     predicted: Array,
 ) -> Iterate:
-    """Error: the largest of ω_b (relative), ln‖S‖∞ and ln|S(jω_low)| (absolute)."""
+    """Error: the largest of ω_b (relative) and of ln of the bounded figures (absolute)."""
     lower, upper = lifted_bounds(problem)
     count = len(problem.names)
     cost = problem.w1 * hardware_cost(plant_of(problem), sample.x[:count])
     error = np.inf
     if sample.certified:
-        errors = np.abs(sample.values[:3] - predicted)
+        errors = np.abs(sample.values[:-1] - predicted)
         errors[0] /= sample.values[0]
         error = float(errors.max())
     step = np.inf

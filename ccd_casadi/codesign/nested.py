@@ -87,7 +87,7 @@ def solve_nested(
         program = replace(program, lower=low, upper=high)
         try:
             solution = solve_program(
-                program, _starts(local, low, high, options.starts, seed + round_number)
+                program, _starts(problem, local, low, high, options.starts, seed + round_number)
             )
         except OuterFailure:
             radius *= 0.5
@@ -134,7 +134,7 @@ def fit_bandwidth(
     kind: str = "matern52",
     gradients: bool = False,
 ) -> GaussianProcess:
-    """An interpolating Gaussian process of ω_b*(θ) in rad/s over the whole box.
+    """An interpolating Gaussian process of ω_b*(θ) in rad/s (or the error in m) over the box.
 
     With `gradients` of those samples that have one, if most do.
     """
@@ -143,7 +143,7 @@ def fit_bandwidth(
     samples = sloped if gradients else samples
     dY = np.array([sample.gradient for sample in samples]) if gradients else None
     X = np.array([sample.theta for sample in samples])
-    Y = np.array([sample.bandwidth for sample in samples])
+    Y = np.array([sample.value for sample in samples])
     lower, upper = box(problem)
     noise = 1e-7 * float(np.abs(Y).max())
     return best_left_out(
@@ -161,7 +161,7 @@ def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
 
 def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.bandwidth
+    return problem.w1 * cost + problem.w2 * sample.value
 
 
 def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> BandwidthSample:
@@ -194,11 +194,16 @@ def _local(
 
 
 def _starts(
-    samples: list[BandwidthSample], low: Array, high: Array, count: int, seed: int
+    problem: CoDesignProblem,
+    samples: list[BandwidthSample],
+    low: Array,
+    high: Array,
+    count: int,
+    seed: int,
 ) -> Array:
     """The best samples inside the region and a Sobol set over it."""
     inside = [s for s in samples if (low <= s.theta).all() and (s.theta <= high).all()]
-    top = sorted(inside, key=lambda s: -s.bandwidth)[: max(1, count // 4)]
+    top = sorted(inside, key=lambda s: problem.w2 * s.value)[: max(1, count // 4)]
     spread = design("sobol", low, high, max(count - len(top), 1), seed)
     return np.vstack([np.array([s.theta for s in top]).reshape(-1, len(low)), spread])
 
@@ -212,14 +217,14 @@ def _iterate(
 ) -> Iterate:
     lower, upper = box(problem)
     cost = problem.w1 * hardware_cost(plant_of(problem), sample.theta)
-    error = abs(predicted / sample.bandwidth - 1.0) if sample.feasible else np.inf
+    error = abs(predicted / sample.value - 1.0) if sample.feasible else np.inf
     step = np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max()
     return Iterate(
         theta=sample.theta,
         predicted=predicted,
-        truth=sample.bandwidth,
+        truth=sample.value,
         predicted_objective=cost + problem.w2 * predicted,
-        objective=cost + problem.w2 * sample.bandwidth if sample.feasible else np.inf,
+        objective=cost + problem.w2 * sample.value if sample.feasible else np.inf,
         error=float(error),
         step=float(step),
         radius=radius,

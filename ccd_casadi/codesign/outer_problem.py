@@ -3,8 +3,8 @@
     min  w1 f(θ) + w2 ω_b   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0        (paper, equation (9))
 
 `nested` puts the surrogate ω_b*(θ) for ω_b; `lifted` has ω_S and ω_T as variables too, with
-‖S‖∞ <= S_max and σ_max(S(jω_low)) <= S_low as explicit constraints on surrogates; `direct` is
-the lifted problem on the true quantities.
+‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low and ‖GS‖∞ <= compliance_max as explicit constraints on
+surrogates; `direct` is the lifted problem on the true quantities.
 """
 
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ def lifted_program(
     exact_hessian: bool = True,
     margin: float = MARGIN,
 ) -> NonlinearProgram:
-    """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln‖S‖∞, ln|S(jω_low)|."""
+    """The problem over (θ, ln ω_S, ln ω_T) with quantities(x) -> ω_b, ln of what is bounded."""
     plant = plant_of(problem)
     count = len(problem.names)
     x = ca.MX.sym("x", count + 2)
@@ -97,16 +97,16 @@ def lifted_program(
     q = quantities(x)
     f, lam = _hardware(plant, theta)
     inner = problem.inner
-    levels = np.log([inner.S_max, inner.S_low]) - margin
+    levels = inner.levels - margin
     lower, upper = lifted_bounds(problem)
     return NonlinearProgram(
         x=x,
         f=problem.w1 * f + problem.w2 * q[0],
-        g=ca.vertcat(q[1] - levels[0], q[2] - levels[1], lam),
+        g=ca.vertcat(q[1 : 1 + len(levels)] - levels, lam),
         lower=lower,
         upper=upper,
         variables=(*problem.names, "omega_S", "omega_T"),
-        constraints=("S_max", "S_low", *plant.constraint_names),
+        constraints=(*inner.bounds, *plant.constraint_names),
         exact_hessian=exact_hessian and plant.exact_hessian,
     )
 

@@ -150,14 +150,13 @@ def _level(parameter: _Parameter, constraint: str) -> float:
 def _parameters(
     problem: CoDesignProblem, x: Array, bandwidth: float, slope_f: Array, slope_b: Array
 ) -> Iterator[_Parameter]:
-    """w1, w2, S_max, S_low, the level of each λ, and the bounds of θ, ω_S, ω_T."""
+    """w1, w2, the inner problem's bounds, the level of each λ, and the bounds of θ, ω_S, ω_T."""
     none = np.zeros(x.size)
     cost = float(plant_of(problem).hardware(x[: len(problem.names)])[0])
     yield _Parameter("w1", problem.w1, slope_f, cost=cost)
     yield _Parameter("w2", problem.w2, slope_b, cost=float(bandwidth))
-    inner = problem.inner
-    yield _Parameter("S_max", inner.S_max, none, {"S_max": -1.0 / inner.S_max})
-    yield _Parameter("S_low", inner.S_low, none, {"S_low": -1.0 / inner.S_low})
+    for name, (_, bound) in problem.inner.bounds.items():
+        yield _Parameter(name, bound, none, {name: -1.0 / bound})
     for name in plant_of(problem).constraint_names:
         yield _Parameter(f"{name} <= 0", 0.0, none, {name: -1.0})
     lower, upper = lifted_bounds(problem)

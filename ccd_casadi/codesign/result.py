@@ -32,6 +32,7 @@ from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.statics import compliance_words
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from surrogates import Quality
 from surrogates.files import write_whole
@@ -53,7 +54,18 @@ def figures_dict(figures: DesignFigures) -> dict[str, Any]:
         "sensitivity_peak": figures.sensitivity_peak,
         "sensitivity_peak_hz": figures.sensitivity_peak_frequency / HZ,
         "sensitivity_low": figures.sensitivity_low,
+        "compliance_max": figures.compliance,
         "certificate": asdict(figures.certificate),
+    }
+
+
+def compliance_dict(most: float, at_rest: float, low: float, low_hz: float) -> dict[str, Any]:
+    """What a force moves, m/N: ‖GS‖∞, at rest (0: an integrator) and at ω_low; and in words."""
+    return {
+        "compliance_max": most,
+        "static_compliance": at_rest,
+        "low_compliance": low,
+        "compliance_words": compliance_words(most, at_rest, low, low_hz),
     }
 
 
@@ -92,6 +104,7 @@ def result_dict(
     why = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
     result = {
         **figures_dict(figures),
+        **_compliance(verified),
         "status": "not_verified" if failed else "verified",
         "reason": "; ".join(part for part in (why, outcome.message) if part) if failed else "",
         "verdict": verdict_dict(verdict),
@@ -137,6 +150,16 @@ def result_dict(
     return clean(result)
 
 
+def _compliance(verified: VerifiedDesign) -> dict[str, Any]:
+    """Nothing where the loop is not certified."""
+    if verified.survival is None:
+        return {}
+    rest = verified.survival.statics
+    return compliance_dict(
+        verified.design.figures.compliance, rest.compliance, rest.low, rest.low_hz
+    )
+
+
 def verdict_of(
     outcome: FormulationResult,
     verified: VerifiedDesign,
@@ -157,6 +180,8 @@ def verdict_of(
             norm=figures.certificate.norm,
             norm_bound=figures.certificate.norm_bound,
             peak=figures.sensitivity_peak,
+            bounds=problem.inner.bounds,
+            compliance=figures.compliance,
         ),
         optimal=optimal(
             residual=verified.kkt.stationarity,

@@ -22,12 +22,14 @@ from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
 from ccd_casadi.codesign.run import conclude, rescue, solution_of_sections, write_run
 from ccd_casadi.codesign.sections_run import conclude_sections, seeded_and_prepared
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.sampler import BandwidthSample, QuantitySample, Sampler, quantity_sample
@@ -39,7 +41,6 @@ from ccd_casadi.support.user_code import permit_user_code
 from surrogates import GaussianProcess
 from surrogates.truth import NAMES, Observations, TruthError, TruthInterrupted
 
-OUTPUTS = ("bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low")
 PageWriter = Callable[[Path, Case, CoDesignProblem, Solution], object]
 CLOSE = 1e-2  # of the box: a verified design so near is where the next verification starts
 
@@ -60,6 +61,7 @@ def open_run(
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
+        require_bandwidth(problem, "retrain")
         formulation = _formulation(folder)
         with (
             pool(scheduler, workers, PATIENCE) as evaluators,
@@ -91,7 +93,7 @@ class CoDesignTruth:
         self.structured = problem.sections is not None
         self.nested = self.structured or formulation == "nested"  # x = θ
         self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
-        self.outputs = OUTPUTS[:1] if self.nested else OUTPUTS
+        self.outputs = OUTPUTS[: 1 if self.nested else 1 + len(problem.inner.bounds)]
         self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
         self.tolerance = case.outer.tolerance if tolerance is None else tolerance
         self.objective, self.constraints = _functions(problem, self.nested)
@@ -108,9 +110,9 @@ class CoDesignTruth:
         if self.nested:
             known = stored_thetas(self.sampler.store, problem)
             return self._bandwidths(self.sampler.bandwidths(known) if len(known) else [])
-        count = len(problem.names)
         designs = stored_designs(self.sampler.store, problem)
-        return self._quantities([quantity_sample(tuple(x), row, count) for x, row in designs])
+        rows = [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
+        return self._quantities(rows)
 
     def evaluate(self, X: Array) -> Observations:
         """New syntheses, through the store."""
@@ -186,10 +188,10 @@ class CoDesignTruth:
         return x
 
     def _quantities(self, samples: list[QuantitySample]) -> Observations:
-        d = len(self.lower)
+        d, k = len(self.lower), 1 + len(self.sampler.problem.inner.bounds)
         X = np.array([s.x for s in samples]).reshape(-1, d)
-        Y = np.array([s.values[:3] for s in samples]).reshape(-1, 3)
-        dY = np.array([s.gradients[:3] for s in samples]).reshape(-1, 3, d)
+        Y = np.array([s.values[:-1] for s in samples]).reshape(-1, k)
+        dY = np.array([s.gradients[:-1] for s in samples]).reshape(-1, k, d)
         Y[[not s.certified for s in samples]] = np.nan
         return Observations(X, Y, dY)
 
@@ -216,18 +218,18 @@ def _function_of(
 
 
 def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.Function]:
-    """J(x, y) = w1 f(θ) + w2 ω_b, and g(x, y): ln S_max and ln S_low where lifted, and λ(θ)."""
+    """J(x, y) = w1 f(θ) + w2 ω_b, and g(x, y): ln of the bounds where lifted, and λ(θ)."""
     plant = plant_of(problem)
     count = len(problem.names)
     x = ca.MX.sym("x", count + (0 if nested else 2))
-    y = ca.MX.sym("y", 1 if nested else 3)
+    levels = problem.inner.levels
+    y = ca.MX.sym("y", 1 if nested else 1 + len(levels))
     f, lam = plant.hardware(x[:count])
     middle = np.array([problem.lower, problem.start, problem.upper])
     sizes = np.array([np.abs(constraint_values(plant, theta)) for theta in middle])
     g = lam / ca.DM(np.maximum(sizes.max(axis=0), 1e-300)) if lam.numel() else ca.MX(0, 1)
     if not nested:
-        levels = np.log([problem.inner.S_max, problem.inner.S_low])
-        g = ca.vertcat(y[1] - levels[0], y[2] - levels[1], g)
+        g = ca.vertcat(y[1:] - levels, g)
     J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])
     return J, ca.Function("constraints", [x, y], [g])
 

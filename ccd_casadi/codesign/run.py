@@ -17,7 +17,7 @@ from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import full_order_beside
-from ccd_casadi.codesign.lifted import Lifted, solve_lifted
+from ccd_casadi.codesign.lifted import OUTPUTS, Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import (
@@ -216,9 +216,10 @@ def _of_sections(
     """A co-design with a controller of fixed structure."""
     if given is not None:
         raise UserError("--surrogate: starts no solve with sections; solve the case without it")
-    if sections_of_problem(sampler.problem).minimise != "bandwidth":
-        words = "is for the command inner so far: J of the outer problem counts the bandwidth"
-        raise UserError(f'inner.minimise = "rms_error" {words}; drop it, and solve')
+    problem = sampler.problem
+    if sections_of_problem(problem).of_error and not problem.w2 > 0.0:
+        words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
+        raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
     began, name = perf_counter(), type(formulation).__name__.lower()
     found = run_sections(sampler, formulation, seed)
     return solution_of_sections(
@@ -249,7 +250,8 @@ def solution_of_sections(
         bar.advance()
     result["full_order"] = beside_dict(beside)
     theta = np.array(verified.theta)
-    quality = surrogate_quality(found.outcome.surrogates, theta, seed)
+    of_error = sections_of_problem(problem).of_error
+    quality = surrogate_quality(found.outcome.surrogates, theta, seed, of_error=of_error)
     result["surrogate_quality"] = clean(quality_dict(quality))
     return Solution(result, found.outcome, None, quality, sections=found.verified)
 
@@ -339,9 +341,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
             folder / "surrogate.json",
             {
                 "formulation": formulation,
-                "outputs": ["bandwidth"]
-                if len(solution.outcome.surrogates) == 1
-                else ["bandwidth", "ln_sensitivity_peak", "ln_sensitivity_low"],
+                "outputs": list(OUTPUTS[: len(solution.outcome.surrogates)]),
                 "loo": [vars(process.loo) for process in solution.outcome.surrogates],
             },
         )

@@ -10,6 +10,7 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, FullOrder
 from ccd_casadi.codesign.result import (
     clean,
+    compliance_dict,
     controller_dict,
     globality_dict,
     kkt_dict,
@@ -59,8 +60,12 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
         "sensitivity_peak": highest.S_peak,
         "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
         "sensitivity_low": max(plant.S_low for plant in judged.plants),
-        "compliance_max": max(plant.GS for plant in judged.plants),
-        "static_compliance": max(plant.static_compliance for plant in judged.plants),
+        **compliance_dict(
+            max(plant.GS for plant in judged.plants),
+            max(plant.static_compliance for plant in judged.plants),
+            max(plant.low_compliance for plant in judged.plants),
+            problem.inner.omega_low / HZ,
+        ),
         "KS_max": max(plant.KS for plant in judged.plants),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
@@ -145,7 +150,8 @@ def sections_result(
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     made = verified.design
-    error = abs(verified.predicted / made.bandwidth - 1.0)
+    error = abs(verified.predicted / verified.value - 1.0)
+    of_error = sections_of_problem(problem).of_error
     plant = plant_of(problem)
     lam = constraint_values(plant, verified.theta)
     checks = {
@@ -177,7 +183,9 @@ def sections_result(
         "units": dict(zip(problem.names, problem.units, strict=True)),
         "objective": verified.objective,
         "hardware_cost": verified.hardware_cost,
-        "surrogate_bandwidth_hz": verified.predicted / HZ,
+        "minimise": sections.minimise,
+        "surrogate_bandwidth_hz": None if of_error else verified.predicted / HZ,
+        **(_error_entry(verified) if of_error else {}),
         "verification_error": error,
         "checks": checks,
         "active": [*bounds, *active_of(made), *met],
@@ -202,6 +210,17 @@ def sections_result(
     assert made.controller is not None
     result |= budget_entry(verified.problem, verified.theta, made.controller)
     return clean(result)
+
+
+def _error_entry(verified: VerifiedSections) -> dict[str, Any]:
+    """What was minimised, root mean square over the plants of the set, m; and its anchors."""
+    anchors = sections_of_problem(verified.problem).error_anchors
+    return {
+        "error_rms_of_set": verified.value,
+        "surrogate_error_rms": verified.predicted,
+        "error_rms_raced": verified.raced.error,
+        "error_anchors": [list(kappa) for kappa in anchors],
+    }
 
 
 def beside_dict(beside: Beside) -> dict[str, Any]:

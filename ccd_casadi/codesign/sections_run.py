@@ -31,14 +31,18 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import (
     joined,
     judged_widely,
+    plants_of,
     prepared,
     proof_of,
     race,
     sections_of_problem,
     sections_value,
+    too_slow,
+    valued,
     with_range,
     worst_members,
 )
+from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
@@ -52,12 +56,16 @@ BETTER = 1e-3  # relative: what a race at the end has to gain to be worth anothe
 
 @dataclass(frozen=True)
 class Raced:
-    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count)."""
+    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count).
+
+    With `error` (m) the least RMS error from there, and κ that of its controller.
+    """
 
     certified: bool
     bandwidth: float
     kappa: tuple[float, ...]
     optima: tuple[tuple[float, int], ...]
+    error: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -66,8 +74,8 @@ class VerifiedSections:
 
     `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
     `proof` is for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much
-    (relative) the race at the end beats the design. `predicted` is what the surrogate says at θ,
-    rad/s.
+    (relative) the race at the end beats the design. `predicted` is what the surrogate says at θ of
+    `value`, ω_b* in rad/s or the least RMS error in m.
     """
 
     problem: CoDesignProblem
@@ -83,6 +91,7 @@ class VerifiedSections:
     proof: Proof
     worst: Excess
     predicted: float
+    value: float
     rounds: int
 
 
@@ -148,6 +157,8 @@ class _End:
     @property
     def gap(self) -> float:
         """By how much (relative) the race beats the design."""
+        if not np.isnan(self.best.error):
+            return self.best.error / self.raced.error - 1.0 if self.raced.certified else 0.0
         return self.raced.bandwidth / self.design.bandwidth - 1.0 if self.raced.certified else 0.0
 
     @property
@@ -172,7 +183,7 @@ def _verified(
     assert made.controller is not None
     worst = end.worst
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-    predicted = best.bandwidth
+    predicted = best.value
     if outcome.surrogates:
         predicted = float(outcome.surrogates[0].predict(np.array(best.theta)[None, :])[0])
     return VerifiedSections(
@@ -189,6 +200,7 @@ def _verified(
         proof=proof_of(problem, best.theta, made),
         worst=worst,
         predicted=predicted,
+        value=best.value,
         rounds=rounds,
     )
 
@@ -226,12 +238,19 @@ def seeded_and_prepared(
     key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
     known = store.get_result(key)
     if known is None:
-        found, made = prepared(problem, _teller("race at the start", quiet), workers)
+        tell = _teller("race at the start", quiet)
+        found, made = prepared(problem, tell, workers)
+        if made.certified and sections_of_problem(problem).of_error:
+            made = too_slow(problem, made)
+        if made.certified and sections_of_problem(problem).of_error:
+            found, least = least_error_at(found, problem.start, made, tell)
+            made = least.design
         sections = sections_of_problem(found)
         known = {
             "anchors": [list(a) for a in sections.anchors],
             "members": [[option, list(point)] for option, point in sections.members],
             "words": "" if made.certified else made.words,
+            "error_anchors": [list(a) for a in sections.error_anchors],
         }
         owner = problem_hash({"race": problem_hash(problem.identity())})
         store.put_unit([], (key, owner, problem.start, known), None)
@@ -239,9 +258,12 @@ def seeded_and_prepared(
         anchors = tuple(tuple(map(float, a)) for a in known["anchors"])
         members = tuple((int(o), tuple(map(float, p))) for o, p in known["members"])
         words = str(known["words"])
+        of_error = tuple(tuple(map(float, a)) for a in known.get("error_anchors", ()))
     except (KeyError, TypeError, ValueError) as error:
         raise store.damaged() from error
-    sections = replace(sections_of_problem(problem), anchors=anchors, members=members)
+    sections = replace(
+        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=of_error
+    )
     return replace(problem, sections=sections), words
 
 
@@ -258,7 +280,12 @@ def _raced(
     known = store.get_result(key)
     if known is None:
         made = race(problem, theta, _teller("race at the end", quiet), workers)
+        error = None
+        if made.certified and sections_of_problem(problem).of_error:
+            found = valued(problem, theta, plants_of(problem, theta), made, 1)
+            made, error = replace(found.design, local_optima=made.local_optima), found.error
         known = {
+            "error": error if made.certified else None,
             "certified": made.certified,
             "bandwidth": float(made.bandwidth) if made.certified else 0.0,
             "kappa": [float(v) for v in made.kappa] if made.certified else [],
@@ -268,7 +295,8 @@ def _raced(
     try:
         optima = tuple((float(value), int(count)) for value, count in known["optima"])
         kappa = tuple(map(float, known["kappa"]))
-        return Raced(bool(known["certified"]), float(known["bandwidth"]), kappa, optima)
+        error = float("nan") if known.get("error") is None else float(known["error"])
+        return Raced(bool(known["certified"]), float(known["bandwidth"]), kappa, optima, error)
     except (KeyError, TypeError, ValueError) as error:
         raise store.damaged() from error
 

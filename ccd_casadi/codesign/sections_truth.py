@@ -2,6 +2,8 @@
 
     min  w1 f(θ) + w2 ω_b*(θ)   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0
 
+or w1 f(θ) + w2 e*(θ), w2 > 0, where the inner problem minimises the RMS error e in m.
+
 Every evaluation is a design that the judge confirms, with its envelope gradient, or NaN.
 """
 
@@ -50,7 +52,7 @@ class TrueBandwidth(VectorCallback):
     def _value(self, theta: Array) -> Array:
         sample = self.at(theta)
         stationary = np.isfinite(sample.gradient).all()
-        return np.array([sample.bandwidth if stationary else np.nan])
+        return np.array([sample.value if stationary else np.nan])
 
     def _slope(self, theta: Array) -> Array:
         return np.array(self.at(theta).gradient)[None, :]
@@ -62,7 +64,7 @@ def objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     if not sample.feasible or (lam > 1e-9).any():
         return np.inf
     cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.bandwidth
+    return problem.w1 * cost + problem.w2 * sample.value
 
 
 def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:

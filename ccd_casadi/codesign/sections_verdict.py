@@ -18,7 +18,7 @@ def sections_verdict(
     return Verdict(
         certified=_certified(verified, constraints),
         optimal=_optimal(verified, tolerance),
-        predicted=_predicted(error, tolerance),
+        predicted=_predicted(verified, error, tolerance),
         survives=_survives(verified),
         deployable=_deployable(verified),
     )
@@ -48,8 +48,16 @@ def _optimal(verified: VerifiedSections, tolerance: float) -> Line:
     }
     raced = ", ".join(f"{value:.2f}" for value in found)
     known = f"a full race at this theta ended at {raced} Hz; gap not known"
+    if _of_error(verified):
+        known = (
+            f"from a full race at this theta the least error is {1e9 * verified.raced.error:.4g} "
+            f"nm RMS, {1e9 * verified.value:.4g} here; gap not known"
+        )
     if gap > tolerance:
-        words = f"a race found a controller with {100.0 * gap:.2g} % more bandwidth at this theta"
+        more = f"{100.0 * gap:.2g} % more bandwidth"
+        if _of_error(verified):
+            more = f"{1e9 * verified.raced.error:.4g} instead of {1e9 * verified.value:.4g} nm RMS"
+        words = f"a race found a controller with {more} at this theta"
         return Line(State.FAILED, words, figures)
     if not math.isfinite(residual):
         return Line(State.WARNED, f"KKT residual over theta unknown; {known}", figures)
@@ -59,11 +67,14 @@ def _optimal(verified: VerifiedSections, tolerance: float) -> Line:
     return Line(State.PASSED, f"KKT residual {residual:.1e} over theta; {known}", figures)
 
 
-def _predicted(error: float, tolerance: float) -> Line:
+def _of_error(verified: VerifiedSections) -> bool:
+    return sections_of_problem(verified.problem).of_error
+
+
+def _predicted(verified: VerifiedSections, error: float, tolerance: float) -> Line:
     state = State.PASSED if error <= tolerance else State.FAILED
-    return Line(
-        state, f"bandwidth predicted to {error:.1e}", {"error": error, "tolerance": tolerance}
-    )
+    what = "RMS error" if _of_error(verified) else "bandwidth"
+    return Line(state, f"{what} predicted to {error:.1e}", {"error": error, "tolerance": tolerance})
 
 
 def _survives(verified: VerifiedSections) -> Line:

@@ -15,7 +15,6 @@ from surrogates import GaussianProcess, SurrogateFileError
 from surrogates.versions import Versions
 
 SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
-OUTPUTS = {"nested": 1, "lifted": 3}
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,8 @@ def named_surrogate(
     except (SurrogateFileError, OSError) as error:
         raise UserError(f"--surrogate {name}: {error}") from error
     lower, upper = box(problem) if formulation == "nested" else lifted_bounds(problem)
-    if len(processes) != OUTPUTS.get(formulation) or processes[0].lower.shape != lower.shape:
+    outputs = {"nested": 1, "lifted": 1 + len(problem.inner.bounds)}
+    if len(processes) != outputs.get(formulation) or processes[0].lower.shape != lower.shape:
         raise UserError(
             f"--surrogate {name}: has {len(processes)} outputs of {processes[0].lower.size} "
             f"inputs, no surrogate of the {formulation} formulation; choose another --formulation"
@@ -79,7 +79,7 @@ def stored_designs(store: SampleStore, problem: CoDesignProblem) -> list[tuple[A
         if (
             row is None
             or len(row.theta) != len(problem.names)
-            or len(row.gradients or ()) != 4 * len(lower)
+            or len(row.gradients or ()) != (2 + len(problem.inner.bounds)) * len(lower)
         ):
             raise store.damaged()
         x = np.array([*row.theta, np.log(row.omega_S), np.log(row.omega_T)])
@@ -112,9 +112,10 @@ def _exact(X: Array, known: Array, width: Array) -> Array:
 
 
 def _quantities(processes: tuple[GaussianProcess, ...], X: Array) -> tuple[QuantitySample, ...]:
-    """The samples that three processes with gradients hold; γ_opt is not among them."""
+    """The samples that the processes with gradients hold; γ_opt, the last, is not among them."""
     n, d = X.shape
-    values, gradients = np.full((n, 4), np.nan), np.full((n, 4, d), np.nan)
+    k = len(processes) + 1
+    values, gradients = np.full((n, k), np.nan), np.full((n, k, d), np.nan)
     for i, process in enumerate(processes):
         targets = process.targets.reshape(1 + d, n)
         values[:, i] = process.output_mean + process.output_scale * targets[0]

@@ -15,16 +15,28 @@ OUTPUTS = (
     ("bandwidth", "Hz", 1.0 / HZ, False),
     ("sensitivity_peak", "%", 100.0, True),
     ("sensitivity_low", "%", 100.0, True),
+    ("compliance", "%", 100.0, True),
 )
+ERROR = ("rms_error", "nm", 1e9, False)
 
 
 def surrogate_quality(
-    processes: Sequence[GaussianProcess], x: Array, seed: int = 0, *, quiet: bool = True
+    processes: Sequence[GaussianProcess],
+    x: Array,
+    seed: int = 0,
+    *,
+    of_error: bool = False,
+    quiet: bool = True,
 ) -> tuple[Quality, ...]:
-    """Judge the processes of ω_b, or of ω_b, ln‖S‖∞ and ln|S(jω_low)|, at the design x."""
+    """Judge the processes of ω_b, or of ω_b and ln of each bounded figure, at the design x.
+
+    `of_error`: the one process is of the RMS error.
+    """
     found = []
     with Progress(len(processes), "judging the surrogates", quiet) as bar:
-        for process, (name, unit, factor, logarithm) in zip(processes, OUTPUTS, strict=False):
+        for process, (name, unit, factor, logarithm) in zip(
+            processes, (ERROR,) if of_error else OUTPUTS, strict=False
+        ):
             quality = quality_of(
                 process,
                 x[: process.lower.size],

@@ -2,11 +2,8 @@
 
 Ranges of a common shift of all flexible resonances and of a factor of their damping in which the
 loop stays stable (closed-loop eigenvalues) and |S| within S_max (frequency responses), classical
-margins, right-half-plane poles of the controller, and what a static force moves,
-
-    K(0),   GS(0) = (I + G(0) K(0))⁻¹ G(0).
-
-The `robustness` command looks closer; this is what no verdict should be without.
+margins, right-half-plane poles of the controller, and what a static force moves (`statics`). The
+`robustness` command looks closer; this is what no verdict should be without.
 """
 
 import math
@@ -19,10 +16,11 @@ import numpy as np
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.plants.scaling import StateSpace, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
+from ccd_casadi.synthesis.statics import Statics, statics
 
 REACH = 0.5  # of the frequency: how far a shift is followed
 FACTORS = (0.1, 10.0)  # of the damping
@@ -40,9 +38,7 @@ class Survival:
     A range that ends at `REACH` or `FACTORS` was not followed further. Margins are the least of
     all loops broken one at a time at the plant's inputs: `gain` up and down as factors,
     `phase_deg`, `delay` in s, and `modulus` = 1/‖S‖∞ on the grid. `unstable_poles_hz`: |p|/2π of
-    the controller's poles in the right half plane. `static_stiffness` in N/m, the least singular
-    value of K(0); `static_compliance` in m/N, the largest of GS(0); `static_share` is |K(0)| over
-    |K(jω_b)|.
+    the controller's poles in the right half plane.
     """
 
     stable_shift: tuple[float, float]
@@ -53,9 +49,7 @@ class Survival:
     delay: float
     modulus: float
     unstable_poles_hz: tuple[float, ...]
-    static_stiffness: float
-    static_compliance: float
-    static_share: float
+    statics: Statics
 
 
 def survival(
@@ -106,8 +100,6 @@ def survival(
 
     stable = shifts(_Loop.stable, PLACES)
     margins = _margins(nominal, respond, grid)
-    G0, K0 = nominal.static(), respond(np.array([0.0]))[0].real
-    at_bandwidth = respond(np.array([bandwidth]))[0]
     poles = np.linalg.eigvals(controller.A)
     unstable = poles[(poles.real > 1e-9 * np.abs(poles)) & (poles.imag >= 0.0)]
     return Survival(
@@ -119,9 +111,12 @@ def survival(
         delay=min(m.delay for m in margins),
         modulus=float(1.0 / _largest(S).max()),
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
-        static_stiffness=float(np.linalg.svd(K0, compute_uv=False).min()),
-        static_compliance=float(np.linalg.norm(np.linalg.solve(np.eye(len(G0)) + G0 @ K0, G0), 2)),
-        static_share=float(np.linalg.norm(K0, 2) / np.linalg.norm(at_bandwidth, 2)),
+        statics=statics(
+            scale_plant(plant, problem.weights.M_K).plant_si(),
+            controller,
+            bandwidth=bandwidth,
+            omega_low=problem.inner.omega_low,
+        ),
     )
 
 
@@ -173,10 +168,6 @@ class _Loop:
         """S(jω) (k, p, p)."""
         L = self.respond(omega) @ controller(omega)
         return np.linalg.inv(np.eye(L.shape[1]) + L)
-
-    def static(self) -> Array:
-        """G(0), with the suspension's stiffness for rigid-body modes."""
-        return self.C @ np.linalg.solve(self.K, self.B)
 
 
 class _ControllerResponse:

@@ -9,7 +9,7 @@ A design is verified when no line failed; a warning is for the reader to weigh.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
@@ -22,7 +22,6 @@ SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no down
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
 LEAST_FACTORS = (0.5, 2.0)  # of their damping, which is known no better
 CLOSER_PEAK = 0.10  # relative: peak of S above S_max on a closer model that is worth a warning
-DIFFERENTIATOR = 0.02  # |K(0)| over |K(jω_b)| below which nothing holds the stage at rest
 SIGMAS = 3.0  # left-out error at the design, in predicted deviations
 DELAY_PERIODS = 1.5  # one period of delay and half a period of hold
 
@@ -75,16 +74,27 @@ class CloserModel:
 
 
 def certified(
-    *, certificate: bool, constraints: bool, norm: float, norm_bound: float, peak: float
+    *,
+    certificate: bool,
+    constraints: bool,
+    norm: float,
+    norm_bound: float,
+    peak: float,
+    bounds: Collection[str] = ("S_max", "S_low"),
+    compliance: float = math.nan,
 ) -> Line:
-    """The certificate of the true closed loop, and S_max, S_low, λ <= 0 as given."""
+    """The certificate of the true closed loop, and `bounds` and λ <= 0 as given."""
     figures = {"norm": norm, "norm_bound": norm_bound, "sensitivity_peak": peak}
+    if "compliance_max" in bounds:
+        figures["compliance_max"] = compliance
     if not certificate:
         return Line(State.FAILED, "the closed loop is not certified", figures)
     if not constraints:
-        words = "certified, but S_max, S_low or a constraint on theta is not met"
+        words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
         return Line(State.FAILED, words, figures)
     words = f"closed loop stable, norm {norm:.6g} <= {norm_bound:.6g}, constraints met"
+    if "compliance_max" in bounds:
+        words += f" (compliance {1e6 * compliance:.4g} um/N at most)"
     return Line(State.PASSED, words, figures)
 
 
@@ -222,10 +232,11 @@ def survives(
         said.insert(0, robust_words)
         if not robust:
             state = State.FAILED
-    if found.static_share < DIFFERENTIATOR:
+    rest = found.statics
+    if rest.differentiates:
         said.append(
-            f"almost a differentiator: |K(0)| is {100 * found.static_share:.2g} % of its value at "
-            f"the bandwidth, 1 N at rest moves the stage {found.static_compliance:.2g} m"
+            f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
+            f"bandwidth, 1 N at rest moves the stage {rest.compliance:.2g} m"
         )
     figures = {
         "stable_shift": list(found.stable_shift),
@@ -238,9 +249,9 @@ def survives(
         "phase_margin_deg": found.phase_deg,
         "modulus_margin": found.modulus,
         "unstable_controller_poles_hz": list(found.unstable_poles_hz),
-        "static_stiffness": found.static_stiffness,
-        "static_compliance": found.static_compliance,
-        "static_share": found.static_share,
+        "static_stiffness": rest.stiffness,
+        "static_compliance": rest.compliance,
+        "static_share": rest.share,
         "robust_set": robust,
         "closer_models": {m.name: {"stable": m.stable, "peak": m.peak} for m in closer},
     }

@@ -94,6 +94,7 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         problem.weights.at(figures.omega_S, figures.omega_T),
         omega_low=problem.inner.omega_low,
         gamma_backoff=problem.inner.gamma_backoff,
+        compliance=True,
     )
     final = handed_out(plant, final, problem.inner.omega_low)
     free = replace(problem, suspension=Suspension(0.0, 0.0))

@@ -2,8 +2,6 @@
 
 from collections.abc import Collection, Sequence
 
-import numpy as np
-
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
@@ -17,7 +15,7 @@ from ccd_casadi.deployment.sampled import (
 from ccd_casadi.deployment.simulation import MeasuredSensitivity, measure_set
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.synthesis.statics import Statics, sampled_statics
+from ccd_casadi.synthesis.statics import Statics, statics
 
 
 class SampledSet:
@@ -58,5 +56,7 @@ def unverified(run: FinishedRun) -> str:
 
 def statics_of(run: FinishedRun, K: DiscreteStateSpace) -> Statics:
     """What a constant force moves with the sampled controller."""
-    at = K.response(np.array([run.figures.bandwidth]))[0]
-    return sampled_statics(run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), at)
+    return statics(
+        run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), bandwidth=run.figures.bandwidth,
+        omega_low=run.problem.inner.omega_low, period=K.period,
+    )  # fmt: skip

@@ -36,6 +36,7 @@ class PlantFigures:
 
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
+    `static_compliance` is GS at 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
     `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peak by a Hamiltonian.
     """
 
@@ -52,6 +53,7 @@ class PlantFigures:
     weighted_KS: float
     weighted_T: float
     static_compliance: float
+    low_compliance: float
     confirmed: bool
 
 
@@ -143,7 +145,7 @@ def judged(
         corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
     grid = _grid(roots, sampling, bounds.omega_low, _size(G), corner)
     table = _Responses(G, loop[0], loop[1], sampling, bounds)
-    values = table.at(grid)
+    values, low = table.at(grid), table.at(np.array([bounds.omega_low]))
     tops = {name: _top(table, name, grid, value) for name, value in values.items()}
     top, at = tops["S"]
     norm = _norm(S, sampling)
@@ -154,7 +156,7 @@ def judged(
         stability=stability,
         S_peak=max(top, norm),
         S_peak_frequency=at,
-        S_low=float(table.at(np.array([bounds.omega_low]))["S"][0]),
+        S_low=float(low["S"][0]),
         crossing=crossing,
         bandwidth=bandwidth,
         KS=tops["KS"][0],
@@ -162,7 +164,8 @@ def judged(
         GS=tops["GS"][0],
         weighted_KS=weighted[0],
         weighted_T=weighted[1],
-        static_compliance=float(values["GS"][0]),
+        static_compliance=0.0 if integrator else float(table.at(np.zeros(1))["GS"][0]),
+        low_compliance=float(low["GS"][0]),
         confirmed=abs(norm / top - 1.0) <= CONFIRMED,
     )
 
@@ -170,7 +173,7 @@ def judged(
 def _unstable(stability: float) -> PlantFigures:
     nan = np.nan
     return PlantFigures(
-        False, stability, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False
+        False, stability, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False
     )
 
 

@@ -2,8 +2,9 @@
 
     min v(κ) - reward τ + ρ max(0, max c(κ, τ)),   κ in its box,  τ >= floor
 
-τ is ln of a bandwidth. The curvature of v is a damped BFGS one (Powell 1978), that of the bounds is
-the model's own. Steps count only where loops are stable; ρ grows while a bound is left passed.
+τ is ln of a bandwidth. The curvature of v is learnt by symmetric rank-one updates, which may curve
+either way, that of the bounds is the model's own; their sum is made convex. Steps count only where
+loops are stable; ρ grows while a bound is left passed.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from ccd_casadi.support.arrays import Array
 PENALTIES = (20.0, 200.0, 2000.0)  # the next one where a bound is left passed
 FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.2, 1.0, 1e-7
 LEAST_GAIN = 1e-9
+LOST = 1e-8  # share of its factors below which a scalar product is rounding
 CONVEXIFYING = 10.0  # times AᵀA of the active rows
 MOST = 200  # steps with one penalty
 
@@ -86,16 +88,15 @@ def _with_penalty(
     for turn in range(1, MOST + 1):
         steps = turn
         rows = _chosen(point, radius)
-        hessian = FLAT * np.eye(n + 1)
-        hessian[:n, :n] += curvature
-        found = solved(rows, rows.value, hessian)
+        hessian = np.zeros((n + 1, n + 1))
+        hessian[:n, :n] = curvature
+        found = solved(rows, rows.value, _convex(hessian))
         if found is None:
             break
         mu = np.where(found[1] > 1e-7 * penalty, found[1], 0.0)
         hessian = hessian + model.hessian(point, rows, mu)
         active = np.column_stack([rows.to_kappa, rows.to_tau])[mu > 0.0]
-        values, vectors = np.linalg.eigh(hessian + CONVEXIFYING * active.T @ active)
-        convex = (vectors * np.maximum(values, FLAT)) @ vectors.T
+        convex = _convex(hessian + CONVEXIFYING * active.T @ active)
         found = solved(rows, rows.value, convex)
         if found is None or found[2] <= LEAST_GAIN:
             break
@@ -125,15 +126,18 @@ def _with_penalty(
 
 
 def _updated(B: Array, s: Array, y: Array) -> Array:
-    """BFGS, damped so that it stays positive (Powell 1978)."""
-    Bs = B @ s
-    sBs = float(s @ Bs)
-    if not sBs > 1e-20:
+    """Symmetric rank one, left as it is where its denominator is lost (Nocedal & Wright 6.26)."""
+    rest = y - B @ s
+    size = float(rest @ s)
+    if abs(size) <= LOST * float(np.linalg.norm(rest) * np.linalg.norm(s)):
         return B
-    sy = float(s @ y)
-    share = 1.0 if sy >= 0.2 * sBs else 0.8 * sBs / (sBs - sy)
-    r = share * y + (1.0 - share) * Bs
-    return np.asarray(B - np.outer(Bs, Bs) / sBs + np.outer(r, r) / float(s @ r))
+    return np.asarray(B + np.outer(rest, rest) / size)
+
+
+def _convex(H: Array) -> Array:
+    """H with its eigenvalues raised to at least `FLAT`."""
+    values, vectors = np.linalg.eigh(H)
+    return np.asarray((vectors * np.maximum(values, FLAT)) @ vectors.T)
 
 
 def _chosen(point: Point, radius: float) -> Constraints:

@@ -4,9 +4,13 @@
     e² = mean over the plants of the error's variance under an `ErrorBudget`
 
 By quadratic programmes in a trust region, from a controller that meets the bounds: the gradient
-of ln e is exact (adjoint Lyapunov equations), its curvature a damped BFGS one, that of the bounds
+of ln e is exact (adjoint Lyapunov equations), its curvature learnt from it, that of the bounds
 exact. The merit is ln e + ρ max(0, max c); a step counts only where every loop stays stable.
-A little is paid for bandwidth, so that ω_b is what the bounds leave free at this κ.
+A little is paid for bandwidth, so that ω_b is what the bounds leave free at this κ. At its end
+
+    d ln e*/dθ = ∂ ln e/∂θ + Σ μ_j ∂c_j/∂θ        (envelope theorem)
+
+but for that payment, `REWARD` dτ/dθ.
 """
 
 from collections.abc import Sequence
@@ -30,7 +34,7 @@ from ccd_casadi.fixed_structure.design import (
     in_problem_units,
     problem_for,
 )
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, assess
+from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, assess, to_theta
 from ccd_casadi.fixed_structure.loop import Sampling
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -38,7 +42,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 STEP = 1e-30  # of κ along the imaginary axis
-REWARD = 1e-3  # of ln ω_b in ln e
+REWARD = 1e-6  # of ln ω_b in ln e
+RESIDUAL = 1e-3  # of ‖∇ ln e‖: above it there is no envelope gradient
+SLOWER = 0.1  # of the largest bandwidth: where a search from a given κ begins
 ACTIVE = 1e-5
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
@@ -55,17 +61,33 @@ class RmsError:
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
         kappa = np.asarray(kappa, float)
-        K = state_space(self.structure, kappa)
         stepped = state_spaces(self.structure, kappa + 1j * STEP * np.eye(len(kappa)))
         changes = [
             Change(None, StateSpace(*(part[i].imag / STEP for part in stepped)))
             for i in range(len(kappa))
         ]
+        return self._summed(kappa, [changes] * len(self.plants))
+
+    def to_theta(self, kappa: Array, plants: Sequence[ScaledPlant]) -> Array:
+        """∂ ln e/∂θ at a fixed κ; `plants` are those of the error, with dA, dB, dC."""
+        none = [np.zeros((len(p.C), p.B.shape[1])) for p in plants]
+        changes = [
+            [
+                Change(StateSpace(p.omega_0 * dA, p.omega_0 / p.force * dB, dC, D), None)
+                for dA, dB, dC in zip(p.dA, p.dB, p.dC, strict=True)
+            ]
+            for p, D in zip(plants, none, strict=True)
+        ]
+        return self._summed(np.asarray(kappa, float), changes)[1]
+
+    def _summed(self, kappa: Array, changes: Sequence[Sequence[Change]]) -> tuple[float, Array]:
+        """ln e and its derivatives to what the changes of each plant's loop are of."""
+        K = state_space(self.structure, kappa)
         total = None
-        for plant in self.plants:
-            found = variance_slopes(Loop(plant, K, self.hold), self.budget, changes)
+        for plant, own in zip(self.plants, changes, strict=True):
+            found = variance_slopes(Loop(plant, K, self.hold), self.budget, own)
             if found is None:
-                return np.inf, np.full(len(kappa), np.nan)
+                return np.inf, np.full(len(own), np.nan)
             total = found if total is None else replace(
                 total, value=total.value + found.value, gradient=total.gradient + found.gradient
             )  # fmt: skip
@@ -79,12 +101,15 @@ class LeastError:
     """A design with its RMS error in m over the set, and that of the controller it began with.
 
     `design.multipliers`: change of ln e per ln of a bound; `design.kkt_residual` is over ‖∇ ln e‖.
+    `gradient` (n_θ,) is de*/dθ where the plants carry derivatives, NaN where the end is not
+    stationary.
     """
 
     design: SectionsDesign
     error: float
     first_error: float
     steps: int
+    gradient: Array
 
 
 def least_error(
@@ -95,9 +120,11 @@ def least_error(
     *,
     sampling: Sampling | None = None,
     least_bandwidth: float = 0.0,
+    initial: Sequence[Array] = (),
     progress: Progress | None = None,
 ) -> LeastError:
-    """From a certified design (and its other local optima) to the least RMS error in m.
+    """From `initial` (κ in SI), or a certified design and its other local optima, to the least
+    RMS error in m: from the latter where nothing is given or what is leads to no certified design.
 
     `least_bandwidth` in rad/s. What the judge does not confirm is not handed out: the design that
     it began with is, then. A local optimum, as any search from given starts finds.
@@ -117,9 +144,14 @@ def least_error(
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
     first = float(np.exp(goal.at(design.kappa)[0]))
-    best = LeastError(design, first, first, 0)
+    unknown = np.full(len(plants[0].dA), np.nan)
+    best = LeastError(design, first, first, 0, unknown)
     steps = 0
-    for bandwidth, kappa in [own, *others]:
+    slower = max(SLOWER * design.bandwidth, least_bandwidth)
+    given = [(slower, tuple(map(float, item))) for item in initial]
+    for bandwidth, kappa in [*given, own, *others]:
+        if (bandwidth, kappa) == own and best.design is not design:
+            break  # one that was given has led to a design: these are climbed from where none does
         if bandwidth < least_bandwidth:
             continue
         start = model.at(in_problem_units(problem, np.array(kappa)), float(np.log(bandwidth / w0)))
@@ -127,12 +159,16 @@ def least_error(
             continue
         end, count = descend(model, start, problem.box, floor, REWARD, problem.margin)
         steps += count
-        made = _judged(problem, plants, sampling, end, design, floor)
+        made, active, mu = _judged(problem, plants, sampling, end, design, floor)
         error = float(np.exp(end.value))
         tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
              f"{made.words}")  # fmt: skip
         if made.certified and error < best.error:
-            best = replace(best, design=made, error=error)
+            slope = unknown
+            if made.kkt_residual <= RESIDUAL:
+                own_slope = goal.to_theta(made.kappa, plants)
+                slope = error * (own_slope + mu @ to_theta(problem, end.kappa, active))
+            best = replace(best, design=made, error=error, gradient=slope)
     return replace(best, steps=steps)
 
 
@@ -170,8 +206,8 @@ def _judged(
     end: Point,
     design: SectionsDesign,
     floor: float,
-) -> SectionsDesign:
-    """The end as a design: certified by the judge, with residual and multipliers."""
+) -> tuple[SectionsDesign, Constraints, Array]:
+    """The end as a design: certified by the judge, with residual and multipliers; what binds."""
     structure, P = problem.structure, problem.plants
     kappa = structure.in_units(end.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
@@ -200,7 +236,7 @@ def _judged(
     ends = tuple((*item, float(v)) for item, v in zip(names, mu[count:], strict=False))
     least = float(np.exp(floor)) * P.omega_0
     good = judged.passed and judged.bandwidth >= least / KEPT
-    return replace(
+    made = replace(
         design,
         outcome=SectionsOutcome.CERTIFIED if good else SectionsOutcome.NOT_CERTIFIED,
         words=judged.words,
@@ -213,3 +249,4 @@ def _judged(
         kkt_residual=residual,
         short={},
     )
+    return made, active, mu[:count]

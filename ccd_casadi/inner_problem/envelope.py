@@ -14,14 +14,19 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 RESIDUAL = 1e-3  # relative; above it the point is no stationary one and has no envelope gradient
 
 
-def bandwidth_gradient(optimum: Sensitivities, active: tuple[str, ...]) -> Array:
-    """dω_b*/dθ (n_θ,) in rad/s per unit of θ; NaN where the optimality conditions do not hold."""
+def bandwidth_gradient(
+    optimum: Sensitivities, active: tuple[str, ...], bounded: tuple[str, ...]
+) -> Array:
+    """dω_b*/dθ (n_θ,) in rad/s per unit of θ; NaN where the optimality conditions do not hold.
+
+    `bounded` names the rows 1 to -2 of the optimum's values, as `InnerProblem.bounds` does.
+    """
     x = optimum.to_break_frequencies
     columns, slopes = [], []
     zero = np.zeros(optimum.to_theta.shape[1])
     for name in active:
-        if name in ("S_max", "S_low"):
-            i = 1 if name == "S_max" else 2
+        if name in bounded:
+            i = 1 + bounded.index(name)
             columns.append(x[i])
             slopes.append(optimum.to_theta[i])
         else:

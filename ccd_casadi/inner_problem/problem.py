@@ -7,7 +7,7 @@ beside the samples that it determines.
 import hashlib
 import importlib.util
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -135,13 +135,19 @@ class CoDesignProblem:
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
 
-        S_max, S_low, bounds and the objective are not in it: the samples answer any of them.
+        S_max, S_low, bounds and the objective are not in it: the samples answer any of them. A
+        bound on the compliance is only in so far as that is computed.
         """
         w, robust = self.weights, self.robust
         with_disturbance = (w.disturbance,) if w.disturbance else ()
-        perturbed = {} if robust is None else {"robust": vars(robust)}
+        perturbed: dict[str, object] = {} if robust is None else {"robust": vars(robust)}
         if self.sections is not None:
             perturbed["sections"] = self.sections.identity() | {"omega_T": w.omega_T}
+            if self.sections.of_error:
+                assert self.budget is not None
+                perturbed["budget"] = asdict(self.budget)
+        if self.inner.compliance_max is not None:
+            perturbed["compliance"] = True
         return {
             "numerics": NUMERICS,
             "plant": self.source.identity(),
@@ -157,8 +163,7 @@ class CoDesignProblem:
         """What else determines ω_b*(θ)."""
         inner = self.inner
         return {
-            "S_max": inner.S_max,
-            "S_low": inner.S_low,
+            **{name: bound for name, (_, bound) in inner.bounds.items()},
             "omega_S": list(inner.omega_S),
             "omega_T": list(inner.omega_T),
             "sweep_points": list(inner.sweep_points),
@@ -286,7 +291,8 @@ def design_choices(problem: CoDesignProblem) -> tuple[CoDesignProblem, ...]:
 def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     """The true inner problem at θ, by the problem's method: ω_b*(θ), where, and what binds.
 
-        max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper)
+        max ω_b over (ω_S, ω_T)  s.t.  ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low    (paper),
+                                       ‖GS‖∞ <= compliance_max where that is given
 
     The best over the design plants of a robust problem that leaves its own open. An infeasible θ
     is a result without `optimum` that says what falls short.

@@ -1,9 +1,9 @@
 """The inner problem by derivatives: the global optimum in a tenth of a sweep's syntheses.
 
 A few designs spread over the box, each with exact derivatives, determine an interpolant of
-ln ω_b, ln‖S‖∞ and ln σ_max(S(jω_low)); its constrained maxima are synthesised and added until
-the interpolant has no better place to offer. A local constrained solve then ends on the true
-functions, as after a sweep.
+ln ω_b and of every bounded figure (ln‖S‖∞, ln σ_max(S(jω_low)), ln‖GS‖∞); its constrained maxima
+are synthesised and added until the interpolant has no better place to offer. A local constrained
+solve then ends on the true functions, as after a sweep.
 """
 
 import numpy as np
@@ -52,22 +52,16 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
 def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
     """The best feasible design, and the best one that is within 2 % of feasible."""
     near = sorted(
-        (row for row in rows if row.certified and _excess(problem, row) < 0.02),
+        (row for row in rows if row.certified and problem.excess(row) < 0.02),
         key=lambda row: -row.bandwidth,
     )
     feasible = [row for row in near if problem.feasible(row)]
     chosen = feasible[:1] or near[:1]
     if not chosen:
         chosen = sorted(
-            (row for row in rows if row.certified), key=lambda row: _excess(problem, row)
+            (row for row in rows if row.certified), key=lambda row: problem.excess(row)
         )[:1]
     return [(row.omega_S, row.omega_T) for row in chosen]
-
-
-def _excess(problem: InnerProblem, row: DesignFigures) -> float:
-    return max(
-        np.log(row.sensitivity_peak / problem.S_max), np.log(row.sensitivity_low / problem.S_low)
-    )
 
 
 def _design(
@@ -79,11 +73,11 @@ def _design(
 
 
 def _values(design: Sensitivities) -> Array:
-    return np.array([np.log(design.values[0]), design.values[1], design.values[2]])
+    return np.array([np.log(design.values[0]), *design.values[1:-1]])
 
 
 def _slopes(design: Sensitivities, width: Array) -> Array:
-    slopes = design.to_break_frequencies[:3].copy()
+    slopes = design.to_break_frequencies[:-1].copy()
     slopes[0] /= design.values[0]
     return slopes * width
 
@@ -114,7 +108,7 @@ def _next_point(
 
     None when every part's best is no better than the incumbent or next to a known design.
     """
-    levels = np.log([problem.S_max, problem.S_low])
+    levels = problem.levels
     excess = (predicted[1:] - levels[:, None, None]).max(axis=0)
     inside = excess <= 0.0
     best = max(

@@ -23,6 +23,8 @@ from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
+from ccd_casadi.fixed_structure.design import SectionsOutcome
+from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
@@ -31,7 +33,9 @@ from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.units import HZ
 
 MOST_ANCHORS = 3
 DISTINCT = 0.1  # relative: local optima further below the best are no anchors
@@ -134,7 +138,8 @@ def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[i
 class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
-    `syntheses`: climbs from anchors and races that it took.
+    Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
+    that of the design. `syntheses`: climbs from anchors and races that it took.
     """
 
     theta: tuple[float, ...]
@@ -142,6 +147,7 @@ class SectionsValue:
     gradient: tuple[float, ...]
     design: SectionsDesign
     syntheses: int
+    error: float = float("nan")
 
     @property
     def feasible(self) -> bool:
@@ -178,13 +184,53 @@ def valued(
     made: SectionsDesign,
     spent: int,
 ) -> SectionsValue:
-    """A design as a value of ω_b*(θ)."""
+    """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least error."""
     point = tuple(float(v) for v in theta)
-    bandwidth, gradient = np.nan, np.full(len(point), np.nan)
-    if made.certified:
+    bandwidth, error, gradient = np.nan, np.nan, np.full(len(point), np.nan)
+    if made.certified and sections_of_problem(problem).of_error:
+        made, error, gradient = _least_error(problem, plants, made)
+        bandwidth = made.bandwidth if made.certified else np.nan
+    elif made.certified:
         sampling = sections_of_problem(problem).sampling
         bandwidth, gradient = bandwidth_and_gradient(plants, bounds_of(problem), made, sampling)
-    return SectionsValue(point, float(bandwidth), tuple(map(float, gradient)), made, spent)
+    slope = tuple(map(float, gradient))
+    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error))
+
+
+def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
+    """Raise UserError where J counts the RMS error, for a command that knows ω_b alone."""
+    if problem.sections is not None and problem.sections.of_error:
+        words = f"{command} counts the bandwidth; solve and inner alone count the error"
+        raise UserError(f'inner.minimise: is "rms_error", and {words}')
+
+
+def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
+    """The design, no longer a certified one where the least error asks for more bandwidth."""
+    least = sections_of_problem(problem).bandwidth_least
+    if made.bandwidth >= least:
+        return made
+    words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
+    words += f", inner.bandwidth_least_hz asks for {least / HZ:.4g} Hz"
+    short = {"bandwidth_least_hz": least / made.bandwidth}
+    return replace(made, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
+
+
+def _least_error(
+    problem: CoDesignProblem, plants: Sequence[ScaledPlant], made: SectionsDesign
+) -> tuple[SectionsDesign, float, Array]:
+    """The design of least RMS error, that in m, and its gradient to θ."""
+    sections, bounds = sections_of_problem(problem), bounds_of(problem)
+    assert problem.budget is not None
+    made = too_slow(problem, made)
+    if not made.certified:
+        return made, np.nan, np.full(len(problem.names), np.nan)
+    started = _with(problem, anchors=sections.error_anchors)
+    found = least_error(
+        plants, bounds, made, problem.budget, sampling=sections.sampling,
+        least_bandwidth=sections.bandwidth_least,
+        initial=warm_starts(started, structure_of(problem), plants, bounds),
+    )  # fmt: skip
+    return found.design, found.error, found.gradient
 
 
 def race(
@@ -231,9 +277,16 @@ def prepared(
     """The problem with anchors and members: a full race at its start θ, worst plants added.
 
     The design is the race's last; where it is not certified the problem has no anchors, and each
-    θ is raced on its own.
+    θ is raced on its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
-    problem = with_range(problem)
+    asked = sections_of_problem(problem).minimise
+    found, made = _prepared(with_range(_with(problem, minimise="bandwidth")), progress, workers)
+    return _with(found, minimise=asked), made
+
+
+def _prepared(
+    problem: CoDesignProblem, progress: Progress | None, workers: Pool | None
+) -> tuple[CoDesignProblem, SectionsDesign]:
     uncertain = uncertain_plant(problem, problem.start)
     members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
     problem = _with(problem, members=members)
@@ -266,11 +319,14 @@ def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
 
 
 def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
-    """The problem with one more anchor, first, and more members."""
+    """The problem with one more anchor, first, of what it minimises, and more members."""
     sections = sections_of_problem(problem)
     own = tuple(float(v) for v in kappa)
-    anchors = (own, *(a for a in sections.anchors if a != own))[: MOST_ANCHORS + 1]
-    return _with(problem, anchors=anchors, members=(*sections.members, *members))
+    name = "error_anchors" if sections.of_error else "anchors"
+    known = getattr(sections, name)
+    anchors = (own, *(a for a in known if a != own))[: MOST_ANCHORS + 1]
+    problem = _with(problem, **{name: anchors})
+    return _with(problem, members=(*sections.members, *members))
 
 
 def _with(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:

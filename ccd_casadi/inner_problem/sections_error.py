@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.least_error import LeastError, least_error
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import (
     Progress,
     bounds_of,
+    joined,
     plants_of,
     sections_of_problem,
     worst_members,
@@ -23,7 +26,8 @@ def least_error_at(
     made: SectionsDesign,
     progress: Progress | None = None,
 ) -> tuple[CoDesignProblem, LeastError]:
-    """The problem with the plants that were found worse on the way, and the design on all of them.
+    """The problem with the plants that were found worse on the way, and the design on all of them,
+    which is the first of its anchors of least error.
 
     The problem has a budget; `made` is its certified design of largest bandwidth.
     """
@@ -34,7 +38,7 @@ def least_error_at(
         found = least_error(
             plants_of(problem, theta), bounds_of(problem), made, problem.budget,
             sampling=sections.sampling, least_bandwidth=sections.bandwidth_least,
-            progress=progress,
+            initial=[np.array(kappa) for kappa in sections.error_anchors], progress=progress,
         )  # fmt: skip
         members = worst_members(problem, theta, found.design, turn, progress)[1]
         if not members or turn == ROUNDS - 1:
@@ -43,4 +47,4 @@ def least_error_at(
             problem, sections=replace(sections, members=(*sections.members, *members))
         )
     assert found is not None
-    return problem, found
+    return joined(problem, found.design.kappa, ()), found

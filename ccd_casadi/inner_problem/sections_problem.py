@@ -52,7 +52,8 @@ class SectionsProblem:
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
     before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
     θ; None: by the plant at the start. `minimise` "rms_error": at a θ the search goes on from there
-    to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more.
+    to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more, from
+    that controller and the `error_anchors` (κ in SI).
     `channels` of a plant with several outputs; where the case names none they are found, with
     `structure` for each.
     """
@@ -71,6 +72,12 @@ class SectionsProblem:
     minimise: str = "bandwidth"
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
+    error_anchors: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def of_error(self) -> bool:
+        """Whether the inner problem's value is the least RMS error in m, not ω_b*."""
+        return self.minimise == "rms_error"
 
     def identity(self) -> dict[str, Any]:
         """What determines ω_b*(θ), as plain values."""
@@ -93,4 +100,6 @@ class SectionsProblem:
             found["channels"] = [
                 vars(channel) | {"structure": vars(channel.structure)} for channel in self.channels
             ]
+        if self.of_error:
+            found["least_error"] = [self.bandwidth_least, self.error_anchors]
         return found

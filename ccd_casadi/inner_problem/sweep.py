@@ -1,7 +1,7 @@
 """The inner problem: the largest certified bandwidth at a fixed θ.
 
     ω_b*(θ) = max over (ω_S, ω_T) of ω_b   s.t.  ‖S‖∞ <= S_max,  σ_max(S(jω_low)) <= S_low
-    (paper, equation (8))
+    (paper, equation (8)), and where it is given  ‖GS‖∞ <= compliance_max
 
 The feasible set can be disconnected. The paper's sweep covers the box; every local maximum of
 the sweep, feasible or nearly so, then starts a local constrained solve with exact derivatives.
@@ -23,6 +23,11 @@ from ccd_casadi.synthesis.weights import Weights
 # The local solves aim this far inside a constraint, so that what they return satisfies it.
 MARGIN = 1e-9
 ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
+LABELS = {
+    "S_max": "peak of S",
+    "S_low": "|S(j omega_low)|",
+    "compliance_max": "compliance |GS| in m/N",
+}
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,33 @@ class InnerProblem:
     omega_T: tuple[float, float]
     gamma_backoff: float = 1.02
     sweep_points: tuple[int, int] = (20, 20)
+    compliance_max: float | None = None  # m/N
+
+    @property
+    def bounds(self) -> dict[str, tuple[str, float]]:
+        """Name of each bound -> the figure that it is on, the bound; as in `values[1:-1]`."""
+        found = {
+            "S_max": ("sensitivity_peak", self.S_max),
+            "S_low": ("sensitivity_low", self.S_low),
+        }
+        if self.compliance_max is not None:
+            found["compliance_max"] = ("compliance", self.compliance_max)
+        return found
+
+    @property
+    def levels(self) -> Array:
+        """ln of each bound, in that order."""
+        return np.log([bound for _, bound in self.bounds.values()])
+
+    def excess(self, figures: object) -> float:
+        """ln of the largest figure over its bound, of a row or a stored sample; 0 is feasible."""
+        bounds = self.bounds.values()
+        return max(float(np.log(getattr(figures, name) / bound)) for name, bound in bounds)
 
     def feasible(self, figures: DesignFigures) -> bool:
-        """Certified, inside the box and within both bounds on S."""
-        return (
-            figures.certified
-            and figures.sensitivity_peak <= self.S_max
-            and figures.sensitivity_low <= self.S_low
+        """Certified, inside the box and within every bound."""
+        return figures.certified and all(
+            getattr(figures, name) <= bound for name, bound in self.bounds.values()
         )
 
     def axes(self) -> tuple[Array, Array]:
@@ -57,14 +82,14 @@ class InnerStatus(StrEnum):
     """Whether the inner problem has a certified feasible design; the value says it in words."""
 
     SOLVED = "solved"
-    INFEASIBLE = "no certified design meets S_max and S_low in the box of omega_S and omega_T"
+    INFEASIBLE = "no certified design meets the bounds in the box of omega_S and omega_T"
 
 
 @dataclass(frozen=True)
 class InnerResult:
     """The optimum (None if infeasible), what binds there, and every synthesis on the way.
 
-    `violation` is the least one in ln S_max and ln S_low of any certified design; zero if solved.
+    `violation` is the least one, in ln of the bounds, of any certified design; zero if solved.
     """
 
     status: InnerStatus
@@ -91,6 +116,7 @@ def sweep_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> 
         omega_T,
         omega_low=problem.omega_low,
         gamma_backoff=problem.gamma_backoff,
+        compliance=problem.compliance_max is not None,
     )
     return refine(plant, weights, problem, rows, sweep_starts(problem, rows))
 
@@ -143,6 +169,7 @@ def evaluate(
         weights.at(*point),
         omega_low=problem.omega_low,
         gamma_backoff=problem.gamma_backoff,
+        compliance=problem.compliance_max is not None,
     )
 
 
@@ -168,11 +195,7 @@ def sweep_starts(
 
 
 def _violation(problem: InnerProblem, row: DesignFigures) -> float:
-    return max(
-        0.0,
-        float(np.log(row.sensitivity_peak / problem.S_max)),
-        float(np.log(row.sensitivity_low / problem.S_low)),
-    )
+    return max(0.0, problem.excess(row))
 
 
 def _merit(problem: InnerProblem, row: DesignFigures) -> float:
@@ -207,7 +230,7 @@ def local_solve(
             raise Uncertified
         return seen[key]
 
-    levels = np.log([problem.S_max, problem.S_low]) - MARGIN
+    levels = problem.levels - MARGIN
     try:
         minimize(
             lambda x: -np.log(at(x).values[0]),
@@ -216,8 +239,8 @@ def local_solve(
             bounds=bounds,
             constraints={
                 "type": "ineq",
-                "fun": lambda x: levels - at(x).values[1:3],
-                "jac": lambda x: -at(x).to_break_frequencies[1:3],
+                "fun": lambda x: levels - at(x).values[1:-1],
+                "jac": lambda x: -at(x).to_break_frequencies[1:-1],
             },
             method="SLSQP",
             options={"ftol": 1e-9, "maxiter": 30},
@@ -230,8 +253,7 @@ def local_solve(
 def active_constraints(problem: InnerProblem, figures: DesignFigures) -> tuple[str, ...]:
     """Names of the constraints and range ends that bind at a design."""
     values = {
-        "S_max": figures.sensitivity_peak / problem.S_max,
-        "S_low": figures.sensitivity_low / problem.S_low,
+        **{name: getattr(figures, of) / bound for name, (of, bound) in problem.bounds.items()},
         "omega_S lower": problem.omega_S[0] / figures.omega_S,
         "omega_S upper": figures.omega_S / problem.omega_S[1],
         "omega_T lower": problem.omega_T[0] / figures.omega_T,
@@ -251,12 +273,9 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         reasons = sorted({row.outcome.value for row in rows})
         return "no synthesis was certified: " + "; ".join(reasons)
     nearest = min(certified, key=lambda row: _violation(problem, row))
-    figures = (
-        ("S_max", "peak of S", "sensitivity_peak", problem.S_max),
-        ("S_low", "|S(j omega_low)|", "sensitivity_low", problem.S_low),
-    )
     missed, kept, least = [], [], []
-    for name, label, attribute, bound in figures:
+    for name, (attribute, bound) in problem.bounds.items():
+        label = LABELS[name]
         value = float(getattr(nearest, attribute))
         if value > bound:
             missed.append(f"{label} {missed_by(value, bound)} where {name} = {bound:g} is asked")

@@ -2,9 +2,10 @@
 
     (θ, ln ω_S, ln ω_T) -> (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt)
 
-Each evaluation is one certified synthesis with its total derivatives. Where a design is not
-certified the values are NaN, which makes IPOPT shorten its step. Hessians are not available:
-use a quasi-Newton method (`ipopt.hessian_approximation = "limited-memory"`).
+with ln‖GS‖∞ before γ_opt where the problem bounds the compliance. Each evaluation is one certified
+synthesis with its total derivatives. Where a design is not certified the values are NaN, which
+makes IPOPT shorten its step. Hessians are not available: use a quasi-Newton method
+(`ipopt.hessian_approximation = "limited-memory"`).
 """
 
 from collections.abc import Callable
@@ -20,8 +21,9 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 class TrueQuantities(VectorCallback):
     """(θ, ln ω_S, ln ω_T) -> ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt, with exact Jacobian.
 
-    A casadi.Callback: keep a reference to it as long as anything built on it is in use. A design
-    that is not certified is NaN, on which IPOPT shortens its step.
+    Before γ_opt comes ln‖GS‖∞ (m/N) where the problem has a `compliance_max`. A casadi.Callback:
+    keep a reference to it as long as anything built on it is in use. A design that is not certified
+    is NaN, on which IPOPT shortens its step.
 
     >>> import ccd_casadi as ccd
     >>> import numpy as np
@@ -41,7 +43,8 @@ class TrueQuantities(VectorCallback):
         self.record = record
         self.designs: dict[bytes, Sensitivities] = {}
         count = len(problem.names) + 2
-        super().__init__("true_quantities", count, 4, self.values, self.jacobian_at)
+        self.size = 2 + len(problem.inner.bounds)
+        super().__init__("true_quantities", count, self.size, self.values, self.jacobian_at)
 
     def at(self, x: Array) -> Sensitivities:
         """The design at x = (θ, ln ω_S, ln ω_T); repeated points cost nothing."""
@@ -60,11 +63,11 @@ class TrueQuantities(VectorCallback):
         return self.designs[key]
 
     def values(self, x: Array) -> Array:
-        """(4,) values, NaN where the design is not certified."""
+        """Values, NaN where the design is not certified."""
         design = self.at(x)
-        return design.values if design.figures.certified else np.full(4, np.nan)
+        return design.values if design.figures.certified else np.full(self.size, np.nan)
 
     def jacobian_at(self, x: Array) -> Array:
-        """(4, n_θ + 2) derivatives."""
+        """Derivatives of the values (…, n_θ + 2)."""
         design = self.at(x)
         return np.hstack([design.to_theta, design.to_break_frequencies])

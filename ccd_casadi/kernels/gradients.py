@@ -7,15 +7,16 @@ F = -(B2ᵀX + D12ᵀC1)/d2² and X the stabilising solution of
 
 With K = K(P_d, w) from the design plant P_d and the loop closed on P,
 
-    dσ_max(S) = -Re a (dG K + G dK) b,
+    dσ_max(S) = -Re a (dG K + G dK) b,   dσ_max(SG) = -Re a (G dK b' - dG c),
 
-dG is a matter of P alone; P is P_d in a nominal design, a plant off the model in a robust one,
-in one unit of time and force. dK goes back through the Riccati equation of P_d: with X̄ the
-gradient to X, one adjoint Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F
-gives the gradient to every matrix at once, however many parameters there are. γ_opt, where X is
-infinite, has the same equation in the basis [U1; U2] of the stable subspace: only
-f = λ_min(X⁻¹) and its null vector q appear, T11 Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0 the filter's
-solution stands in B1 and has an adjoint Lyapunov equation of its own (`disturbance_pullback`).
+a = uᵀS, b = S v, b' = S G v, c = (I + KG)⁻¹ v with the singular vectors u, v. dG is a matter of P
+alone; P is P_d in a nominal design, a plant off the model in a robust one, in one unit of time and
+force. dK goes back through the Riccati equation of P_d: with X̄ the gradient to X, one adjoint
+Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F gives the gradient to every
+matrix at once, however many parameters there are. γ_opt, where X is infinite, has the same equation
+in the basis [U1; U2] of the stable subspace: only f = λ_min(X⁻¹) and its null vector q appear, T11
+Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0 the filter's solution stands in B1 and has an adjoint Lyapunov
+equation of its own (`disturbance_pullback`).
 
 Plain NumPy: a point is differentiated once, and compiled this took a third of the set-up.
 """
@@ -46,7 +47,10 @@ from ccd_casadi.support.arrays import Array
 
 
 class Loop(NamedTuple):
-    """A plant with its derivatives to θ, and the frequency at which σ_max(S) is differentiated."""
+    """A plant with its derivatives to θ, and the frequency at which σ_max is differentiated.
+
+    Of S, or with `compliance` of S G; those stand last among several.
+    """
 
     A: Array
     B: Array
@@ -55,6 +59,7 @@ class Loop(NamedTuple):
     dB: Array
     dC: Array
     omega: float
+    compliance: bool = False
 
 
 class DesignPlant(NamedTuple):
@@ -110,10 +115,11 @@ def gamma_gradient(gp, H0, back, gamma_opt):
     return *(scale * part[0] for part in back.to_plant_and_weights(terms)), ok
 
 
-def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
+def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω, compliance):
     """Vectors of dσ = -Re(aᵀ(dG K + G dK)b) at ω, and dσ/dω, σ, the relative gap to σ_2.
 
-    A, B, C (k, ...) and ω (k,) are one a loop; vectors are columns, (k, n, 1).
+    A, B, C (k, ...) and ω (k,) are one a loop; vectors are columns, (k, n, 1). The last loops,
+    where `compliance` is True, are of S G: b is S G v and -(I + KG)⁻¹ v stands for K b.
     """
     jω = 1j * ω[:, None, None]
     M, Mk = jω * np.eye(A.shape[-1]) - A, jω * np.eye(len(Ak)) - Ak
@@ -121,19 +127,32 @@ def _gain_cotangents(A, B, C, Ak, Bk, Ck, ω):
     G, K = C @ GB, Ck @ KB
     p = C.shape[1]
     S = np.linalg.inv(np.eye(p) + G @ K)
-    U, s, Vh = np.linalg.svd(S)
-    gap = np.ones(len(s)) if p == 1 else (s[:, 0] - s[:, 1]) / s[:, 0]
-    a, b = _transposed(S) @ U[:, :, :1].conj(), S @ _transposed(Vh[:, :1]).conj()
-    Kb, aG = K @ b, _transposed(G) @ a
+    first = compliance.count(False)
+    found = _of_gain(G[:first], K[:first], S[:first], False)
+    if first < len(compliance):
+        last = _of_gain(G[first:], K[first:], S[first:], True)
+        found = tuple(np.concatenate(both) for both in zip(found, last, strict=True))
+    s, gap, a, b, Kb = found
+    aG = _transposed(G) @ a
     lG, rG = np.linalg.solve(_transposed(M), _transposed(C) @ a), GB @ Kb
     lK, rK = np.linalg.solve(_transposed(Mk), Ck.T @ aG), KB @ b
     # dG/dω = -j C M⁻² B, dK/dω likewise
     slope = (1j * ((lG * rG).sum((1, 2)) + (lK * rK).sum((1, 2)))).real
-    return a, b, Kb, aG, lG, rG, lK, rK, slope, s[:, 0], gap
+    return a, b, Kb, aG, lG, rG, lK, rK, slope, s, gap
+
+
+def _of_gain(G, K, S, compliance):
+    """σ_max of S, or of S G, the relative gap to σ_2, and a, b, K b of `_gain_cotangents`."""
+    U, s, Vh = np.linalg.svd(S @ G if compliance else S)
+    gap = np.ones(len(s)) if s.shape[1] == 1 else (s[:, 0] - s[:, 1]) / s[:, 0]
+    a, v = _transposed(S) @ U[:, :, :1].conj(), _transposed(Vh[:, :1]).conj()
+    b = S @ (G @ v if compliance else v)
+    # (I + KG)⁻¹ v = v - K S G v
+    return s[:, 0], gap, a, b, K @ b - v if compliance else K @ b
 
 
 def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
-    """Gradients (k, n_θ + n_w) of σ_max(S(jω)) of each loop, to θ and the weights.
+    """Gradients (k, n_θ + n_w) of σ_max of S(jω) or S G(jω) of each loop, to θ and the weights.
 
     `gamma_slope` (n_θ + n_w) is the gradient of γ_opt. Returns besides, one a loop, the gradient
     to θ with K held, the slopes dσ/dω, σ, the relative gaps (σ1 - σ2)/σ1; and whether the
@@ -156,7 +175,7 @@ def loop_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
     plants = (np.array([getattr(loop, name) for loop in loops]) for name in "ABC")
     ω = np.array([loop.omega for loop in loops])
     a, b, Kb, aG, lG, rG, lK, rK, slopes, gains, gaps = _gain_cotangents(
-        *plants, Ag + B2 @ F - B1 @ C2, B1, F, ω
+        *plants, Ag + B2 @ F - B1 @ C2, B1, F, ω, [loop.compliance for loop in loops]
     )
     direct = -_outer(lG, rG), -_outer(lG, Kb), -_outer(a, rG)
     h = aG + B2.T @ lK
@@ -204,14 +223,14 @@ def figure_gradients(design_plant, posed, gamma_opt, gamma_slope, loops):
     """Gradients of (ω_b, ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt), of ω_b with K held, and σ's gaps.
 
     The first (4, n_θ + n_w), to θ and to the weights; `loops` are where ω_b, the peak and ω_low
-    are taken. The fixed-K gradient (n_θ) is the paper's. With them whether the Hamiltonian
-    splits; everything is NaN where it does not.
+    are taken. A fourth loop's ln σ stands before γ_opt. The fixed-K gradient (n_θ) is the paper's.
+    With them whether the Hamiltonian splits; everything is NaN where it does not.
     """
     found, held, slopes, gains, gaps, ok = loop_gradients(
         design_plant, posed, gamma_opt, gamma_slope, loops
     )
-    # ω_b by the implicit function theorem; the peak's own frequency drops out (envelope)
-    scale = np.array([-slopes[0], gains[1], gains[2]])
+    # ω_b by the implicit function theorem; a peak's own frequency drops out (envelope)
+    scale = np.array([-slopes[0], *gains[1:]])
     out = np.vstack([found / scale[:, None], gamma_slope if ok else np.full_like(gamma_slope, nan)])
     return out, -held[0] / slopes[0], gaps, ok
 
@@ -257,10 +276,10 @@ def off_design_gradients(design_plant: DesignPlant, row: Array, gamma_slope: Arr
     """What `figure_gradients` gives but the last, with loops closed on other plants.
 
     `row` is the synthesis on the design plant, `gamma_slope` the gradient of its γ_opt. NaN
-    where there are no three loops, or the synthesis has no gradients.
+    where there are no loops, or the synthesis has no gradients.
     """
     none = _no_gradients(design_plant)
-    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or len(loops) != 3:
+    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED] or not loops:
         return none
     with np.errstate(all="ignore"):
         out, fixed, gaps, ok = figure_gradients(

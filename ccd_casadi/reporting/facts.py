@@ -88,6 +88,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
             number(r["sensitivity_low"], 4),
             f"S_low = {inner.S_low:g}",
         ),
+        *_compliance(problem, r),
         (
             "Certificate",
             "passed" if certificate["passed"] else "FAILED",
@@ -99,6 +100,16 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
         *_optimality(r),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]
+
+
+def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
+    """What a force moves, at most and at rest; nothing of a run of before."""
+    if "compliance_words" not in r:
+        return []
+    asked = problem.inner.compliance_max
+    bound = "no compliance_max" if asked is None else f"compliance_max = {1e6 * asked:g} µm/N"
+    value = f"{number(1e6 * r['compliance_max'], 4)} µm/N"
+    return [("Compliance ‖GS‖∞", value, f"{bound}; {r['compliance_words']}")]
 
 
 def _robust(r: Mapping[str, Any]) -> list[Fact]:
@@ -192,6 +203,9 @@ def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> 
     elif name == "S_low":
         words = f"|S| at ω_low is at S_low = {inner.S_low:g}"
         gain = _gain(multiplier, 0.01, "raising S_low by 1 %")
+    elif name == "compliance_max" and inner.compliance_max is not None:
+        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
+        gain = _gain(multiplier, 0.01, "raising it by 1 %")
     else:
         variable, _, end = name.rpartition(" ")
         side = "widening the range there by 1 %"

@@ -1,5 +1,7 @@
 """The inner problem at the optimum: ω_b over (ω_S, ω_T) from the store, or from the surrogates."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
@@ -46,13 +48,18 @@ def sweep_data(
     )
     inner = problem.inner
     axes = [np.geomspace(*ends, GRID) for ends in (inner.omega_S, inner.omega_T)]
-    limits = np.log([inner.S_max, inner.S_low])
+    limits = inner.levels
     source, field = LINEAR, None
-    if len(processes) == 3:
+    if len(processes) > 1:
         source = LIFTED
         field = fields(processes, np.array([theta]), *map(np.log, axes))[:, 0]
     else:
-        field = _interpolated(rows, axes)
+        # besides the peak, whichever bound is nearest to being passed
+        others = [
+            [np.log(getattr(s, name) / bound) for name, bound in list(inner.bounds.values())[1:]]
+            for s in samples
+        ]
+        field = _interpolated(rows, limits[1] + np.max(others, axis=1), axes)
     empty = np.empty((0, 0))
     known = field is not None
     return SweepMap(
@@ -61,16 +68,17 @@ def sweep_data(
         omega_T=axes[1] / HZ,
         bandwidth_hz=field[0] / HZ if field is not None else empty,
         peak=field[1] - limits[0] if field is not None else empty,
-        low=field[2] - limits[1] if field is not None else empty,
+        low=(field[2:] - limits[1:, None, None]).max(0) if field is not None else empty,
         optimum=optimum,
         source=source if known else NO_FIELD,
+        others=" or ".join(list(inner.bounds)[1:]),
     )
 
 
-def _interpolated(rows: Array, axes: list[Array]) -> Array | None:
-    """ω_b, ln‖S‖∞, ln|S(low)| between the rows, linear in logarithms; None if they span no area."""
+def _interpolated(rows: Array, low: Array, axes: list[Array]) -> Array | None:
+    """ω_b, ln‖S‖∞ and `low` between the rows, linear in logarithms; None if they span no area."""
     places = np.log(HZ * rows[:, :2])
-    values = np.column_stack([HZ * rows[:, 2], np.log(rows[:, 3]), np.log(rows[:, 4])])
+    values = np.column_stack([HZ * rows[:, 2], np.log(rows[:, 3]), low])
     # refinements pile up near the optimum; triangles between them are only rounding
     _, first = np.unique(np.round(places, 3), axis=0, return_index=True)
     logs = [np.log(axis) for axis in axes]
@@ -87,12 +95,13 @@ def _interpolated(rows: Array, axes: list[Array]) -> Array | None:
     return np.moveaxis(between(points), -1, 0)
 
 
-def caption_sweep(sweep: SweepMap, *, S_max: float, S_low: float) -> str:
+def caption_sweep(sweep: SweepMap, bounds: Mapping[str, float]) -> str:
     """How many syntheses, how many feasible, and what S_max costs."""
     inside = sweep.rows[:, 5] > 0.5
+    given = [f"{name} = {bound:g}" for name, bound in bounds.items()]
     words = (
         f"{len(inside)} certified syntheses at the optimal θ, {int(inside.sum())} of them within "
-        f"S_max = {S_max:g} and S_low = {S_low:g} ({sweep.source}). The optimum (★) lies at "
+        f"{', '.join(given[:-1])} and {given[-1]} ({sweep.source}). The optimum (★) lies at "
         f"ω_S = {number(sweep.optimum[0], 4)} Hz, ω_T = {number(sweep.optimum[1], 4)} Hz."
     )
     if (~inside).any():
@@ -100,7 +109,7 @@ def caption_sweep(sweep: SweepMap, *, S_max: float, S_low: float) -> str:
         if hz > sweep.optimum[2]:
             worst = sweep.rows[~inside][sweep.rows[~inside, 2].argmax()]
             words += (
-                f" Without the bounds on S there would be up to {number(hz, 4)} Hz, at "
+                f" Without these bounds there would be up to {number(hz, 4)} Hz, at "
                 f"‖S‖∞ = {number(float(worst[3]), 4)}."
             )
     if sweep.bandwidth_hz.size:

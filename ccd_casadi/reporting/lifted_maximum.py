@@ -33,7 +33,7 @@ class InnerMaximum:
 def fields(
     processes: tuple[GaussianProcess, ...], thetas: Array, omega_S: Array, omega_T: Array
 ) -> Array:
-    """ω_b, ln‖S‖∞, ln|S(jω_low)| (3, t, a, b) over the tensor grid of ln ω_S (a,), ln ω_T (b,)."""
+    """ω_b and ln of each bounded figure (…, t, a, b) on the grid of ln ω_S (a,), ln ω_T (b,)."""
     t, a, b = len(thetas), len(omega_S), len(omega_T)
     pairs = np.stack(np.meshgrid(omega_S, omega_T, indexing="ij"), -1).reshape(-1, 2)
     X = np.hstack([np.repeat(thetas, a * b, axis=0), np.tile(pairs, (t, 1))])
@@ -43,12 +43,12 @@ def fields(
 def inner_maximum(
     problem: CoDesignProblem, processes: tuple[GaussianProcess, ...], thetas: Array
 ) -> InnerMaximum:
-    """The largest surrogate bandwidth at every θ (t, n_θ), subject to S_max and S_low."""
+    """The largest surrogate bandwidth at every θ (t, n_θ), subject to every bound."""
     low, high = (bound[-2:] for bound in lifted_bounds(problem))
     nodes = np.cos(np.pi * np.arange(NODES) / (NODES - 1))
     axes = [0.5 * (low[k] + high[k]) + 0.5 * (high[k] - low[k]) * nodes for k in range(2)]
     values = fields(processes, thetas, *axes)
-    limits = np.log([problem.inner.S_max, problem.inner.S_low])
+    limits = problem.inner.levels[:, None, None, None]
     t = np.arange(len(thetas))
 
     def at(u: Array, v: Array) -> tuple[Array, Array]:
@@ -56,7 +56,7 @@ def inner_maximum(
         f = np.einsum(
             "tim,qtmn,tjn->qtij", _basis(nodes, u), values, _basis(nodes, v), optimize=True
         )
-        return f[0], np.maximum(f[1] - limits[0], f[2] - limits[1])
+        return f[0], (f[1:] - limits).max(axis=0)
 
     grid = np.linspace(-1.0, 1.0, COARSE)
     flat = np.broadcast_to(grid, (len(thetas), COARSE))

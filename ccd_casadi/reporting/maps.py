@@ -72,7 +72,8 @@ class ThetaPath:
 class SweepMap:
     """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
 
-    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low` = ln(|S(low)|/S_low) lie on the grid of
+    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low`, the largest ln(figure/bound) of the bounds
+    that `others` names, lie on the grid of
     `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
     where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
     """
@@ -85,6 +86,7 @@ class SweepMap:
     low: Array
     optimum: tuple[float, float, float]
     source: str
+    others: str = "S_low"
 
 
 def figure_landscape(
@@ -152,7 +154,7 @@ def figure_sweep(sweep: SweepMap, *, key: str = "sweep") -> str:
         filled, norm = _contours(axes, sweep.omega_S, sweep.omega_T, sweep.bandwidth_hz, shown)
         if sweep.bandwidth_hz.size:
             _shade(axes, sweep.omega_S, sweep.omega_T, np.maximum(sweep.peak, sweep.low))
-            for field, line, label in ((sweep.peak, "-", "S_max"), (sweep.low, "--", "S_low")):
+            for field, line, label in ((sweep.peak, "-", "S_max"), (sweep.low, "--", sweep.others)):
                 if np.nanmin(field) < 0.0 < np.nanmax(field):
                     axes.contour(sweep.omega_S, sweep.omega_T, field.T, levels=[0.0],
                                  colors=BLACK, linewidths=1.1, linestyles=line)  # fmt: skip

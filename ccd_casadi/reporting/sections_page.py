@@ -71,10 +71,11 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     """What holds θ, and what the controller, with what loosening it would gain."""
     over_theta = binding(problem, {**result, "active": []})
     mu = result["controller"]["multipliers"]
+    gain = "lower the RMS error" if sections_of_problem(problem).of_error else "raise ω_b"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S below ω_b", "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
     over_kappa = [
-        f"{words} binds; a bound looser by 1 % would raise ω_b by {number(mu[name], 3)} %"
+        f"{words} binds; a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"
         for name, words in names.items()
         if mu.get(name, 0.0) > 1e-6
     ]
@@ -147,12 +148,18 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     )  # fmt: skip
     worst = f"largest of {robust['plants']} plants of the box"
     kkt = r["kkt"]["stationarity"]
+    of_error = sections_of_problem(problem).of_error
+    predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
+    if of_error:
+        e, guess = (1e9 * r[key] for key in ("error_rms_of_set", "surrogate_error_rms"))
+        words = f"{number(e, 6)} nm over the set (predicted {number(guess, 6)})"
+        predicted = ("RMS error e", words)
     return [
-        ("Objective J", number(r["objective"], 7), f"{problem.w1:g} f(θ) + ({problem.w2:g}) ω_b"),
+        ("Objective J", number(r["objective"], 7),
+         f"{problem.w1:g} f(θ) + ({problem.w2:g}) {'e, in m' if of_error else 'ω_b'}"),
         ("Hardware cost f(θ)", number(r["hardware_cost"], 6), ""),
         ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", "on every plant of the set"),
-        ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz",
-         f"relative error {number(r['verification_error'], 2)}"),
+        (*predicted, f"relative error {number(r['verification_error'], 2)}"),
         ("Loop", runs, ""),
         ("Peak of sensitivity", number(r["sensitivity_peak"], 6),
          f"at {number(r['sensitivity_peak_hz'], 4)} Hz; S_max = {inner.S_max:g}"),
@@ -160,7 +167,7 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
         (f"|S| at {number(inner.omega_low / HZ)} Hz", number(r["sensitivity_low"], 4),
          f"S_low = {inner.S_low:g}"),
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
-         f"at most; at the lowest frequencies {number(1e6 * r['static_compliance'], 4)} µm/N"),
+         r["compliance_words"]),
         ("Largest |KS|", f"{number(r['KS_max'], 4)} N/m", ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {certificate['plants']} "

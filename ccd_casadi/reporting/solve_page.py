@@ -166,7 +166,7 @@ def _theta(
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
         paths = [ThetaPath("iterates", path, numbered=True)] if len(path) else []
         svg = figure_landscape(land, paths, (verified.theta[0], verified.theta[1]))
-        caption = caption_landscape(land, best, lifted=len(processes) == 3) + extra
+        caption = caption_landscape(land, best, lifted=len(processes) > 1) + extra
         tables = tables_landscape(land)
         return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables))
     slices = slices_data(problem, processes, truths, verified.theta)
@@ -174,7 +174,7 @@ def _theta(
         words = "There is no surrogate, and no design near the optimum to show in its place."
         return Section("Bandwidth over the hardware", paragraph(words))
     svg = figure_slices(slices, best)
-    caption = caption_slices(slices, best, lifted=len(processes) == 3) + extra
+    caption = caption_slices(slices, best, lifted=len(processes) > 1) + extra
     return Section("Bandwidth over the hardware", figure_html(svg, caption, *tables_slices(slices)))
 
 
@@ -240,7 +240,7 @@ def _history(
         w2=problem.w2,
         tolerance=case.outer.tolerance,
     )
-    caption = caption_history(history, lifted=len(outcome.surrogates) == 3)
+    caption = caption_history(history, lifted=len(outcome.surrogates) > 1)
     table = table_history(history, problem.names)
     return Section(heading, figure_html(figure_history(history), caption, table))
 
@@ -270,8 +270,8 @@ def _sweep(
     if sweep is None:
         words = f"Too few syntheses at {theta_words(result)} to draw the inner problem there."
         return Section(heading, paragraph(words))
-    inner = problem.inner
-    caption = caption_sweep(sweep, S_max=inner.S_max, S_low=inner.S_low)
+    bounds = {name: bound for name, (_, bound) in problem.inner.bounds.items()}
+    caption = caption_sweep(sweep, bounds)
     return Section(heading, figure_html(figure_sweep(sweep), caption, table_sweep(sweep)))
 
 

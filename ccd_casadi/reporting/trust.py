@@ -14,8 +14,11 @@ WORDS = {
     "bandwidth": "bandwidth ω_b",
     "sensitivity_peak": "peak of S",
     "sensitivity_low": "|S| at ω_low",
+    "compliance": "compliance |GS|",
+    "rms_error": "RMS error",
 }
-AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–"}
+AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–", "compliance": "m/N",
+        "rms_error": "nm"}  # fmt: skip
 LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 
 

@@ -29,9 +29,8 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import loop_data
-from ccd_casadi.synthesis.statics import Statics, sampled_statics, statics
+from ccd_casadi.synthesis.statics import Statics, statics
 
 
 @dataclass(frozen=True)
@@ -122,11 +121,7 @@ def tried(
         gains=gains(loop.plant, loop.controller),
         margins=margins(run.plant, run.controller, loop.hz, loop.plant, loop.controller),
         noise=noise(closed, d.sensor, d.disturbance),
-        statics=statics(
-            run.plant.plant_si(),
-            run.controller,
-            responses(run.plant, run.controller, np.array([run.figures.bandwidth]))[1][0],
-        ),
+        statics=_statics(run),
         shift=shift_line(run, system, d.shift, quiet=quiet),
         damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
@@ -148,7 +143,6 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
     G, K = run.sampled.responses(run.plant, HZ * hz)
-    at = run.sampled.responses(run.plant, np.array([run.figures.bandwidth]))[1][0]
     profile = setpoint(d.limits)
     free, moves = _moves(run, profile, d)
     return Study(
@@ -157,7 +151,7 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
         gains=gains(G, K),
         margins=sampled_margins(hz, G, K),
         noise=None,
-        statics=sampled_statics(run.plant.plant_si(), run.controller, at),
+        statics=_statics(run),
         shift=shift_line(run, system, d.shift, quiet=quiet),
         damping=damping_line(run, system, *d.damping, quiet=quiet),
         modes=single_modes(run, system, d.shift),
@@ -168,6 +162,14 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
         free=free,
         moves=moves,
     )
+
+
+def _statics(run: FinishedRun) -> Statics:
+    return statics(
+        run.plant.plant_si(), run.controller, bandwidth=run.figures.bandwidth,
+        omega_low=run.problem.inner.omega_low,
+        period=0.0 if run.sampled is None else run.sampled.period,
+    )  # fmt: skip
 
 
 def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[bool, tuple[Move, ...]]:

@@ -13,6 +13,7 @@ import numpy as np
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
@@ -28,7 +29,8 @@ CHUNK = 8  # single designs a unit at most
 class BandwidthSample:
     """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
 
-    An infeasible one says what falls short, and by how much (ln) at least: `violation`.
+    An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
+    `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
     """
 
     theta: tuple[float, ...]
@@ -41,6 +43,12 @@ class BandwidthSample:
     violation: float
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
+    error: float = float("nan")
+
+    @property
+    def value(self) -> float:
+        """What J counts: the error where the inner problem is of that, else ω_b*."""
+        return self.bandwidth if np.isnan(self.error) else self.error
 
     @property
     def feasible(self) -> bool:
@@ -50,8 +58,9 @@ class BandwidthSample:
 
 @dataclass(frozen=True)
 class QuantitySample:
-    """Values (4,) and derivatives (4, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
+    """Values and their derivatives (…, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
 
+    As `Sensitivities` has them: ω_b, ln of the bounded figures, γ_opt last.
     `peak_frequency` is where S is largest, rad/s; NaN where it is not known.
     """
 
@@ -137,7 +146,7 @@ class Sampler:
                 self.nearest is None or sample.violation < self.nearest.violation
             ):
                 self.nearest = sample
-            self._spend(key, sample.syntheses, theta, sample.bandwidth)
+            self._spend(key, sample.syntheses, theta, sample.value)
         return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:
@@ -146,7 +155,9 @@ class Sampler:
         keys = [self._design_key(x) for x in points]
         count = len(self.problem.names)
         known = {key: s for key, s in self.store.get(keys).items() if s.gradients is not None}
-        if any(len(sample.gradients or ()) != 4 * (count + 2) for sample in known.values()):
+        if any(
+            len(sample.gradients or ()) != self._size * (count + 2) for sample in known.values()
+        ):
             raise self.store.damaged()
         todo = list({k: x for k, x in zip(keys, points, strict=True) if k not in known}.items())
         size = min(CHUNK, max(1, -(-len(todo) // self.workers.count)))  # a few keep all at work
@@ -160,7 +171,8 @@ class Sampler:
         for x, key in zip(points, keys, strict=True):
             sample = known[key]
             self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
-        return [quantity_sample(x, known[k], count) for x, k in zip(points, keys, strict=True)]
+        inner = self.problem.inner
+        return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
 
     def design(self, x: Array) -> Sensitivities:
         """One true design at x, recorded."""
@@ -190,12 +202,12 @@ class Sampler:
         self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(objective)))
 
     def _meets(self, sample: Sample) -> bool:
-        inner = self.problem.inner
-        return (
-            sample.certified
-            and sample.sensitivity_peak <= inner.S_max
-            and sample.sensitivity_low <= inner.S_low
-        )
+        return sample.certified and self.problem.inner.excess(sample) <= 0.0
+
+    @property
+    def _size(self) -> int:
+        """Number of values of a design."""
+        return 2 + len(self.problem.inner.bounds)
 
     def _design_key(self, x: tuple[float, ...]) -> str:
         return sample_key(self.hash, x[:-2], *_frequencies(self.problem, x))
@@ -229,7 +241,10 @@ def inner_unit(
         "bandwidth": None if optimum is None else optimum.figures.bandwidth,
         "gradient": None
         if optimum is None
-        else [_number(v) for v in bandwidth_gradient(optimum, result.active)],
+        else [
+            _number(v)
+            for v in bandwidth_gradient(optimum, result.active, tuple(problem.inner.bounds))
+        ],
         "omega_S": None if optimum is None else optimum.figures.omega_S,
         "omega_T": None if optimum is None else optimum.figures.omega_T,
         "active": list(result.active),
@@ -273,6 +288,7 @@ def sections_unit(
         "bandwidth": _number(value.bandwidth),
         "gradient": [_number(v) for v in value.gradient] if value.feasible else None,
         "kappa": [float(v) for v in design.kappa] if value.feasible else [],
+        "error": _number(value.error),
         "active": sorted(name for name, mu in design.multipliers.items() if mu > 0.0),
         "shortfall": "" if value.feasible else design.words,
         "violation": _number(np.log(max(design.short.values()))) if design.short else None,
@@ -326,6 +342,7 @@ def _sample(
         certified=figures.certified,
         seconds=seconds,
         gradients=gradients,
+        compliance=figures.compliance,
     )
 
 
@@ -335,7 +352,7 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
     nan = float("nan")
     gradient = payload["gradient"] or [None] * len(theta)
     active, shortfall = payload["active"], payload["shortfall"]
-    kappa = payload.get("kappa")
+    kappa, error = payload.get("kappa"), payload.get("error")
     sized = ("bandwidth",) if kappa is not None else ("bandwidth", "omega_S", "omega_T")
     positive = [payload[key] for key in sized] if feasible else []
     violation, syntheses = payload["violation"], payload["syntheses"]
@@ -347,6 +364,7 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
         or not all(isinstance(word, str) for word in [shortfall, *active])
         or type(syntheses) is not int
         or not all(type(v) is float for v in kappa or ())
+        or not (error is None or (type(error) is float and error > 0.0))
     ):
         raise ValueError("a stored result holds what none is made of")
     return BandwidthSample(
@@ -360,22 +378,17 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
         violation=np.inf if violation is None else violation,
         syntheses=syntheses,
         kappa=tuple(kappa or ()),
+        error=nan if error is None else error,
     )
 
 
-def quantity_sample(x: tuple[float, ...], sample: Sample, count: int) -> QuantitySample:
-    """A row with derivatives as values at x; `count` hardware parameters."""
+def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerProblem) -> QuantitySample:
+    """A row with derivatives as values at x, of the figures that `inner` bounds."""
     assert sample.gradients is not None
     with np.errstate(invalid="ignore", divide="ignore"):
-        values = np.array(
-            [
-                sample.bandwidth,
-                np.log(sample.sensitivity_peak),
-                np.log(sample.sensitivity_low),
-                sample.gamma_opt,
-            ]
-        )
-    gradients = np.array(sample.gradients).reshape(4, count + 2)
+        bounded = np.log([getattr(sample, name) for name, _ in inner.bounds.values()])
+        values = np.array([sample.bandwidth, *bounded, sample.gamma_opt])
+    gradients = np.array(sample.gradients).reshape(len(values), len(x))
     where = sample.sensitivity_peak_frequency
     return QuantitySample(x, values, gradients, sample.certified, where)
 

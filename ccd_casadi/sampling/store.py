@@ -33,7 +33,8 @@ class Sample:
     """One synthesis, certified or not; SI, frequencies in rad/s, NaN where there is no figure.
 
     `gradients` are the flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞,
-    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed.
+    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed. With `compliance`
+    (‖GS‖∞, m/N) its logarithm stands before γ_opt.
     """
 
     key: str
@@ -55,12 +56,14 @@ class Sample:
     certified: bool
     seconds: float
     gradients: tuple[float, ...] | None = None
+    compliance: float = math.nan
 
 
 _COLUMNS = tuple(field.name for field in fields(Sample))
 _REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
 _TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
 _DAMAGED = "a row is damaged"
+_ADDED = "compliance"  # the one column that stores of before do not have
 _THETA, _CERTIFIED, _GRADIENTS = map(_COLUMNS.index, ("theta", "certified", "gradients"))
 _TABLES = """
 create table if not exists meta (name text primary key, value text not null);
@@ -70,7 +73,7 @@ create table if not exists samples (
     omega_T real not null, outcome text not null, reason text not null, gamma_opt real,
     gamma_lower_bound real, gamma real, bandwidth real, sensitivity_peak real,
     sensitivity_peak_frequency real, sensitivity_low real, max_real_pole real, norm real,
-    norm_bound real, certified integer not null, seconds real, gradients text
+    norm_bound real, certified integer not null, seconds real, gradients text, compliance real
 );
 create table if not exists results (
     key text primary key, problem text not null, theta text not null, json text not null
@@ -133,6 +136,8 @@ class SampleStore:
                     # one by one: executescript would end the transaction
                     for statement in _TABLES.split(";"):
                         self._db.execute(statement)
+                    if _ADDED not in self._columns():  # a store of before
+                        self._db.execute(f"alter table samples add column {_ADDED} real")
                     insert = "insert or ignore into meta values ('schema', ?)"
                     self._db.execute(insert, (str(SCHEMA),))
             except BaseException:
@@ -155,13 +160,16 @@ class SampleStore:
                 f"{self.path}: is a database of another program; choose another --out"
             )
         found = self._db.execute("select * from meta where name = 'schema'").fetchone()
-        columns = {row[1] for row in self._db.execute("pragma table_info(samples)")}
+        columns = self._columns() | {_ADDED}
         schema = None if found is None else found[1]
         if schema != str(SCHEMA) or not set(_COLUMNS) <= columns:
             raise SampleStoreError(
                 f"{self.path}: is a sample store of schema {schema}, not {SCHEMA}; "
                 "choose another --out"
             )
+
+    def _columns(self) -> set[str]:
+        return {row[1] for row in self._db.execute("pragma table_info(samples)")}
 
     def _write_ahead(self) -> None:
         """Switch to the write-ahead log; SQLite does not wait for that lock by itself."""

@@ -17,6 +17,7 @@ from ccd_casadi.kernels.gradients import (
 )
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.compliance import compliance_over_family
 from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.synthesis.weights import Weights
 
@@ -28,12 +29,12 @@ _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 class Sensitivities:
     """Figures of one design with their gradients.
 
-    `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), γ_opt.
-    `to_theta` (4, n_θ) per unit of θ; `to_weights` maps a weight's name to the derivatives (4,)
-    to its logarithm, W_d as `disturbance` where it is given. `fixed_controller` (n_θ) is dω_b/dθ
-    with K held fixed.
-    `simple` tells whether σ_max is a simple singular value at the three frequencies; where it is
-    not, the gradient is one of several one-sided ones.
+    `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), where it was
+    asked for ln‖GS‖∞ (m/N), γ_opt. `to_theta` (4 or 5, n_θ) per unit of θ; `to_weights` maps a
+    weight's name to the derivatives to its logarithm, W_d as `disturbance` where it is given.
+    `fixed_controller` (n_θ) is dω_b/dθ with K held fixed. `simple` tells whether σ_max is a simple
+    singular value at these frequencies; where it is not, the gradient is one of several one-sided
+    ones.
     """
 
     figures: DesignFigures
@@ -45,7 +46,7 @@ class Sensitivities:
 
     @property
     def to_break_frequencies(self) -> Array:
-        """Derivatives (4, 2) to (ln ω_S, ln ω_T)."""
+        """Derivatives (4 or 5, 2) to (ln ω_S, ln ω_T)."""
         return np.column_stack([self.to_weights["omega_S"], self.to_weights["omega_T"]])
 
 
@@ -56,11 +57,13 @@ def sensitivities(
     omega_low: float,
     gamma_backoff: float = 1.02,
     guess: float = 0.0,
+    compliance: bool = False,
 ) -> Sensitivities:
     """Synthesise, certify and differentiate at one point; gradients are NaN if not certified.
 
     What is certified here has finite gradients; where they are not, the outcome says so.
-    With a family the peak is the largest on any of it, its gradient that of the plant that has it.
+    With a family the peak is the largest on any of it, its gradient that of the plant that has it;
+    so is ‖GS‖∞, which is among the values where `compliance` asks for it.
     """
     w0 = plant.omega_0
     w = weights.scaled(w0)
@@ -75,16 +78,20 @@ def sensitivities(
         row, *controller, gradient, fixed, gaps = design_with_gradients(
             *arguments, omega_low / w0, guess, *slopes, made_on.channels, weights.delta
         )
-        if plant.family is not None:
+        if plant.family is not None or compliance:
             figures, worst = over_family(plant, weights, row, tuple(controller), omega_low)
-            members = (plant, *plant.family.perturbed)
+            places = [
+                (plant, figures.bandwidth, False),
+                (worst, figures.sensitivity_peak_frequency, False),
+                (plant, omega_low, False),
+            ]
+            if compliance and figures.certified:
+                most = compliance_over_family(plant, plant.controller_si(*controller))
+                figures = replace(figures, compliance=most.gain)
+                places.append((most.plant, most.omega, True))
             loops = [
-                Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0)
-                for at, omega in (
-                    (plant, figures.bandwidth),
-                    (members[worst], figures.sensitivity_peak_frequency),
-                    (plant, omega_low),
-                )
+                Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega / w0, of_force)
+                for at, omega, of_force in places
             ]
             made_at = DesignPlant(*arguments[:3], *slopes, w, gamma_backoff, weights.delta)
             gradient, fixed, gaps = off_design_gradients(
@@ -93,20 +100,17 @@ def sensitivities(
     except np.linalg.LinAlgError:
         row, gradient = failed_row(), np.full((4, count + len(names)), np.nan)
         fixed, gaps = np.full(count, np.nan), np.full(3, np.nan)
+    if len(gradient) != 4 + compliance:
+        gradient = np.full((5, gradient.shape[1]), np.nan)
     if figures is None:
         figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     if figures.certified and not np.isfinite(gradient).all():
         figures = replace(figures, outcome=Outcome.NO_DERIVATIVES)
     gradient[0] *= w0
     with np.errstate(invalid="ignore", divide="ignore"):
-        values = np.array(
-            [
-                figures.bandwidth,
-                np.log(figures.sensitivity_peak),
-                np.log(figures.sensitivity_low),
-                figures.gamma_opt,
-            ]
-        )
+        bounded = [figures.sensitivity_peak, figures.sensitivity_low]
+        bounded += [figures.compliance] if compliance else []
+        values = np.array([figures.bandwidth, *np.log(bounded), figures.gamma_opt])
     return Sensitivities(
         figures=figures,
         values=values,

@@ -13,24 +13,33 @@ from ccd_casadi.support.arrays import Array
 NEAR_AXIS = 1e-3  # |Re λ|/|λ| of a candidate: a spurious one costs an evaluation, no more
 RESOLUTION = 1e-10  # relative step of the level
 ROUNDS = 40
+MEMORY = 1_000_000  # complex numbers at once
 
 
 def gains(system: StateSpace, omega: Array) -> Array:
     """σ_max of C(jω - A)⁻¹B + D at every ω in rad/s; infinite at a pole on the axis."""
-    n = len(system.A)
-    out = np.empty(len(omega))
-    for i, w in enumerate(omega):
-        if not np.isfinite(w):
-            response = system.D.astype(complex)
-        else:
-            try:
-                response = system.C @ np.linalg.solve(1j * w * np.eye(n) - system.A, system.B)
-            except np.linalg.LinAlgError:
-                out[i] = np.inf
-                continue
-            response = response + system.D
-        out[i] = np.linalg.norm(response, 2) if np.isfinite(response).all() else np.inf
+    out = np.full(len(omega), np.linalg.norm(system.D, 2))
+    finite = np.flatnonzero(np.isfinite(omega))
+    size = max(1, MEMORY // max(1, system.A.size))
+    for first in range(0, len(finite), size):
+        part = finite[first : first + size]
+        try:
+            out[part] = _gains(system, omega[part])
+        except np.linalg.LinAlgError:  # of some of them: one by one
+            for i in part:
+                try:
+                    out[i] = _gains(system, omega[i : i + 1])[0]
+                except np.linalg.LinAlgError:
+                    out[i] = np.inf
     return out
+
+
+def _gains(system: StateSpace, omega: Array) -> Array:
+    shifted = 1j * omega[:, None, None] * np.eye(len(system.A)) - system.A
+    response = system.C @ np.linalg.solve(shifted, system.B + 0j) + system.D
+    known = np.asarray(np.isfinite(response).all(axis=(1, 2)))
+    sizes = np.linalg.norm(np.where(known[:, None, None], response, 0.0), 2, axis=(1, 2))
+    return np.where(known, sizes, np.inf)
 
 
 def level_frequencies(system: StateSpace, level: float) -> Array:

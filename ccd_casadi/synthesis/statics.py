@@ -1,9 +1,10 @@
-"""The loop at rest: what a constant force does, exactly at 0 Hz.
+"""The loop at rest and at the lowest frequency that counts: what a constant force does.
 
     K(0) in N/m,   GS(0) = (I + G(0) K(0))⁻¹ G(0) in m/N, the rigid bodies on their suspension
 
 Not the edge of a grid: mixed sensitivity cancels the suspension's poles, and |K| may fall by
-decades below the last frequency that a grid shows.
+decades below the last frequency that a grid shows. With an integrator GS(0) is nothing and K(0)
+what rounding left of a pole; what such a loop gives way is then told at ω_low.
 """
 
 from dataclasses import dataclass
@@ -11,19 +12,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
-PURE_INTEGRATOR = 1e-10  # least singular value of A over the largest below which s = 0 is a pole
+# |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
+INTEGRATOR = 1e-6
 
 
 @dataclass(frozen=True)
 class Statics:
-    """Least singular value of K(0) (N/m), largest of GS(0) (m/N), |K(0)| over |K| at ω_b."""
+    """Least singular value of K(0) (N/m), largest of GS(0) (m/N), |K(0)| over |K| at ω_b.
+
+    Infinite, 0 and infinite of a controller that integrates. `low` is that of GS at `low_hz`.
+    """
 
     stiffness: float
     compliance: float
     share: float
+    low: float
+    low_hz: float
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the controller has a pole at rest."""
+        return bool(np.isinf(self.stiffness))
 
     @property
     def differentiates(self) -> bool:
@@ -33,11 +45,15 @@ class Statics:
     @property
     def words(self) -> str:
         """One or two sentences."""
-        if np.isinf(self.stiffness):
-            return "Static stiffness: infinite (the controller integrates)."
+        low = f"at {self.low_hz:.3g} Hz {self.low:.3g} m (GS there)"
+        if self.integrates:
+            return (
+                "The controller integrates: at rest a constant force moves the stage by nothing; "
+                f"1 N moves it {low}."
+            )
         found = (
             f"Static stiffness K(0) = {self.stiffness:.3g} N/m: a constant force of 1 N moves the "
-            f"stage {self.compliance:.3g} m (GS at 0 Hz)."
+            f"stage {self.compliance:.3g} m (GS at 0 Hz), {low}."
         )
         if self.differentiates:
             found += (
@@ -47,30 +63,49 @@ class Statics:
         return found
 
 
-def statics(plant: StateSpace, controller: StateSpace, at_bandwidth: Array) -> Statics:
-    """From a stable plant and a continuous controller in SI, and K(jω_b) (m, p)."""
-    return statics_from(_at_rest(plant, 0.0), _at_rest(controller, 0.0), at_bandwidth)
+def statics(
+    plant: StateSpace,
+    controller: StateSpace,
+    *,
+    bandwidth: float,
+    omega_low: float,
+    period: float = 0.0,
+) -> Statics:
+    """Of a continuous plant without a pole at 0 and a controller in SI; ω_b, ω_low in rad/s.
 
+    `period` > 0: the controller is in discrete time, its rest z = 1; hold and delay, which turn
+    nothing at ω_low, are left out there.
+    """
 
-def statics_from(G0: Array | None, K0: Array | None, at_bandwidth: Array) -> Statics:
-    """The same from G(0) (p, m) and K(0) (m, p); None for a K that integrates."""
-    if K0 is None or G0 is None:
-        return Statics(np.inf, 0.0, np.inf)
+    def at(omega: float) -> np.ndarray:
+        return _response(controller, 1j * omega if period == 0.0 else np.exp(1j * omega * period))
+
+    def compliance(omega: float, K: np.ndarray) -> float:
+        G = _response(plant, 1j * omega)
+        return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
+
+    low = compliance(omega_low, at(omega_low))
+    poles = np.linalg.eigvals(controller.A)
+    rates = np.abs(poles) if period == 0.0 else np.abs(poles - 1.0) / period
+    if rates.size and rates.min() <= INTEGRATOR * bandwidth:
+        return Statics(np.inf, 0.0, np.inf, low, omega_low / HZ)
+    K0 = at(0.0)
     gains = np.linalg.svd(K0, compute_uv=False)
-    compliance = np.linalg.norm(np.linalg.solve(np.eye(len(G0)) + G0 @ K0, G0), 2)
-    share = gains[0] / max(float(np.linalg.norm(at_bandwidth, 2)), 1e-300)
-    return Statics(float(gains[-1]), float(compliance), float(share))
+    share = gains[0] / max(float(np.linalg.norm(at(bandwidth), 2)), 1e-300)
+    return Statics(float(gains[-1]), compliance(0.0, K0), float(share), low, omega_low / HZ)
 
 
-def _at_rest(system: StateSpace, z: float) -> Array | None:
-    """C (z - A)⁻¹ B + D for a real z; None where z is a pole."""
-    shifted = z * np.eye(len(system.A)) - system.A
-    sizes = np.linalg.svd(shifted, compute_uv=False)
-    if len(sizes) and sizes[-1] <= PURE_INTEGRATOR * sizes[0] * 1e-4:
-        return None
-    return np.asarray(system.C @ np.linalg.solve(shifted, system.B) + system.D, float)
+def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> str:
+    """‖GS‖∞, GS at rest (0: an integrator) and at the lowest frequency that counts, all in m/N.
+
+    >>> compliance_words(2e-6, 0.0, 5e-7, 1.0)
+    '2 um/N at most, 0.5 um/N at 1 Hz, none at rest (an integrator)'
+    """
+    rest = f"{1e6 * at_rest:.4g} um/N at rest" if at_rest else "none at rest (an integrator)"
+    return f"{1e6 * most:.4g} um/N at most, {1e6 * low:.4g} um/N at {low_hz:.3g} Hz, {rest}"
 
 
-def sampled_statics(plant: StateSpace, controller: StateSpace, at_bandwidth: Array) -> Statics:
-    """The same with a controller in discrete time, whose rest is z = 1."""
-    return statics_from(_at_rest(plant, 0.0), _at_rest(controller, 1.0), at_bandwidth)
+def _response(system: StateSpace, z: complex) -> np.ndarray:
+    """C (z - A)⁻¹ B + D."""
+    inside = z * np.eye(len(system.A)) - system.A
+    return np.asarray(system.C @ np.linalg.solve(inside, system.B + 0j) + system.D)

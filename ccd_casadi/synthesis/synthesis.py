@@ -16,6 +16,7 @@ from ccd_casadi.kernels.design import sweep as _sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.compliance import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
 UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm
@@ -77,6 +78,7 @@ class DesignFigures:
     sensitivity_peak_frequency: float
     sensitivity_low: float
     certificate: Certificate
+    compliance: float = float("nan")  # ‖GS‖∞ in m/N, where it was asked for
 
     @property
     def certified(self) -> bool:
@@ -100,11 +102,12 @@ def synthesise(
     omega_low: float,
     gamma_backoff: float = 1.02,
     guess: float = 0.0,
+    compliance: bool = False,
 ) -> Design:
     """One certified design; `omega_low` in rad/s, `guess` a nearby γ_opt (0: none).
 
     With a family it is made on the family's design plant, see `over_family`. A failure is an
-    outcome of its `figures`, no exception.
+    outcome of its `figures`, no exception. `compliance` asks for ‖GS‖∞ among them.
 
     >>> import ccd_casadi as ccd
     >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
@@ -121,7 +124,10 @@ def synthesise(
     figures = figures_from_row(row, weights.omega_S, weights.omega_T, w0)
     if plant.family is not None:
         figures = over_family(plant, weights, row, (Ak, Bk, Ck), omega_low)[0]
-    return Design(figures, weights, plant.controller_si(Ak, Bk, Ck))
+    controller = plant.controller_si(Ak, Bk, Ck)
+    if compliance and figures.certified:
+        figures = replace(figures, compliance=compliance_over_family(plant, controller).gain)
+    return Design(figures, weights, controller)
 
 
 def sweep(
@@ -132,16 +138,18 @@ def sweep(
     *,
     omega_low: float,
     gamma_backoff: float = 1.02,
+    compliance: bool = False,
 ) -> list[DesignFigures]:
     """A certified design at every (ω_S, ω_T) of a grid, rad/s; ω_T varies fastest."""
     w0 = plant.omega_0
     S, T = np.asarray(omega_S, float), np.asarray(omega_T, float)
     w = weights.scaled(w0)
     numbers = (plant.grid, plant.gain, gamma_backoff, omega_low / w0, plant.channels, weights.delta)
-    if plant.family is not None:
+    if plant.family is not None or compliance:
         points = [weights.at(float(s), float(t)) for s in S for t in T]
-        options = {"omega_low": omega_low, "gamma_backoff": gamma_backoff}
-        return [synthesise(plant, point, **options).figures for point in points]
+        made = (synthesise(plant, point, omega_low=omega_low, gamma_backoff=gamma_backoff,
+                           compliance=compliance) for point in points)  # fmt: skip
+        return [design.figures for design in made]
     rows = _sweep(plant.A, plant.B, plant.C, w, S / w0, T / w0, *numbers)
     return [
         figures_from_row(rows[i, j], float(s), float(t), w0)
@@ -156,16 +164,16 @@ def over_family(
     row: Array,
     controller: tuple[Array, Array, Array],
     omega_low: float,
-) -> tuple[DesignFigures, int]:
+) -> tuple[DesignFigures, ScaledPlant]:
     """Figures of a scaled controller (A_K, B_K, C_K) on a plant and its perturbed siblings.
 
-    ω_b and σ_max(S(jω_low)) are the plant's own, ‖S‖∞ is the largest of all; second comes which
-    has it, 0 the plant itself. `row` is that of the synthesis on the family's design plant. γ_opt
+    ω_b and σ_max(S(jω_low)) are the plant's own, ‖S‖∞ is the largest of all; second comes the
+    plant that has it. `row` is that of the synthesis on the family's design plant. γ_opt
     is of that one; the certified norm is of the plant itself, and no optimal one there.
     """
     w0 = plant.omega_0
     if row[Figure.CODE] != Code.CERTIFIED or plant.family is None:
-        return figures_from_row(row, weights.omega_S, weights.omega_T, w0), 0
+        return figures_from_row(row, weights.omega_S, weights.omega_T, w0), plant
     w, Dk = weights.scaled(w0), np.zeros((controller[2].shape[0], controller[1].shape[1]))
 
     def assessed(member: ScaledPlant, gamma: float) -> Array:
@@ -177,15 +185,15 @@ def over_family(
     own = assessed(plant, UNBOUNDED)
     if own[Figure.CODE] == Code.CERTIFIED:
         own = assessed(plant, max(row[Figure.GAMMA], (1.0 + LEVEL) * own[Figure.NORM]))
-    worst = 0
+    worst = plant
     if own[Figure.CODE] == Code.CERTIFIED:
-        for i, member in enumerate(plant.family.perturbed, 1):
+        for member in plant.family.perturbed:
             other = assessed(member, UNBOUNDED)
             if other[Figure.CODE] not in (Code.CERTIFIED, Code.NO_BANDWIDTH):
                 figures = figures_from_row(own, weights.omega_S, weights.omega_T, w0)
-                return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), i
+                return replace(figures, outcome=Outcome.NOT_ROBUST, sensitivity_peak=np.inf), member
             if other[Figure.PEAK] > own[Figure.PEAK]:
-                worst = i
+                worst = member
                 own[[Figure.PEAK, Figure.PEAK_FREQUENCY]] = other[
                     [Figure.PEAK, Figure.PEAK_FREQUENCY]
                 ]

@@ -1,0 +1,129 @@
+"""The least RMS error as the inner problem's value: its gradient to θ, and a solve with it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from case_documents import TWO_MASS
+from helpers import HZ
+from test_sections_codesign import PID, quick
+
+from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
+from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.run import solve
+from ccd_casadi.codesign.sections_run import seeded_and_prepared
+from ccd_casadi.codesign.sections_truth import objective
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
+from ccd_casadi.inner_problem.sections_problem import Uncertainty
+from ccd_casadi.sampling.sampler import BandwidthSample
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.errors import UserError
+
+CABLES = ErrorBudget((
+    Source("cables", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0,),))),
+    Source("encoder", Kind.SENSOR_NOISE, ShapedSpectrum(2.5e-21)),
+))  # fmt: skip
+SLOW = 8.0 * HZ
+
+
+def least(sampling: Sampling | None = None, **changes: object) -> CoDesignProblem:
+    sections = replace(
+        PID, uncertainty=Uncertainty(), starts=2, sampling=sampling, minimise="rms_error",
+        bandwidth_least=SLOW,
+    )  # fmt: skip
+    case = replace(quick(replace(sections, **changes)), budget=CABLES)  # type: ignore[arg-type]
+    return replace(case, w1=0.01, w2=1e6, lower=(58.0, 58.0), upper=(62.0, 62.0))
+
+
+def anchored(case: CoDesignProblem, folder: Path) -> CoDesignProblem:
+    with SampleStore(folder / "anchors.sqlite") as store:
+        found, words = seeded_and_prepared(store, case, 0, True)
+        assert not words
+        assert seeded_and_prepared(store, case, 0, True) == (found, "")
+    return found
+
+
+@pytest.mark.parametrize(
+    "sampling", [None, pytest.param(Sampling(8000.0, 80.0), marks=pytest.mark.slow)]
+)
+def test_the_gradient_is_the_slope_of_the_least_error(
+    sampling: Sampling | None, tmp_path: Path
+) -> None:
+    case = anchored(least(sampling), tmp_path)
+    assert case.sections is not None
+    assert case.sections.error_anchors
+    theta, h = np.array([61.0, 59.0]), 0.05
+    value = sections_value(case, theta)
+    assert value.feasible
+    assert value.bandwidth >= SLOW * (1.0 - 1e-5)
+    way = np.array([0.8, 0.6])
+    ends = [sections_value(case, theta + sign * h * way) for sign in (1.0, -1.0)]
+    numeric = (ends[0].error - ends[1].error) / (2.0 * h)
+    assert np.array(value.gradient) @ way == pytest.approx(numeric, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_solve_counts_the_error(tmp_path: Path) -> None:
+    """Direct and lifted at the same θ; J = w1 f + w2 e; the answer says so wherever it is shown."""
+    case, store = least(), tmp_path / "samples.sqlite"
+    found = [solve(case, kind, store=store).result for kind in (Direct(starts=1), Lifted(points=4))]
+    for result in found:
+        assert result["status"] == "verified", result["reason"]
+        assert result["minimise"] == "rms_error"
+        assert result["surrogate_bandwidth_hz"] is None
+        e, f = result["error_rms_of_set"], result["hardware_cost"]
+        assert result["objective"] == pytest.approx(case.w1 * f + case.w2 * e, rel=1e-12)
+        assert result["bandwidth_hz"] >= 8.0 * (1.0 - 1e-5)
+        assert "RMS" in result["verdict"]["optimal"]["words"]
+        # the budget's own figure, on the one plant that there is
+        assert result["budget"]["error_rms_largest"] == pytest.approx(e, rel=1e-6)
+    assert found[0]["objective"] == pytest.approx(found[1]["objective"], rel=1e-4)
+
+
+def test_too_much_bandwidth_is_said(tmp_path: Path) -> None:
+    case = least(bandwidth_least=500.0 * HZ)
+    found = solve(case, Direct(starts=1), store=tmp_path / "samples.sqlite").result
+    assert found["status"] == "infeasible"
+    assert "bandwidth_least_hz asks for 500 Hz" in found["reason"]
+
+
+def test_j_counts_the_error_where_a_sample_has_one() -> None:
+    case = least()
+    sample = BandwidthSample((60.0, 61.0), 50.0, (0.0, 0.0), np.nan, np.nan, (), "", 0.0, 1)
+    assert sample.value == 50.0
+    assert objective(case, replace(sample, error=2e-7)) == pytest.approx(0.01 * 121.0 + 0.2)
+
+
+def written(folder: Path, w2: str, inner: str = 'minimise = "rms_error"') -> Path:
+    text = TWO_MASS.read_text().replace("w2 = -0.9950", f"w2 = {w2}")
+    added = '[controller]\nstructure = "sections"\n[budget.force]\nunit = "N/rtHz"\nlevel = 0.01\n'
+    path = folder / "case.toml"
+    path.write_text(text.replace("[inner]", f"[inner]\n{inner}") + "\n" + added)
+    return path
+
+
+def test_the_sign_of_w2(tmp_path: Path) -> None:
+    assert problem_of(load_case(written(tmp_path, "1e6"))).w2 == 1e6
+    with pytest.raises(CaseError, match=r"objective\.w2: is 1.*J must reward bandwidth"):
+        load_case(written(tmp_path, "1e6", ""))
+    with pytest.raises(CaseError, match=r"objective\.w2: is 0.*J counts the RMS error"):
+        load_case(written(tmp_path, "0.0"))
+    # as before for `inner`; a solve would reward the error
+    rewarding = problem_of(load_case(written(tmp_path, "-0.9950")))
+    with pytest.raises(UserError, match="give a positive number"):
+        solve(rewarding, Direct(starts=1))
+    with pytest.raises(UserError, match="insight counts the bandwidth"):
+        require_bandwidth(rewarding, "insight")
+
+
+def test_the_budget_is_part_of_what_a_sample_is() -> None:
+    case = least()
+    quieter = replace(case, budget=ErrorBudget(tuple(s.times(0.5) for s in CABLES.sources)))
+    assert case.identity() != quieter.identity()
+    plain = least(minimise="bandwidth")
+    assert plain.identity() == replace(plain, budget=quieter.budget).identity()
