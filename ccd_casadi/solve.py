@@ -74,11 +74,11 @@ def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
 
 
 def _gains(controller: Mapping[str, Any]) -> str:
-    """`4.7e+05 N/m`, of several channels one after the other by name."""
+    """`4.7e+05 N/m`, of several channels `z: 4.7e+05 N/m, tip: …`."""
     channels = controller.get("channels")
     if channels is None:
         return f"{controller['gain']:.4g} N/m"
-    return ", ".join(f"{item['name']} {item['gain']:.4g} N/m" for item in channels)
+    return ", ".join(f"{item['name']}: {item['gain']:.4g} N/m" for item in channels)
 
 
 def sections_summary(result: Mapping[str, Any]) -> str:

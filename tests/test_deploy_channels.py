@@ -158,7 +158,7 @@ def test_a_solve_runs_to_its_end_and_deploys(
     options = ["--formulation", "direct", "--workers", "1", "--out", str(run)]
     assert solve_main([str(written(tmp_path)), *options]) == 0
     printed = capsys.readouterr().out
-    assert "order 6, 1 " in printed
+    assert "order 6, gain 1: " in printed
     result = json.loads((run / "result.json").read_text())
     assert result["status"] == "verified"
     assert result["proof"]["outcome"] == "several_channels"

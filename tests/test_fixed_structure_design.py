@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, two_mass_model
+from helpers import HZ, SUSPENSION, random_plant, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,
@@ -19,6 +19,7 @@ from ccd_casadi.fixed_structure import (
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.optimality import optimality
+from ccd_casadi.fixed_structure.starts import by_rules, kept
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -125,10 +126,10 @@ def test_a_flat_shelf_is_no_bandwidth() -> None:
     assert judged.bandwidth < 0.5 * judged.crossing
     omega = np.geomspace(1e-3 * judged.crossing, judged.crossing, 20001)
     S = np.abs(responses(plant(), K, omega)[2][:, 0, 0])
-    for factor, kept in ((1.0 - 1e-6, True), (1.02, False)):
+    for factor, holds in ((1.0 - 1e-6, True), (1.02, False)):
         end = factor * judged.bandwidth
         allowed = np.minimum(EASY.shape * omega / end, 1.0) / np.sqrt(2.0)
-        assert bool((allowed >= S)[omega <= end].all()) == kept
+        assert bool((allowed >= S)[omega <= end].all()) == holds
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, Sampling(3000.0, 700.0)])
@@ -225,6 +226,24 @@ def test_the_worst_plant_is_worse_than_any_of_a_lattice(design) -> None:
     assert heads[0].value == pytest.approx(
         excesses(box, [(heads[0].option, heads[0].point)], *asked)[0]
     )
+
+
+def test_of_many_parameters_the_worst_plant_is_climbed_to(design) -> None:
+    """Worse than a lattice and than every corner, of a box too large for one move each."""
+    system = mechanics(random_plant(5, rigid=1, flexible=4, inputs=1, outputs=1), (0.5, 0.5))
+    box = UncertainPlant((system,), SUSPENSION, 1e6, 0.01, 0.02, (0.5, 2.0), 0.05)
+    assert len(box.names) == 7
+    members = problem_for([box.plant(box.nominal)], SMALL, EASY)
+    kappa = kept(members, by_rules(members, np.geomspace(0.01, 0.3, 8)))[0]
+    units = members.plants
+    kappa = SMALL.in_units(kappa, units.omega_0, units.force)
+    asked = (SMALL, kappa, 0.01 * units.omega_0, EASY, None)
+    heads, looked = worst_plants(box, *asked, count=12)
+    ends = np.array(list(np.ndindex(*(2,) * 7)))
+    corners = [(0, box.box[row, np.arange(7)]) for row in ends]
+    values = excesses(box, [*lattice(box, 12, 0), *corners], *asked)
+    assert looked < len(corners)
+    assert heads[0].value >= values.max() - 1e-6
 
 
 def test_stationarity_is_measured_not_assumed(design) -> None:

@@ -210,3 +210,26 @@ def test_derivatives_of_plants_with_single_modes_shifted(modal: bool) -> None:
         numeric = (response(theta + e) - response(theta - e)) / (2.0 * h)
         exact = q.dC[i] @ R @ q.B + q.C @ R @ q.dA[i] @ R @ q.B + q.C @ R @ q.dB[i]
         assert exact[0, 0] / q.force == pytest.approx(numeric, rel=1e-6)
+
+
+@pytest.mark.parametrize("modal", [True, False])
+def test_derivatives_of_a_plant_to_what_is_uncertain(modal: bool) -> None:
+    """Of the transfer function, at a point of the box, against differences."""
+    plant = random_plant(7, rigid=1, flexible=3, inputs=1, outputs=1, modal=modal)
+    system = mechanics(plant, (0.4, 0.6))
+    box = UncertainPlant((system,), SUSPENSION, 1e6, 0.03, 0.1, (0.5, 2.0), 0.2)
+    point, h, s = np.array([0.02, 0.1, -0.05, 0.07, 1.5, 0.1]), 1e-5, 2j * np.pi * 60.0
+
+    def response(at: np.ndarray) -> complex:
+        G = box.plant(at).plant_si()
+        return complex((G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B))[0, 0])
+
+    q = box.sloped(point)
+    np.testing.assert_array_equal(q.A, box.plant(point).A)
+    R = np.linalg.inv(s / q.omega_0 * np.eye(len(q.A)) - q.A)
+    slopes = zip(q.dA, q.dB, strict=True)
+    exact = np.array([(q.C @ R @ (dA @ R @ q.B + dB))[0, 0] for dA, dB in slopes])
+    numeric = [(response(point + e) - response(point - e)) / (2.0 * h) for e in h * np.eye(6)]
+    size = np.abs(numeric).max()
+    np.testing.assert_allclose(exact / q.force, numeric, rtol=1e-6, atol=1e-8 * size)
+    assert len(box.corners()) == 1 + 2**3  # the common shift, the modes together, the gain

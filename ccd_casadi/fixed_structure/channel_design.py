@@ -76,24 +76,31 @@ def synthesise(
     alike = [in_units_of(plant, plants[0]) for plant in plants]
     span = span_of(problem)
 
-    def channels(limits: Bounds) -> list[SectionsDesign]:
-        """A design for each channel, on its entry of every plant; one for all that are alike."""
+    def channels(limits: Bounds, before: Sequence[SectionsDesign] = ()) -> list[SectionsDesign]:
+        """A design for each channel, on its entry of every plant; one for all that are alike.
+
+        Climbs from `before`, the same with wider limits, where there are such.
+        """
         found: list[SectionsDesign] = []
         own_plants: list[list[ScaledPlant]] = []
         for i, own in enumerate(structure.structures):
             members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
             begins = [_of_channel(structure, item, i) for item in initial]
+            again = bool(before) and bool(np.isfinite(before[i].kappa).all())
+            if again:
+                begins = [before[i].kappa]
             own_plants.append(members)
             same = [j for j in range(i) if structure.structures[j] == own
                     and _alike(members, own_plants[j])]  # fmt: skip
-            if same and not begins:
+            if same and (not begins or again):
                 found.append(found[same[0]])
                 continue
             name = structure.decoupling.names[i]
             found.append(
                 synthesise_sections(
                     members, own, limits, sampling=sampling, starts=starts, seed=seed,
-                    initial=begins, only_initial=only_initial, frequencies=span, workers=workers,
+                    initial=begins, only_initial=only_initial or again, frequencies=span,
+                    workers=workers,
                     progress=lambda words, name=name: tell(f"channel {name}: {words}"),  # type: ignore[misc]
                 )
             )  # fmt: skip
@@ -113,9 +120,11 @@ def synthesise(
     field = _stable(problem, pool)
     evaluations = len(pool)
     if not only_initial:
+        before: list[SectionsDesign] = []
         for share in TIGHTENED:
             limits = replace(bounds, S_max=1.0 + share * (bounds.S_max - 1.0))
-            stack = _stacked(problem, channels(limits))
+            before = channels(limits, before)
+            stack = _stacked(problem, before)
             evaluations += 1
             fresh = [] if stack is None else _stable(problem, [stack])
             field += fresh

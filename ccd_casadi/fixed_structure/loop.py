@@ -329,8 +329,7 @@ def _loop_plant(
     state = (A, B, C, np.zeros((len(C), B.shape[1])))
     if period is not None:
         state = _in_w(*_sampled(A, B, C, period, delay), period)
-    theta = len(plant.dA)
-    dA = np.einsum("ij,tjk,kl->til", W, ratio * plant.dA, V) if theta else np.zeros((0, *A.shape))
+    dA = W @ (ratio * plant.dA) @ V
     return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
+from ccd_casadi.plants.modal import ModalPlant, Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
@@ -68,7 +68,40 @@ class UncertainPlant:
         return np.array([1.0 if name == "damping" else 0.0 for name in self.names])
 
     def plant(self, point: Array, option: int = 0) -> ScaledPlant:
-        """The scaled plant at a point of the box."""
+        """The scaled plant at a point of the box; its derivatives are those to θ."""
+        return scale_plant(self._modal(point, option), self.M_K, bare=True)
+
+    def sloped(self, point: Array, option: int = 0) -> ScaledPlant:
+        """The same with derivatives to the point itself, one for each of `names`.
+
+            ∂k_i = 2 k_i ∂r_i/r_i,   ∂d_i = d_i ∂r_i/r_i,   r_i = (1 + p_common)(1 + p_i)
+
+        of flexible modes with stiffness k_i and damping d_i; all d_i are as the damping factor.
+        """
+        modal, values = self._modal(point, option), np.asarray(point, float)
+        flexible = np.flatnonzero(~modal.rigid)
+        count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
+        dK, dD, dB = np.zeros((count, n, n)), np.zeros((count, n, n)), np.zeros((count, n, m))
+        given = self.options[option].damping_ratio is None  # a matrix, which no shift moves
+        for row, (name, value) in enumerate(zip(self.names, values.tolist(), strict=True)):
+            word, _, number = name.partition(" ")
+            if word == "gain":
+                dB[row] = modal.B / (1.0 + value)
+                continue
+            if word == "damping":
+                own = np.ix_(flexible, flexible)
+                dD[row][own] = modal.D[own] / value
+                continue
+            at = flexible[int(number) - 1 : int(number)] if number else flexible
+            dK[row, at, at] = 2.0 * modal.K[at, at] / (1.0 + value)
+            if not given:
+                dD[row, at, at] = modal.D[at, at] / (1.0 + value)
+        still = np.zeros((count, n, n))
+        moved = replace(modal, dM=still, dK=dK, dD=dD, dB=dB,
+                        dC=np.zeros((count, *modal.C.shape)))  # fmt: skip
+        return scale_plant(moved, self.M_K, bare=True)
+
+    def _modal(self, point: Array, option: int) -> ModalPlant:
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
         shift, factor = values.get("resonance_shift", 0.0), values.get("damping", 1.0)
         system = self.options[option]
@@ -78,27 +111,27 @@ class UncertainPlant:
         gain = 1.0 + values.get("gain", 0.0)
         if gain != 1.0:
             modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
-        return scale_plant(modal, self.M_K)
+        return modal
 
     def plants(self, points: Sequence[tuple[int, Array]]) -> list[ScaledPlant]:
         """The plants of (option, point) pairs."""
         return [self.plant(point, option) for option, point in points]
 
     def corners(self) -> list[tuple[int, Array]]:
-        """The model of every option, then the ends of every parameter, all together and alone."""
+        """The model of every option, then the corners of its box.
+
+        With more than three parameters single modes' shifts go together, with the least damping:
+        of the other corners there are too many to look at, and a search finds those that matter.
+        """
         box, centre = self.box, self.nominal
         found = [(option, centre) for option in range(len(self.options))]
-        n = len(centre)
+        goes_with = list(self.names)  # the parameter that each one is at the same end as
+        if len(centre) > 3:
+            goes_with = ["modes" if name.startswith("mode_shift") else name for name in goes_with]
+        free = [name for name in dict.fromkeys(goes_with) if len(centre) <= 3 or name != "damping"]
         for option in range(len(self.options)):
-            if n <= 3:
-                for number in range(2**n if n else 0):
-                    row = [(number >> i) & 1 for i in range(n)]
-                    found.append((option, box[row, np.arange(n)]))
-            else:
-                for end in (0, 1):
-                    found.append((option, box[end]))
-                    for i in range(n):
-                        point = centre.copy()
-                        point[i] = box[end, i]
-                        found.append((option, point))
+            for number in range(2 ** len(free) if free else 0):
+                end = {name: (number >> place) & 1 for place, name in enumerate(free)}
+                row = [end.get(name, 0) for name in goes_with]
+                found.append((option, box[row, np.arange(len(centre))]))
         return found

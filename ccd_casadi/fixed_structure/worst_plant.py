@@ -2,7 +2,9 @@
 
     max over p in the box of  max_j c_j(κ, τ; p)
 
-by compass searches from many points at once; an unstable loop is worst of all. What the end says is
+by compass searches from many points at once, of more than four parameters by ascent: each of the
+largest c_j of a plant, made linear in p, points to a corner of the box, and steps towards these
+corners are tried. An unstable loop is worst of all. What the end says is
 what was done: the number of plants that were looked at, a lattice of the box among them, and the
 worst of them. For what lies between there is `box_proof`.
 """
@@ -10,6 +12,7 @@ worst of them. For what lies between there is `box_proof`.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +27,11 @@ from ccd_casadi.fixed_structure.design import (
     in_problem_units,
     problem_for,
 )
-from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.figures import Constraints, LoopProblem, assess, to_theta
 from ccd_casadi.fixed_structure.loop import Sampling
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
@@ -38,6 +41,10 @@ LATTICE = 200  # plants, evenly over the box
 SEARCHES = 6
 ROUNDS = 7  # of a compass search, its step halved each time
 AT_ONCE = 3  # plants added in one round
+FEW = 4  # parameters up to which every one is moved on its own
+LARGEST = 3  # constraints of a plant that are followed
+STEPS = (1.0, 0.3)  # towards the corner that a constraint points to
+CLIMBS = 4  # rounds of them
 
 
 @dataclass(frozen=True)
@@ -101,15 +108,29 @@ def excesses(
     sampling: Sampling | None,
 ) -> Array:
     """The largest c of every plant's loop, with SI parameters κ and ω_b in rad/s."""
-    problem = problem_for(uncertain.plants(points), structure, bounds, sampling)
+    plants = uncertain.plants(points)
+    return _looked_at(plants, structure, kappa, bandwidth, bounds, sampling)[0]
+
+
+def _looked_at(
+    plants: Sequence[ScaledPlant],
+    structure: Structure | ChannelStructure,
+    kappa: Array,
+    bandwidth: float,
+    bounds: Bounds,
+    sampling: Sampling | None,
+) -> tuple[Array, LoopProblem, Constraints | None]:
+    """The largest c of every plant's loop; the problem, and the constraints it is one of."""
+    problem = problem_for(plants, structure, bounds, sampling)
     scaled = in_problem_units(problem, kappa)
     tau = float(np.log(bandwidth / problem.plants.omega_0))
     found = assess(problem, scaled, tau, each=True)
-    out = np.full(len(points), -np.inf)
+    out = np.full(len(plants), -np.inf)
     if found.peaks is not None:
         np.maximum.at(out, plants_of_rows(problem, found.peaks), found.peaks.value - problem.margin)
     grown = (found.poles.real / np.abs(found.poles)).max(axis=1)  # of no unit
-    return np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
+    value = np.where(grown < 0.0, out, UNSTABLE + np.maximum(grown, 0.0))
+    return value, problem, found.peaks
 
 
 def worst_plants(
@@ -135,6 +156,21 @@ def worst_plants(
     heads = [Excess(points[i][0], points[i][1], float(value[i])) for i in first]
     if n == 0:
         return heads, looked
+    if n > FEW:
+        loop = (structure, kappa, bandwidth, bounds, sampling)
+        for _ in range(CLIMBS):
+            steps = _towards_corners(uncertain, heads, loop)
+            if not steps:
+                break
+            ends = values([(heads[row].option, point) for row, point in steps]).tolist()
+            looked += len(steps)
+            better = False
+            for (row, point), end in zip(steps, ends, strict=True):
+                if end > heads[row].value + WITHIN:
+                    heads[row], better = Excess(heads[row].option, point, end), True
+            if not better:
+                break
+        return sorted(heads, key=lambda head: -head.value), looked
     box = uncertain.box
     step = 0.25 * (box[1] - box[0]) if n > 1 else (box[1] - box[0]) / count
     for _ in range(ROUNDS):
@@ -153,6 +189,33 @@ def worst_plants(
                 heads[row] = Excess(option, point, float(found[row, k]))
         step = 0.5 * step
     return sorted(heads, key=lambda head: -head.value), looked
+
+
+def _towards_corners(
+    uncertain: UncertainPlant, heads: Sequence[Excess], loop: tuple[Any, ...]
+) -> list[tuple[int, Array]]:
+    """Steps from every head that is stable: the head's number and the point."""
+    box, kappa = uncertain.box, loop[1]
+    plants = [uncertain.sloped(head.point, head.option) for head in heads]
+    _, problem, peaks = _looked_at(plants, *loop)
+    if peaks is None:
+        return []
+    of = plants_of_rows(problem, peaks)
+    chosen = [
+        own[np.argsort(-peaks.value[own])[:LARGEST]]
+        for own in (np.flatnonzero(of == row) for row in range(len(heads)))
+    ]
+    rows = np.concatenate(chosen)
+    slopes = to_theta(problem, in_problem_units(problem, kappa), peaks.only(rows))
+    found: list[tuple[int, Array]] = []
+    for row, slope in zip(of[rows].tolist(), slopes, strict=True):
+        head = heads[row]
+        corner = np.where(slope > 0.0, box[1], np.where(slope < 0.0, box[0], head.point))
+        for step in STEPS:
+            point = head.point + step * (corner - head.point)
+            if np.abs(point - head.point).max() > 0.0:
+                found.append((row, point))
+    return found
 
 
 def synthesise_robustly(

@@ -92,9 +92,10 @@ class ScaledPlant:
         return StateSpace(self.omega_0 * A, self.omega_0 * B, self.force * C, D)
 
 
-def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
+def scale_plant(modal: ModalPlant, M_K: float, *, bare: bool = False) -> ScaledPlant:
     """Scale a modal plant for weights with this M_K; M_K in N/m (force over displacement).
 
+    `bare`: without the grid, the gains and the channels, which a synthesis needs and no loop does.
     Raises PlantError where no mode is both driven and measured.
     """
     b = np.linalg.norm(modal.B, axis=1)
@@ -131,6 +132,9 @@ def scale_plant(modal: ModalPlant, M_K: float) -> ScaledPlant:
         dA[i, n:, n:] = -lower(dD)
         dB[i, n:] = left[:, None] * drive * (modal.dB[i] - modal.dM[i] @ modal.B)
         dC[i, :, :n] = modal.dC[i] * right / s
+    if bare:
+        none = np.empty(0)
+        return ScaledPlant(A, B, C, omega_0, M_K, none, none, modal.natural, dA, dB, dC)
     grid, gain = _gains(A, B, C)
     channels = _scaled_channels(find_channels(modal.K, modal.D, modal.B, modal.C), A, B, C)
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, modal.natural, dA, dB, dC, channels)
