@@ -46,17 +46,22 @@ class Background:
     """
 
     def __init__(self, workers: int, user_code: bool = True) -> None:
-        context = multiprocessing.get_context("spawn")
-
-        def pool(count: int) -> ProcessPoolExecutor:
-            return ProcessPoolExecutor(count, context, _prepare, (user_code,))
-
-        self._asked, self._filling = pool(1), pool(max(1, workers - 1))
+        self._sizes = {"asked": 1, "filling": max(1, workers - 1)}
+        self._user_code = user_code
+        self._pools: dict[str, ProcessPoolExecutor] = {}  # made when they are needed
         self._closed = False
+
+    def _pool(self, name: str) -> ProcessPoolExecutor:
+        if name not in self._pools:
+            context = multiprocessing.get_context("spawn")
+            self._pools[name] = ProcessPoolExecutor(
+                self._sizes[name], context, _prepare, (self._user_code,)
+            )
+        return self._pools[name]
 
     def ask(self, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed) -> Future:
         """Do what the user waits for; one after the other."""
-        return self._submit(self._asked, work, task, then, failed)
+        return self._submit("asked", work, task, then, failed)
 
     def fill(self, session: Session, problem: CoDesignProblem, told: Callable[[], None]) -> None:
         """Sample a slow plant over its box and fit the surrogate of its modes again and again.
@@ -72,7 +77,7 @@ class Background:
             if known.due(fitted):
                 fitted = len(known.exact)
                 task = (list(known.exact), list(known.exact.values()))
-                self._submit(self._filling, _fit, task, took, print_failure)
+                self._submit("filling", _fit, task, took, print_failure)
                 known.save(session.folder)
 
         def took(found: Any) -> None:
@@ -87,10 +92,10 @@ class Background:
         for theta in plan(problem.lower, problem.upper):
             if theta not in known.exact:
                 task = (problem, theta)
-                self._submit(self._filling, _sample, task, sampled, lambda error: None)
+                self._submit("filling", _sample, task, sampled, lambda error: None)
 
     def _submit(
-        self, pool: ProcessPoolExecutor, work: Callable[[Any], Any], task: Any, then: Then,
+        self, pool: str, work: Callable[[Any], Any], task: Any, then: Then,
         failed: Failed,
     ) -> Future:  # fmt: skip
         def done(future: Future) -> None:
@@ -102,14 +107,14 @@ class Background:
             else:
                 failed(error)
 
-        future = pool.submit(work, task)
+        future = self._pool(pool).submit(work, task)
         future.add_done_callback(done)
         return future
 
     def close(self) -> None:
         """End what is under way."""
         self._closed = True
-        for pool in (self._asked, self._filling):
+        for pool in self._pools.values():
             running = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
             for process in running:

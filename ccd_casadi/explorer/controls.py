@@ -89,7 +89,10 @@ class Controls:
             for slider, k, value in zip(self._theta, self._scale, knobs.theta, strict=True):
                 slider.value = k * value
             self.S_max.value, self.shift.value = knobs.S_max, knobs.resonance_shift
-            for slider, pair in ((self.omega_S, knobs.omega_S_hz), (self.omega_T, knobs.omega_T_hz)):
+            for slider, pair in (
+                (self.omega_S, knobs.omega_S_hz),
+                (self.omega_T, knobs.omega_T_hz),
+            ):
                 slider.value = tuple(float(v) for v in np.log10(pair))
             self.structure.value, self.sampled.active = knobs.structure, knobs.sampled
             self.rate.value, self.delay.value = float(np.log10(knobs.rate_hz)), knobs.delay_us

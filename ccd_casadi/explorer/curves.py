@@ -10,6 +10,7 @@ from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.explorer.designs import Look
+from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.move import mass_feedforward, simulate
@@ -23,6 +24,8 @@ POINTS = 180  # of the frequency grid, besides those around resonances
 STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
 WATCHED = 2.0  # durations of the move that are shown
+LIGHT = 0.3  # damping ratio below which a pole is a resonance
+FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
 
 
@@ -32,8 +35,7 @@ class Curves:
 
     `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `loci` (k, p): eigenvalues of L = GK, NaN where one
     is too large to be drawn. `poles` of the closed loop, of K and of G in Hz, complex. `step`: y of
-    the first output after a step of its reference; `move`: its error (m) with mass feedforward,
-    over s.
+    the first output after a step of its reference, over s.
     """
 
     hz: Array
@@ -45,10 +47,24 @@ class Curves:
     plant_poles: np.ndarray
     step_time: Array
     step: Array
-    move_time: Array
-    move: Array
-    move_end: float
+    move: "Moved"
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Error in m of the first output over s in the default move of `robustness`, ending at `end`.
+
+    With mass feedforward where a rigid body can be moved; `free`: on the plant without suspension.
+    """
+
+    time: Array
+    error: Array
+    end: float
     feedforward: bool
+    free: bool
+
+
+_AT_REST = Moved(np.zeros(0), np.zeros(0), 0.0, False, False)
 
 
 @dataclass(frozen=True)
@@ -80,9 +96,7 @@ def curves_of(look: Look) -> Curves | None:
     stable = bool(poles.real.max() < 0.0)
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     step_time, step = _step(loop, bandwidth) if stable else (np.zeros(0), np.zeros(0))
-    move_time, move, end, ahead = np.zeros(0), np.zeros(0), 0.0, False
-    if stable:
-        move_time, move, end, ahead = _move(look, loop, bandwidth)
+    move = _move(look, K, bandwidth) if stable else _AT_REST
     return Curves(
         hz=hz,
         gains=gains,
@@ -93,10 +107,7 @@ def curves_of(look: Look) -> Curves | None:
         plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
         step_time=step_time,
         step=step,
-        move_time=move_time,
         move=move,
-        move_end=end,
-        feedforward=ahead,
     )
 
 
@@ -110,7 +121,12 @@ def grid_of(look: Look) -> Array:
     natural = plant.natural[plant.natural > 0.0] / HZ
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     high = max(30.0 * bandwidth, 3.0 * float(natural.max(initial=0.0)))
-    around = plant.grid * plant.omega_0 / HZ
+    poles = np.linalg.eigvals(plant.A) * plant.omega_0 / HZ
+    if look.controller is not None:
+        poles = np.concatenate([poles, np.linalg.eigvals(look.controller.A) / HZ])
+    light = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))]
+    # even steps of the phase around a resonance, so that its circle in the Nyquist plot is round
+    around = (np.abs(light.imag)[:, None] + np.abs(light.real)[:, None] * FLANKS).ravel()
     special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
     grid = np.concatenate([np.geomspace(low, high, POINTS), around, special])
     return np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
@@ -140,20 +156,34 @@ def _step(loop: ClosedLoop, bandwidth_hz: float) -> tuple[Array, Array]:
     return time, y
 
 
-def _move(look: Look, loop: ClosedLoop, bandwidth_hz: float) -> tuple[Array, Array, float, bool]:
-    """The default move of `robustness`: error over time, when it ends, with feedforward or not."""
+def _move(look: Look, K: StateSpace, bandwidth_hz: float) -> Moved:
+    """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
     demands = Demands()
     profile = setpoint(demands.limits)
-    ahead = mass_feedforward(look.modal, demands.axis)
+    modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
+    n, m, p = len(modal.K), modal.B.shape[1], len(modal.C)
+    released = StateSpace(
+        np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]]),
+        np.vstack([np.zeros((n, m)), modal.B]),
+        np.hstack([modal.C, np.zeros((p, n))]),
+        np.zeros((p, m)),
+    )
+    loop = closed_loop(released, K)
+    free = bool(np.linalg.eigvals(loop.A).real.max() < 0.0)
+    if not free:
+        loop = closed_loop(look.plant.plant_si(), K)
+    ahead = mass_feedforward(modal, demands.axis)
     found = simulate(
         loop, profile, axis=demands.axis, forces=ahead, window=demands.window,
         bandwidth_hz=bandwidth_hz, doublings=1,
     )  # fmt: skip
     shown = found.time <= WATCHED * found.duration
-    return found.time[shown], found.error[shown], found.duration, ahead is not None
+    return Moved(found.time[shown], found.error[shown], found.duration, ahead is not None, free)
 
 
-def as_sampled(plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float) -> AsSampled:
+def as_sampled(
+    plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float
+) -> AsSampled:
     """A controller in discrete time on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
     period, delay = 1.0 / rate_hz, 1e-6 * delay_us
     tustin = Conversion(Discretisation.TUSTIN, False, 1.0)

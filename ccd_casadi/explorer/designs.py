@@ -116,7 +116,9 @@ def present(
     point = (float(np.clip(point[0], *inner.omega_S)), float(np.clip(point[1], *inner.omega_T)))
     choices = design_choices(problem)
     looks = [_look(choice, knobs, elements, point, How.PRESENT, began) for choice in choices]
-    return min(looks, key=lambda look: float(np.nan_to_num(look.figures.sensitivity_peak, nan=np.inf)))
+    return min(
+        looks, key=lambda look: float(np.nan_to_num(look.figures.sensitivity_peak, nan=np.inf))
+    )
 
 
 def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> Look:
@@ -149,9 +151,7 @@ def _look(
     plant = scaled_system(problem, elements.system)
     weights = problem.weights.at(*point)
     inner = problem.inner
-    made = synthesise(
-        plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff
-    )
+    made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
     made = handed_out(plant, made, inner.omega_low)
     cost, broken = _hardware(problem, knobs.theta)
     standing, reason = judged(problem, made.figures, broken)

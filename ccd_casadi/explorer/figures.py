@@ -19,7 +19,7 @@ from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.reporting.svg import AMBER, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
 
-HEIGHT = 250
+HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, SKY)
@@ -41,7 +41,9 @@ class Figures:
     def __init__(self, dark: bool) -> None:
         self.main = SKY if dark else BLUE
         self.ink = "#d0d0d0" if dark else "#333333"
-        self.gains = ColumnDataSource({k: [] for k in ("hz", "S", "KS", "T", "bS", "bKS", "bT")})
+        self.gains = ColumnDataSource(
+            {k: [] for k in ("hz", "S", "KS", "T", "bS", "bKS", "bT", "top")}
+        )
         self.sampled = ColumnDataSource({"hz": [], "S": []})
         self.loci = ColumnDataSource({"xs": [], "ys": []})
         self.poles = {
@@ -80,6 +82,8 @@ class Figures:
         )  # fmt: skip
         made.toolbar.logo = None
         made.toolbar.autohide = True
+        for axis in made.axis:
+            axis.axis_label_text_font_style = "normal"
         return made
 
     def _line(self, on: Any, x: str, y: str, source: ColumnDataSource, **look: Any) -> Any:
@@ -93,7 +97,12 @@ class Figures:
 
     def _gain(self, name: str, label: str, hz: Range1d) -> Any:
         made = self._figure(
-            f"gain_{name}", "frequency (Hz)", label, x_axis_type="log", y_axis_type="log", x_range=hz
+            f"gain_{name}",
+            "frequency (Hz)",
+            label,
+            x_axis_type="log",
+            y_axis_type="log",
+            x_range=hz,
         )
         made.varea("hz", f"b{name}", "top", source=self.gains, fill_color=ORANGE, fill_alpha=0.13)
         made.line("hz", f"b{name}", source=self.gains, line_color=ORANGE, line_dash="dashed")
@@ -101,13 +110,24 @@ class Figures:
         line = self._line(made, "hz", name, self.gains)
         renderers = [line]
         if name == "S":
-            self.S_max = BoxAnnotation(bottom=2.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay")
+            self.S_max = BoxAnnotation(
+                bottom=2.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay"
+            )
             self.S_low = BoxAnnotation(fill_color=ORANGE, fill_alpha=0.28, level="underlay")
             self.bandwidth = Span(dimension="height", line_color=GREEN, line_width=1.2)
             for part in (self.S_max, self.S_low, self.bandwidth):
                 made.add_layout(part)
-            made.add_layout(Span(location=2**-0.5, dimension="width", line_color=GREY, line_dash="dotted"))
-            made.line("hz", "S", source=self.sampled, line_color=PURPLE, line_dash="dotdash", line_width=1.6)
+            made.add_layout(
+                Span(location=2**-0.5, dimension="width", line_color=GREY, line_dash="dotted")
+            )
+            made.line(
+                "hz",
+                "S",
+                source=self.sampled,
+                line_color=PURPLE,
+                line_dash="dotdash",
+                line_width=1.6,
+            )
         made.y_range = DataRange1d(renderers=renderers, range_padding=0.12)
         made.add_tools(
             CrosshairTool(overlay=self.cursor),
@@ -120,7 +140,9 @@ class Figures:
             "nyquist", "Re L", "Im L", x_range=(-3.2, 1.6), y_range=(-2.0, 2.0), match_aspect=True
         )
         made.circle(0.0, 0.0, radius=1.0, fill_color=None, line_color=GREY, line_dash="dotted")
-        self.disk = made.circle(-1.0, 0.0, radius=0.5, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE)
+        self.disk = made.circle(
+            -1.0, 0.0, radius=0.5, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE
+        )
         made.scatter([-1.0], [0.0], marker="cross", size=9, line_color=self.ink)
         self._pins(made, "nyquist")
         found = made.multi_line("xs", "ys", source=self.loci, line_color=self.main, line_width=2.0)
@@ -130,7 +152,9 @@ class Figures:
     def _poles(self) -> Any:
         made = self._figure("poles", "|pole| (Hz)", "damping ratio", x_axis_type="log")
         made.y_range = Range1d(-0.08, 1.08)
-        made.add_layout(BoxAnnotation(top=0.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay"))
+        made.add_layout(
+            BoxAnnotation(top=0.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay")
+        )
         looks = {"G": ("circle", GREY, "plant"), "K": ("triangle", GREEN, "controller"),
                  "loop": ("x", self.main, "closed loop")}  # fmt: skip
         for name, (marker, colour, words) in looks.items():
@@ -171,7 +195,10 @@ class Figures:
             return
         columns = {"hz": c.hz, "top": np.full(len(c.hz), TOP)}
         for i, (name, _) in enumerate(GAINS):
-            columns |= {name: c.gains[i], f"b{name}": c.bounds[i] if certified else np.full(len(c.hz), np.nan)}
+            columns |= {
+                name: c.gains[i],
+                f"b{name}": c.bounds[i] if certified else np.full(len(c.hz), np.nan),
+            }
         self.gains.data = columns
         self.loci.data = dict(zip(("xs", "ys"), _lines(c.loci), strict=True))
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
@@ -179,8 +206,8 @@ class Figures:
             size = np.maximum(np.abs(upper), 1e-300)
             self.poles[name].data = {"hz": size, "damping": -upper.real / size}
         self.step.data = {"ms": 1e3 * c.step_time, "y": c.step}
-        self.move.data = {"ms": 1e3 * c.move_time, "um": 1e6 * c.move}
-        self.end.location = 1e3 * c.move_end
+        self.move.data = {"ms": 1e3 * c.move.time, "um": 1e6 * c.move.error}
+        self.end.location = 1e3 * c.move.end
 
     def _clear(self) -> None:
         for source in (self.gains, self.loci, self.step, self.move, *self.poles.values()):
@@ -203,7 +230,7 @@ class Figures:
             for x, y in zip(*_lines(c.loci), strict=True):
                 rows["nyquist"].append((x, y, colour, name))
             rows["step"].append((1e3 * c.step_time, c.step, colour, name))
-            rows["move"].append((1e3 * c.move_time, 1e6 * c.move, colour, name))
+            rows["move"].append((1e3 * c.move.time, 1e6 * c.move.error, colour, name))
         for name, source in self.pinned.items():
             keys = ("xs", "ys", "colour", "name")
             source.data = {key: [row[i] for row in rows[name]] for i, key in enumerate(keys)}

@@ -66,4 +66,3 @@ def field_of(
     known = best_designs(problem, read_truths(store, problem))
     samples = np.array([(t[i], t[j], hz) for t, hz in known.items()]).reshape(-1, 3)
     return Field(x, y, field, samples, words)
-

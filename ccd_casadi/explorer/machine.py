@@ -52,7 +52,9 @@ def lumped(system: Mechanics) -> Lumped | None:
     ground = K.sum(axis=1)
     if n > MOST_NODES or not apart or off.max(initial=0.0) > level or ground.min() < -n * level:
         return None
-    springs = [(i, j, float(-K[i, j])) for i in range(n) for j in range(i + 1, n) if -K[i, j] > level]
+    springs = [
+        (i, j, float(-K[i, j])) for i in range(n) for j in range(i + 1, n) if -K[i, j] > level
+    ]
     if not springs:
         return None
     springs += [(i, -1, float(ground[i])) for i in range(n) if ground[i] > n * level]

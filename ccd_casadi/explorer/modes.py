@@ -75,9 +75,7 @@ class ModeSurrogate:
         both = np.zeros((len(lam), m + len(self.pattern.C)))
         for row in self.rows:
             both[row.mode] += row.process.predict(x)[0] * row.direction
-        return replace(
-            self.pattern, K=np.diag(lam), B=both[:, :m].copy(), C=both[:, m:].T.copy()
-        )
+        return replace(self.pattern, K=np.diag(lam), B=both[:, :m].copy(), C=both[:, m:].T.copy())
 
 
 def fit_modes(thetas: Sequence[Theta], systems: Sequence[Mechanics]) -> ModeSurrogate:

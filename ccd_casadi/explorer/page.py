@@ -114,7 +114,7 @@ class Page:
             extra = {} if form is None else {"formatter": NumberFormatter(format=form)}
             columns.append(TableColumn(field=field, title=title, **extra))
         self.table = DataTable(source=self.pinned, columns=columns, height=150, index_position=None,
-                               sizing_mode="stretch_width", name="pins")  # fmt: skip
+                               sizing_mode="stretch_width", reorderable=False, name="pins")  # fmt: skip
 
     def _roots(self) -> None:
         from bokeh.layouts import column, row
@@ -168,15 +168,28 @@ class Page:
     def show(self, look: Look, full: bool) -> None:
         """Draw a design, and say that this is the answer."""
         sampled = None
-        if look.knobs.sampled and look.controller is not None and look.standing is not Standing.REFUSED:
-            sampled = as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
+        if (
+            look.knobs.sampled
+            and look.controller is not None
+            and look.standing is not Standing.REFUSED
+        ):
+            sampled = as_sampled(
+                look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us
+            )
         self.now = Drawn(look, curves_of(look), sampled)
         self.figures.show(self.now)
         if full:
             self.figures.frame(self.now)
         session = self.session
         self.verdict.text = standing_html(look, sampled)
-        self.machine.text = machine_html(look.problem, look.theta, session.start.theta, look.elements.system, look.modal, session.reference)
+        self.machine.text = machine_html(
+            look.problem,
+            look.theta,
+            session.start.theta,
+            look.elements.system,
+            look.modal,
+            session.reference,
+        )
         i, j = self._axes()
         self.here.data = {"x": [look.theta[i]], "y": [look.theta[j]]}
         self._seen.append(look)
@@ -200,7 +213,9 @@ class Page:
             return
         self.note.text = "<p>solving the model and searching at this θ …</p>"
         task = (self.session.problems.at(knobs), knobs)
-        self.background.ask(searched_exactly, task, self._then(self._searched), self._then(self._failed))
+        self.background.ask(
+            searched_exactly, task, self._then(self._searched), self._then(self._failed)
+        )
 
     def _then(self, action: Any) -> Any:
         return lambda found: self.document.add_next_tick_callback(lambda: action(found))
@@ -214,7 +229,9 @@ class Page:
         words = ""
         if known.surrogate is not None and in_modal_form(look.elements.system):
             off = frequency_error(known.surrogate.at(look.theta), look.elements.system)
-            words = f"<p>the surrogate's frequencies are off by {100.0 * off:.2g} % at most here</p>"
+            words = (
+                f"<p>the surrogate's frequencies are off by {100.0 * off:.2g} % at most here</p>"
+            )
         self.session.took(look)
         self.note.text = words
         self.modes.text = modes
@@ -249,9 +266,15 @@ class Page:
         (x0, x1), (y0, y1) = found.x, found.y
         self.image.data = {"image": [found.field], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]} if found.field.size else {k: [] for k in self.image.data}  # fmt: skip
         self.dots.data = dict(zip(("x", "y", "hz"), found.samples.T, strict=True))
-        for axis, (low, high), select in ((self.map.x_range, found.x, self.axes[0]), (self.map.y_range, found.y, self.axes[1])):
+        for axis, (low, high), select in (
+            (self.map.x_range, found.x, self.axes[0]),
+            (self.map.y_range, found.y, self.axes[1]),
+        ):
             axis.start, axis.end = low - 0.03 * (high - low), high + 0.03 * (high - low)
-        self.map.xaxis.axis_label, self.map.yaxis.axis_label = self.axes[0].value, self.axes[1].value
+        self.map.xaxis.axis_label, self.map.yaxis.axis_label = (
+            self.axes[0].value,
+            self.axes[1].value,
+        )
         i, j = self._axes()
         theta = self.now.look.theta
         self.here.data = {"x": [theta[i]], "y": [theta[j]]}
@@ -293,7 +316,9 @@ class Page:
         folder, case = self.session.folder_for_solve(self.controls.knobs())
         self._output = [f"solving into {folder}"]
         self.solve_button.disabled, self.stop.disabled = True, False
-        self.solve = Solve(case, folder, self.workers, self._then(self._said), self._then(self._ended))
+        self.solve = Solve(
+            case, folder, self.workers, self._then(self._said), self._then(self._ended)
+        )
         self._said("")
 
     def stop_solve(self) -> None:

@@ -19,7 +19,9 @@ TEMPLATE = Path(__file__).with_name("page.html")
 class Explorer:
     """Serves a session until `stop`; `url` has the token, without which every path is refused."""
 
-    def __init__(self, session: Session, *, workers: int, user_code: bool = True, port: int = 0) -> None:
+    def __init__(
+        self, session: Session, *, workers: int, user_code: bool = True, port: int = 0
+    ) -> None:
         self.session = session
         self.background = Background(workers, user_code)
         self._pages: list[Page] = []
@@ -49,7 +51,7 @@ class Explorer:
         document.template_variables["case"] = str(self.session.case.path)
         document.template_variables["folder"] = str(self.session.folder)
         document.template_variables["dark"] = dark
-        document.theme = "dark_minimal" if dark else "caliber"
+        document.theme = "dark_minimal" if dark else "light_minimal"
         page = Page(document, self.session, self.background, self._workers, dark)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._gone(page))
