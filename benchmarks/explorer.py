@@ -104,7 +104,8 @@ def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int]:
         page.evaluate(WATCH, [given.parameter, scale, FIGURES])
         place = page.evaluate(
             """name => {
-              const view = Bokeh.index.find_one(Bokeh.documents[0].get_model_by_name(`theta_${name}`))
+              const model = Bokeh.documents[0].get_model_by_name(`theta_${name}`)
+              const view = Bokeh.index.find_one(model)
               const box = selector => {
                 const b = view.shadow_el.querySelector(selector).getBoundingClientRect()
                 return [b.x, b.y, b.width, b.height]

@@ -97,7 +97,8 @@ def with_structure(case: Case, structure: str) -> Case:
     tables: dict[str, Any] = {"controller": replace(case.controller, structure=structure)}
     for name, keys in other.items():
         table = tables.get(name, getattr(case, name))
-        tables[name] = replace(table, **{f.name: f.default for f in fields(table) if f.name in keys})
+        unset = {item.name: item.default for item in fields(table) if item.name in keys}
+        tables[name] = replace(table, **unset)
     if structure != WITH_DISTURBANCE:
         tables["weights"] = replace(case.weights, disturbance=None)
     return replace(case, **tables)

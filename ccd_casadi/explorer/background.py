@@ -20,12 +20,16 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.user_code import permit_user_code
 
+BEHIND = 10  # niceness of what fills the box
+
 Then = Callable[[Any], None]
 Failed = Callable[[BaseException], None]
 
 
-def _prepare(user_code: bool) -> None:
+def _prepare(user_code: bool, behind: bool) -> None:
     """In a worker: one BLAS thread, Ctrl-C left to the parent, and no life beyond it."""
+    if behind and hasattr(os, "nice"):
+        os.nice(BEHIND)  # the page comes first
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(limits=1)
     permit_user_code(user_code).__enter__()
@@ -55,7 +59,7 @@ class Background:
         if name not in self._pools:
             context = multiprocessing.get_context("spawn")
             self._pools[name] = ProcessPoolExecutor(
-                self._sizes[name], context, _prepare, (self._user_code,)
+                self._sizes[name], context, _prepare, (self._user_code, name == "filling")
             )
         return self._pools[name]
 

@@ -3,26 +3,23 @@
 from typing import Any
 
 import numpy as np
-from bokeh.models import (
-    Checkbox,
-    CustomJSTickFormatter,
-    RangeSlider,
-    Select,
-    Slider,
-)
+from bokeh.models import CustomJSTickFormatter
+from bokeh.models.widgets.inputs import Checkbox, Select
+from bokeh.models.widgets.sliders import RangeSlider, Slider
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.explorer.knobs import Knobs
 
 STEPS = 1000  # of a slider of θ
 WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case
-STRUCTURES = ("h_infinity", "h_infinity_disturbance", "sections")
+DARK = ".bk-input { background-color: #2b3238; color: #e0e0e0; }"  # the theme is of figures only
+STRUCTURES: tuple[Any, ...] = ("h_infinity", "h_infinity_disturbance", "sections")
 
 
 class Controls:
-    """Widgets for everything that `Knobs` says; `changed` is called with True when one is let go."""
+    """Widgets for all that `Knobs` says; `changed` is called with True when one is let go."""
 
-    def __init__(self, case: Case, start: Knobs, changed: Any) -> None:
+    def __init__(self, case: Case, start: Knobs, changed: Any, dark: bool) -> None:
         self._scale = [1e3 if p.unit == "m" else 1.0 for p in case.theta]  # shown in mm
         self._start, self._theta = start, []
         self.quiet = False  # while they are set from here
@@ -48,7 +45,8 @@ class Controls:
                             end=max(1000.0, start.delay_us), step=5.0, value=start.delay_us,
                             format="0")  # fmt: skip
         self.structure = Select(name="structure", title="controller", value=start.structure,
-                                options=list(STRUCTURES))  # fmt: skip
+                                options=[*STRUCTURES],
+                                stylesheets=[DARK] if dark else [])  # fmt: skip
         self.always = Checkbox(name="always", label="full search while dragging", active=False)
         sliders = [*self._theta, self.S_max, self.omega_S, self.omega_T, self.shift, self.rate,
                    self.delay]  # fmt: skip
@@ -89,11 +87,8 @@ class Controls:
             for slider, k, value in zip(self._theta, self._scale, knobs.theta, strict=True):
                 slider.value = k * value
             self.S_max.value, self.shift.value = knobs.S_max, knobs.resonance_shift
-            for slider, pair in (
-                (self.omega_S, knobs.omega_S_hz),
-                (self.omega_T, knobs.omega_T_hz),
-            ):
-                slider.value = tuple(float(v) for v in np.log10(pair))
+            self.omega_S.value = _logarithms(knobs.omega_S_hz)
+            self.omega_T.value = _logarithms(knobs.omega_T_hz)
             self.structure.value, self.sampled.active = knobs.structure, knobs.sampled
             self.rate.value, self.delay.value = float(np.log10(knobs.rate_hz)), knobs.delay_us
         finally:
@@ -106,7 +101,7 @@ def _power() -> CustomJSTickFormatter:
 
 
 def _frequencies(name: str, title: str, hz: tuple[float, float]) -> RangeSlider:
-    low, high = (float(v) for v in np.log10(hz))
+    low, high = _logarithms(hz)
     reach = float(np.log10(WIDER))
     return RangeSlider(
         name=name, title=title, start=low - reach, end=high + reach, step=0.01, value=(low, high),
@@ -123,3 +118,7 @@ def _hz(slider: RangeSlider, start: tuple[float, float]) -> tuple[float, float]:
 def _near(value: float, exact: float) -> float:
     """The case's own number where a logarithm and back is within rounding of it."""
     return exact if abs(value / exact - 1.0) < 1e-9 else value
+
+
+def _logarithms(pair: tuple[float, float]) -> tuple[float, float]:
+    return float(np.log10(pair[0])), float(np.log10(pair[1]))

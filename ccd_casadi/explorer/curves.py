@@ -3,27 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 from scipy.optimize import linear_sum_assignment
 
-from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.given_controller import Sampled
-from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.explorer.designs import Look
-from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.explorer.signals import Moved, in_discrete_time, signals_of
+from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
-from ccd_casadi.robust.demands import Demands
-from ccd_casadi.robust.move import mass_feedforward, simulate
-from ccd_casadi.robust.setpoint import setpoint
-from ccd_casadi.robust.signals import ClosedLoop, closed_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 180  # of the frequency grid, besides those around resonances
-STEP_POINTS = 240
-STEP_PERIODS = 5.0  # of the bandwidth
-WATCHED = 2.0  # durations of the move that are shown
 LIGHT = 0.3  # damping ratio below which a pole is a resonance
 FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
@@ -47,24 +37,7 @@ class Curves:
     plant_poles: np.ndarray
     step_time: Array
     step: Array
-    move: "Moved"
-
-
-@dataclass(frozen=True)
-class Moved:
-    """Error in m of the first output over s in the default move of `robustness`, ending at `end`.
-
-    With mass feedforward where a rigid body can be moved; `free`: on the plant without suspension.
-    """
-
-    time: Array
-    error: Array
-    end: float
-    feedforward: bool
-    free: bool
-
-
-_AT_REST = Moved(np.zeros(0), np.zeros(0), 0.0, False, False)
+    move: Moved
 
 
 @dataclass(frozen=True)
@@ -87,28 +60,47 @@ def curves_of(look: Look) -> Curves | None:
         return None
     plant, K = look.plant, look.controller
     hz = grid_of(look)
-    G, k, S = responses(plant, K, HZ * hz)
+    run_at = sampling_of(look)
+    if run_at is None:
+        G, k, S = responses(plant, K, HZ * hz)
+    else:  # it was designed for hold and delay
+        hz = hz[hz < 0.499 * run_at.rate_hz]
+        G, k = in_discrete_time(K, run_at).responses(plant, HZ * hz)
+        S = np.linalg.inv(np.eye(G.shape[1]) + G @ k)
     KS = k @ S
     gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in (S, KS, G @ KS)])
-    gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
-    loop = closed_loop(plant.plant_si(), K)
-    poles = np.linalg.eigvals(loop.A)
-    stable = bool(poles.real.max() < 0.0)
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
-    step_time, step = _step(loop, bandwidth) if stable else (np.zeros(0), np.zeros(0))
-    move = _move(look, K, bandwidth) if stable else _AT_REST
+    signals = signals_of(look.problem, look.elements.system, plant, K, run_at, bandwidth)
     return Curves(
         hz=hz,
         gains=gains,
-        bounds=gamma / np.abs(look.weights.responses(HZ * hz)),
+        bounds=bounds_of(look, hz),
         loci=loci_of(G @ k),
-        poles=poles / HZ,
+        poles=signals.poles / HZ,
         controller_poles=np.linalg.eigvals(K.A) / HZ,
         plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
-        step_time=step_time,
-        step=step,
-        move=move,
+        step_time=signals.step_time,
+        step=signals.step,
+        move=signals.move,
     )
+
+
+def sampling_of(look: Look) -> Sampling | None:
+    """The sampled loop that a design is made for; None where that is a continuous one."""
+    sections = look.problem.sections
+    return None if sections is None else sections.sampling
+
+
+def bounds_of(look: Look, hz: Array) -> Array:
+    """What σ_max of S, KS and T must not pass (3, k): γ/|W|, or the bounds of the sections."""
+    size = np.abs(look.weights.responses(HZ * hz))
+    sections = look.problem.sections
+    if sections is None:
+        return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
+    level = np.nan if sections.weighted_level is None else sections.weighted_level
+    shape = np.nan if sections.shape is None else sections.shape
+    below = np.where(hz <= look.bandwidth_hz, shape * hz / look.bandwidth_hz * 2.0**-0.5, np.nan)
+    return np.array([below, *(level / size[1:])])
 
 
 def grid_of(look: Look) -> Array:
@@ -142,52 +134,20 @@ def loci_of(L: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) <= FAR, values, np.nan)
 
 
-def _step(loop: ClosedLoop, bandwidth_hz: float) -> tuple[Array, Array]:
-    time = np.linspace(0.0, STEP_PERIODS / bandwidth_hz, STEP_POINTS)
-    n = len(loop.A)
-    joint = np.zeros((n + 1, n + 1))
-    joint[:n, :n], joint[:n, n] = loop.A, loop.B_r[:, 0]
-    Phi = expm(joint * time[1])
-    x, y = np.zeros(n + 1), np.zeros(len(time))
-    x[n] = 1.0
-    for i in range(1, len(time)):
-        x = Phi @ x
-        y[i] = loop.C_y[0] @ x[:n]
-    return time, y
-
-
-def _move(look: Look, K: StateSpace, bandwidth_hz: float) -> Moved:
-    """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
-    demands = Demands()
-    profile = setpoint(demands.limits)
-    modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
-    n, m, p = len(modal.K), modal.B.shape[1], len(modal.C)
-    released = StateSpace(
-        np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]]),
-        np.vstack([np.zeros((n, m)), modal.B]),
-        np.hstack([modal.C, np.zeros((p, n))]),
-        np.zeros((p, m)),
-    )
-    loop = closed_loop(released, K)
-    free = bool(np.linalg.eigvals(loop.A).real.max() < 0.0)
-    if not free:
-        loop = closed_loop(look.plant.plant_si(), K)
-    ahead = mass_feedforward(modal, demands.axis)
-    found = simulate(
-        loop, profile, axis=demands.axis, forces=ahead, window=demands.window,
-        bandwidth_hz=bandwidth_hz, doublings=1,
-    )  # fmt: skip
-    shown = found.time <= WATCHED * found.duration
-    return Moved(found.time[shown], found.error[shown], found.duration, ahead is not None, free)
+def sampled_of(look: Look) -> AsSampled | None:
+    """A certified design at the rate and delay of its sliders; None where it is designed for it."""
+    if look.controller is None or look.problem.sections is not None:
+        return None
+    if look.standing is Standing.REFUSED:
+        return None
+    return as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
 
 
 def as_sampled(
     plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float
 ) -> AsSampled:
     """A controller in discrete time on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
-    period, delay = 1.0 / rate_hz, 1e-6 * delay_us
-    tustin = Conversion(Discretisation.TUSTIN, False, 1.0)
-    sampled = Sampled(discretise(controller, tustin, period, delay), delay)
+    sampled = in_discrete_time(controller, Sampling(rate_hz, delay_us))
     stable, bandwidth, peak, _ = sampled.judge(plant)
     near = plant.grid * plant.omega_0 / HZ
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * rate_hz, 0.499 * rate_hz, POINTS), near]))

@@ -19,6 +19,7 @@ from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, miss
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
 from ccd_casadi.plants.plant import Mechanics, constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
@@ -32,7 +33,7 @@ class How(StrEnum):
     SEARCHED = "full inner search: the largest bandwidth at this θ"
     RUN = "the design of the run"
     SECTIONS = "fixed structure, climbed from its anchors at this θ"
-    HELD = "fixed structure, the controller of another θ, judged here"
+    HELD = "fixed structure, the controller designed last, judged at this θ"
 
 
 class Standing(StrEnum):
@@ -58,7 +59,8 @@ class Look:
 
     `figures` (rad/s) are NaN past the point where a synthesis failed; `reason` says in words why
     a design is not KEPT. `controller` in SI, None where a synthesis ended before there was one.
-    `problem` has its design plant chosen, `weights` the frequencies that were used.
+    `problem` has its design plant chosen, `weights` the frequencies that were used. `kappa`: of a
+    fixed structure.
     """
 
     knobs: Knobs
@@ -76,6 +78,7 @@ class Look:
     active: tuple[str, ...]
     seconds: float
     result: InnerResult | None = None
+    kappa: Array | None = None
 
     @property
     def theta(self) -> tuple[float, ...]:
@@ -153,7 +156,7 @@ def _look(
     inner = problem.inner
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
     made = handed_out(plant, made, inner.omega_low)
-    cost, broken = _hardware(problem, knobs.theta)
+    cost, broken = hardware_at(problem, knobs.theta)
     standing, reason = judged(problem, made.figures, broken)
     finite = all(np.isfinite(part).all() for part in vars(made.controller).values())
     return Look(
@@ -193,7 +196,8 @@ def judged(
     return (Standing.MISSED, "; ".join(missed)) if missed else (Standing.KEPT, "")
 
 
-def _hardware(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[float, list[str]]:
+def hardware_at(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[float, list[str]]:
+    """f(θ), and the names of the constraints on θ that are not met."""
     plant = plant_of(problem)
     values = constraint_values(plant, theta)
     broken = [n for n, v in zip(plant.constraint_names, values, strict=True) if v > 1e-9]

@@ -4,15 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from bokeh.models import (
-    BoxAnnotation,
-    ColumnDataSource,
-    CrosshairTool,
-    DataRange1d,
-    HoverTool,
-    Range1d,
-    Span,
-)
+from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d, HoverTool, Range1d
+from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from ccd_casadi.explorer.curves import AsSampled, Curves
@@ -21,6 +14,7 @@ from ccd_casadi.reporting.svg import AMBER, BLUE, GREEN, GREY, ORANGE, PURPLE, S
 
 HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there
+SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, SKY)
 DASHES = {Standing.KEPT: "solid", Standing.MISSED: "solid", Standing.REFUSED: "dashed"}
@@ -57,7 +51,7 @@ class Figures:
         }
         self.lines: list[Any] = []  # those of the present design, whose look says its standing
         self.cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
-        hz = Range1d(0.1, 1e4)
+        hz = Range1d(start=0.1, end=1e4)
         self.of_gain = [self._gain(name, label, hz) for name, label in GAINS]
         self.hz = hz
         self.nyquist = self._nyquist()
@@ -131,7 +125,7 @@ class Figures:
         made.y_range = DataRange1d(renderers=renderers, range_padding=0.12)
         made.add_tools(
             CrosshairTool(overlay=self.cursor),
-            HoverTool(renderers=[line], mode="vline", tooltips=[("Hz", "@hz{0.00}"), (name, f"@{name}{{0.0000}}")]),
+            _hover(line, [("Hz", "@hz{0.00}"), (name, f"@{name}{{0.0000}}")]),
         )  # fmt: skip
         return made
 
@@ -151,7 +145,7 @@ class Figures:
 
     def _poles(self) -> Any:
         made = self._figure("poles", "|pole| (Hz)", "damping ratio", x_axis_type="log")
-        made.y_range = Range1d(-0.08, 1.08)
+        made.y_range = Range1d(start=-0.08, end=1.08)
         made.add_layout(
             BoxAnnotation(top=0.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay")
         )
@@ -173,7 +167,7 @@ class Figures:
         made = self._figure(name, f"time ({unit})", label)
         self._pins(made, name)
         line = self._line(made, unit, y, source)
-        made.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=[("ms", f"@{unit}{{0.00}}"), (label, f"@{y}{{0.0000}}")]))  # fmt: skip
+        made.add_tools(_hover(line, [("ms", f"@{unit}{{0.00}}"), (label, f"@{y}{{0.0000}}")]))
         return made
 
     def show(self, drawn: Drawn) -> None:
@@ -204,7 +198,8 @@ class Figures:
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
             upper = roots[roots.imag >= 0.0]
             size = np.maximum(np.abs(upper), 1e-300)
-            self.poles[name].data = {"hz": size, "damping": -upper.real / size}
+            at = np.maximum(size, SLOWEST * c.hz[0])  # an integrator's has no place on the axis
+            self.poles[name].data = {"hz": at, "damping": -upper.real / size}
         self.step.data = {"ms": 1e3 * c.step_time, "y": c.step}
         self.move.data = {"ms": 1e3 * c.move.time, "um": 1e6 * c.move.error}
         self.end.location = 1e3 * c.move.end
@@ -238,3 +233,7 @@ class Figures:
 
 def _lines(loci: np.ndarray) -> tuple[list[Any], list[Any]]:
     return [line.real for line in loci.T], [line.imag for line in loci.T]
+
+
+def _hover(line: Any, tips: list[tuple[str, str]]) -> HoverTool:
+    return HoverTool(renderers=[line], mode="vline", tooltips=tips)

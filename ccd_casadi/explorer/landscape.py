@@ -1,5 +1,6 @@
 """ω_b* over two parameters: the run's surrogate where it still answers, and every sample known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,12 +41,13 @@ def run_surrogate(folder: Path) -> tuple[GaussianProcess, ...]:
 
 def field_of(
     problem: CoDesignProblem,
+    theta: Sequence[float],
     made_for: CoDesignProblem | None,
     processes: tuple[GaussianProcess, ...],
     store: Path,
     axes: tuple[int, int],
 ) -> Field:
-    """The landscape over the parameters `axes`, the others as at the problem's start.
+    """The landscape over the parameters `axes`, the others as at θ.
 
     `made_for`: the problem that the surrogates are of; of another one they say nothing.
     """
@@ -56,7 +58,7 @@ def field_of(
     if processes and made_for is not None:
         same = made_for.identity() == problem.identity()
         if same and made_for.inner_identity() == problem.inner_identity():
-            thetas = np.tile(np.array(problem.start), (GRID * GRID, 1))
+            thetas = np.tile(np.array(theta), (GRID * GRID, 1))
             first, second = np.meshgrid(np.linspace(*x, GRID), np.linspace(*y, GRID))
             thetas[:, i], thetas[:, j] = first.ravel(), second.ravel()
             field = predicted(problem, processes, thetas, std=False)[0].reshape(GRID, GRID)

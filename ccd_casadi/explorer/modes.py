@@ -161,10 +161,10 @@ class KnownModes:
     def save(self, folder: Path) -> None:
         """Keep the exact matrices in the folder, as plain arrays."""
         systems = list(self.exact.values())
-        arrays = {name: np.array([getattr(s, name) for s in systems]) for name in ("K", "B", "C")}
+        K, B, C = (np.array([getattr(s, name) for s in systems]) for name in ("K", "B", "C"))
         draft = folder / f".{FILE}"
         with draft.open("wb") as file:
-            np.savez(file, key=self.key, theta=np.array(list(self.exact)), **arrays)
+            np.savez(file, key=self.key, theta=np.array(list(self.exact)), K=K, B=B, C=C)
         draft.replace(folder / FILE)
 
     def load(self, folder: Path, pattern: Mechanics) -> None:

@@ -44,7 +44,7 @@ class Explorer:
 
     def _document(self, document: Document) -> None:
         context = document.session_context
-        arguments = context.request.arguments if context is not None else {}
+        arguments = getattr(getattr(context, "request", None), "arguments", {})
         dark = arguments.get("dark", [b"0"])[0] == b"1"
         document.title = f"Explorer: {self.session.case.path.name}"
         document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
@@ -62,7 +62,7 @@ class Explorer:
 
     def _surrogate_made(self) -> None:
         for page in list(self._pages):
-            page.document.add_next_tick_callback(lambda page=page: page.moved(False))
+            page.document.add_next_tick_callback(page.improved)
 
     def run(self, *, show: bool) -> None:
         """Serve until Ctrl-C."""

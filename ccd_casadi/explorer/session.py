@@ -10,10 +10,11 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.explorer.designs import Elements, Look, elements_at, present, searched
+from ccd_casadi.explorer.designs import Elements, How, Look, elements_at, present, searched
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.machine import lumped, stage_modes_html
 from ccd_casadi.explorer.modes import KnownModes, in_modal_form
+from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import sample_of, unit_of
@@ -34,7 +35,9 @@ class Session:
         if run is not None:
             self.start = replace(self.start, theta=run.theta)
         self.store = SampleStore(folder / "samples.sqlite")
-        self.pins: list[Look] = []
+        # of a fixed structure: the last controller, and the problem that it was designed for
+        self.kappa = None if run is None else run.kappa
+        self.designed_for = None if self.kappa is None or run is None else run.problem
         problem = self.problems.at(self.start)
         began = perf_counter()
         first = elements_at(problem, self.start.theta)
@@ -57,10 +60,35 @@ class Session:
         return elements_at(problem, theta) if self.known is None else self.known.at(theta)
 
     def live(self, knobs: Knobs) -> Look:
-        """One certified synthesis at the weights of the last search."""
+        """One certified synthesis at the weights of the last search.
+
+        Of a fixed structure: the last controller, judged at this θ.
+        """
         problem = self.problems.at(knobs)
+        if problem.sections is not None:
+            return self._held(problem, knobs)
         elements = self.elements(problem, knobs.theta)
         return present(problem, knobs, elements, (self.point[0], self.point[1]))
+
+    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> Look:
+        problem = anchored(problem, self.designed_for)
+        if self.kappa is None:
+            elements = elements_at(problem, knobs.theta)
+            return empty_look(problem, knobs, elements, "no controller yet: design one here")
+        return judged_look(problem, knobs, self.kappa, How.HELD)
+
+    def took_sections(self, found: Designed) -> Look | None:
+        """A design of a fixed structure ended: into the store, and the controller of looks to come.
+
+        None where no controller was found.
+        """
+        key = problem_hash(found.problem.identity())
+        self.store.put_problem(key, found.problem.identity())
+        self.store.put_unit(found.rows, found.unit, key)
+        if found.kappa is None:
+            return None
+        self.kappa, self.designed_for = found.kappa, found.problem
+        return judged_look(found.problem, found.knobs, found.kappa, How.SECTIONS)
 
     def full(self, knobs: Knobs) -> Look:
         """The inner problem at θ on the model itself."""
@@ -82,6 +110,10 @@ class Session:
         """
         for look in looks:
             problem = look.problem.identity()
+            if look.how is How.SECTIONS:
+                continue  # with its unit, or there is none
+            if look.kappa is not None:
+                problem = problem | {"held": [float(v) for v in look.kappa]}
             if not look.elements.exact:
                 problem = problem | {"elements": look.elements.words}
             key = problem_hash(problem)

@@ -24,12 +24,18 @@ def standing_html(look: Look, sampled: AsSampled | None) -> str:
         c = f.certificate
         facts = [
             f"ω_b = {number(look.bandwidth_hz, 5)} Hz",
-            f"‖S‖∞ = {number(f.sensitivity_peak, 5)} at {number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
+            f"‖S‖∞ = {number(f.sensitivity_peak, 5)} at "
+            f"{number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
             f"J = {number(look.objective, 6)}",
             f"hardware cost {number(look.cost, 6)}",
-            f"ω_S = {number(f.omega_S / HZ, 4)} Hz, ω_T = {number(f.omega_T / HZ, 4)} Hz",
-            f"norm {c.norm:.6g} ≤ {c.norm_bound:.6g}",
         ]
+        if look.kappa is None:
+            facts.append(
+                f"ω_S = {number(f.omega_S / HZ, 4)} Hz, ω_T = {number(f.omega_T / HZ, 4)} Hz"
+            )
+            facts.append(f"norm {c.norm:.6g} ≤ {c.norm_bound:.6g}")
+        else:
+            facts.append(f"at most {c.norm:.5g} of a bound on the corners of the plant set")
         if look.active:
             facts.append(f"binding: {', '.join(look.active)}")
     how = f"{look.how.value}; modes: {on.words}"
@@ -46,9 +52,21 @@ def sampled_words(sampled: AsSampled, S_max: float) -> str:
         return "Run at this rate and delay the loop is NOT stable (hold and delay exact)."
     over = 100.0 * (sampled.peak / S_max - 1.0)
     return (
-        f"Run at this rate and delay (exact, dash-dotted, not designed for it): ω_b = "
-        f"{number(sampled.bandwidth_hz, 4)} Hz, ‖S‖∞ = {number(sampled.peak, 4)}, {over:+.2g} % of S_max."
+        "Run at this rate and delay (exact, dash-dotted, not designed for it): ω_b = "
+        f"{number(sampled.bandwidth_hz, 4)} Hz, ‖S‖∞ = {number(sampled.peak, 4)}, {over:+.2g} % of "
+        "S_max."
     )
+
+
+def end_words(code: int) -> str:
+    """An exit code of `solve` in words."""
+    found = {
+        0: "done and verified",
+        3: "no feasible design",
+        4: "finished, not verified",
+        130: "stopped; what is sampled is kept",
+    }
+    return found.get(code, f"exit code {code}")
 
 
 def pin_columns(names: Sequence[str], pins: Sequence[tuple[str, Look]]) -> dict[str, list[Any]]:
