@@ -159,9 +159,11 @@ class Solve:
                 tell(line.rstrip())
             ended(self._process.wait())
 
+        self._asked = False
         threading.Thread(target=read, daemon=True).start()
 
     def stop(self) -> None:
-        """As Ctrl-C does: what is sampled is kept."""
+        """As Ctrl-C does, and what is sampled is kept; asked again, without more ado."""
         if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
+            self._process.send_signal(signal.SIGTERM if self._asked else signal.SIGINT)
+            self._asked = True

@@ -46,7 +46,7 @@ class Page:
         self.map = MapFigure(names, self.draw_map, dark)
         run = session.run
         self._surrogate = () if run is None else run_surrogate(run.folder)
-        self._scheduled = self._let_go = False
+        self._open, self._scheduled, self._let_go = True, False, False
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
@@ -174,7 +174,8 @@ class Page:
         """The action in this document's own turn, whatever thread calls."""
 
         def later(found: Any) -> None:
-            self.document.add_next_tick_callback(lambda: action(found))
+            if self._open:
+                self.document.add_next_tick_callback(lambda: action(found))
 
         return later
 
@@ -276,6 +277,7 @@ class Page:
 
     def close(self) -> None:
         """The page was closed: a solve goes on only while somebody sees it."""
+        self._open = False
         self.stop_solve()
         self.session.keep(self._seen)
         self._seen = []

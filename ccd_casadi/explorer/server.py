@@ -5,6 +5,8 @@ import webbrowser
 from pathlib import Path
 
 from bokeh.document import Document
+from bokeh.events import ClientReconnected, ConnectionLost
+from bokeh.models import CustomJS
 from bokeh.server.server import Server
 from jinja2 import Template
 
@@ -51,6 +53,9 @@ class Explorer:
         document.template_variables["case"] = str(self.session.case.path)
         document.template_variables["folder"] = str(self.session.folder)
         document.template_variables["dark"] = dark
+        shown = 'document.getElementById("lost").hidden = '
+        document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
+        document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
         document.theme = "dark_minimal" if dark else "light_minimal"
         page = Page(document, self.session, self.background, self._workers, dark)
         self._pages.append(page)
