@@ -20,6 +20,7 @@ COMMANDS = {
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
     "retrain": ("surrogates.retrain", "adds true samples to a run where they help most"),
     "insight": ("ccd_casadi.insight", "weight against bandwidth; what the optimum answers to"),
+    "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),

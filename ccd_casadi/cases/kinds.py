@@ -2,12 +2,13 @@
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
 from ccd_casadi.cases.sections import (
+    Case,
     ControllerSection,
     InnerSection,
     LoopSection,
@@ -93,6 +94,19 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
             raise fail(f"controller.channel.{name}.inputs", "has no outputs beside it; add them")
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
+
+
+def with_structure(case: Case, structure: str) -> Case:
+    """The case with another kind of controller; keys without effect on it as if not given."""
+    other = _OF_H_INFINITY if structure == "sections" else _OF_SECTIONS
+    tables: dict[str, Any] = {"controller": replace(case.controller, structure=structure)}
+    for name, keys in other.items():
+        table = tables.get(name, getattr(case, name))
+        unset = {item.name: item.default for item in fields(table) if item.name in keys}
+        tables[name] = replace(table, **unset)
+    if structure != WITH_DISTURBANCE:
+        tables["weights"] = replace(case.weights, disturbance=None)
+    return replace(case, **tables)
 
 
 def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> float:

@@ -21,7 +21,7 @@ from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
-from ccd_casadi.plants.plant import ModelFunction, Plant, build_plant, mechanics
+from ccd_casadi.plants.plant import Mechanics, ModelFunction, Plant, build_plant, mechanics
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
@@ -261,7 +261,11 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
     (209.2, (4, 4))
     """
-    system = mechanics(plant_of(problem), theta)
+    return scaled_system(problem, mechanics(plant_of(problem), theta))
+
+
+def scaled_system(problem: CoDesignProblem, system: Mechanics) -> ScaledPlant:
+    """The same of given matrices, whatever they are of: the plant's own, or close to them."""
 
     def scaled(*perturbation: Perturbation) -> ScaledPlant:
         modal = modal_plant(system, problem.suspension, *perturbation)
@@ -307,15 +311,16 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
 
 
 def best_choice(
-    problem: CoDesignProblem, theta: Sequence[float]
+    problem: CoDesignProblem, theta: Sequence[float], system: Mechanics | None = None
 ) -> tuple[CoDesignProblem, InnerResult]:
     """The choice of `design_choices` with the largest ω_b* at θ (least violation), and its result.
 
-    `syntheses` counts those of all choices.
+    `syntheses` counts those of all choices. `system`: matrices in place of the plant's own at θ.
     """
     solve = sweep_inner if problem.method == "sweep" else search_inner
+    system = mechanics(plant_of(problem), theta) if system is None else system
     found = [
-        (choice, solve(scaled_plant(choice, theta), choice.weights, choice.inner))
+        (choice, solve(scaled_system(choice, system), choice.weights, choice.inner))
         for choice in design_choices(problem)
     ]
     best = min(found, key=lambda item: (item[1].violation, -np.nan_to_num(item[1].bandwidth)))

@@ -89,9 +89,12 @@ def simulate_sampled(
 
 def simulate(
     loop: ClosedLoop, profile: Setpoint, *, axis: int, forces: Array | None, window: float,
-    bandwidth_hz: float,
+    bandwidth_hz: float, doublings: int = DOUBLINGS,
 ) -> Move:  # fmt: skip
-    """The move of output `axis`, the others told to stay; `forces` from `mass_feedforward`."""
+    """The move of output `axis`, the others told to stay; `forces` from `mass_feedforward`.
+
+    It is watched until it has settled, for a tail of `TAIL` periods doubled so often at most.
+    """
     n, m = loop.A.shape[0], loop.B_d.shape[1]
     ahead = np.zeros(m) if forces is None else forces
     # states: the loop, then r, ṙ, r̈, r⃛
@@ -122,7 +125,7 @@ def simulate(
     stop = x[n : n + 4] * np.array([1.0, 0.0, 0.0, 0.0])  # what rounding left of the derivatives
     x = np.concatenate([x[:n], stop])
     tail = TAIL / bandwidth_hz
-    for _ in range(DOUBLINGS):
+    for _ in range(doublings):
         run(0.0, tail)
         error = _error(loop, np.array(states[-SEGMENT:]), axis)
         if np.abs(error).max() <= 0.5 * window:

@@ -13,7 +13,7 @@ import numpy as np
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
@@ -185,7 +185,7 @@ class Sampler:
         """Keep a design made outside the pool (IPOPT on the true function)."""
         point = tuple(float(v) for v in x)
         key = self._design_key(point)
-        sample = _sample(key, point[:-2], design.figures, 0.0, design)
+        sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
 
@@ -232,19 +232,28 @@ def inner_unit(
     began = perf_counter()
     result = true_inner(problem, theta)
     each = (perf_counter() - began) / max(result.syntheses, 1)
+    rows, payload = unit_of(problem_key, theta, result, problem.inner, each)
+    return rows, (key, theta, payload)
+
+
+def unit_of(
+    problem_key: str,
+    theta: tuple[float, ...],
+    result: InnerResult,
+    inner: InnerProblem,
+    each: float,
+) -> tuple[list[Sample], dict]:
+    """Rows and payload of one θ's inner problem; `each` synthesis took so many seconds."""
     rows = {}
     for figures in result.rows:
         row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
-        rows[row_key] = _sample(row_key, theta, figures, each)
+        rows[row_key] = sample_of(row_key, theta, figures, each)
     optimum = result.optimum
     payload = {
         "bandwidth": None if optimum is None else optimum.figures.bandwidth,
         "gradient": None
         if optimum is None
-        else [
-            _number(v)
-            for v in bandwidth_gradient(optimum, result.active, tuple(problem.inner.bounds))
-        ],
+        else [_number(v) for v in bandwidth_gradient(optimum, result.active, tuple(inner.bounds))],
         "omega_S": None if optimum is None else optimum.figures.omega_S,
         "omega_T": None if optimum is None else optimum.figures.omega_T,
         "active": list(result.active),
@@ -252,7 +261,7 @@ def inner_unit(
         "violation": _number(result.violation),
         "syntheses": len(rows),
     }
-    return list(rows.values()), (key, theta, payload)
+    return list(rows.values()), payload
 
 
 def sections_unit(
@@ -306,17 +315,18 @@ def design_unit(
     for key, x in points:
         began = perf_counter()
         design = true_design(problem, x[:-2], *_frequencies(problem, x))
-        samples.append(_sample(key, x[:-2], design.figures, perf_counter() - began, design))
+        samples.append(sample_of(key, x[:-2], design.figures, perf_counter() - began, design))
     return samples, None
 
 
-def _sample(
+def sample_of(
     key: str,
     theta: tuple[float, ...],
     figures: DesignFigures,
     seconds: float,
     design: Sensitivities | None = None,
 ) -> Sample:
+    """One synthesis as a row of the store, with derivatives where `design` has them."""
     gradients = None
     if design is not None:
         whole = np.hstack([design.to_theta, design.to_break_frequencies])

@@ -1,0 +1,56 @@
+"""`python -m ccd_casadi.explore CASE.toml|RUN_DIR`: drag a design and see its certified loop.
+
+Serves one page on the loopback address until Ctrl-C.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """The command itself."""
+    from ccd_casadi.support.optional_packages import require
+
+    require("bokeh", "explore")
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.explorer.server import Explorer
+    from ccd_casadi.explorer.session import Session
+
+    place: Path = options.run
+    finished = read_run(place) if place.is_dir() else None
+    case = load_case(place) if finished is None else finished.case
+    beside = place.with_name(f"{place.stem}_explored.toml")
+    folder = run_folder(beside, place if finished is not None and not options.out else options.out)
+    session = Session(case, folder, finished)
+    explorer = Explorer(session, workers=options.workers, user_code=not options.no_user_code)
+    print(f"explorer      {explorer.url}", flush=True)
+    print(f"folder        {folder} (samples.sqlite, saved cases); Ctrl-C ends it", flush=True)
+    try:
+        explorer.run(show=not options.no_open)
+    except KeyboardInterrupt:
+        print()
+    finally:
+        explorer.close()
+    return ExitCode.DONE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.explore",
+        "Drag a design and see its certified loop, in the browser.",
+        metavar="CASE.toml|RUN_DIR",
+        about="a case file, or the folder of a finished solve",
+    )
+    arguments.add_argument(
+        "--no-open", action="store_true", help="only print the address, open no browser"
+    )
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.result"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,169 @@
+"""What takes longer than a drag: exact searches, samples of a slow plant, and a whole solve."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from ccd_casadi.explorer.designs import elements_at
+from ccd_casadi.explorer.modes import Theta, fit_modes, plan
+from ccd_casadi.explorer.session import Session
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.support.user_code import permit_user_code
+
+BEHIND = 10  # niceness of what fills the box
+
+Then = Callable[[Any], None]
+Failed = Callable[[BaseException], None]
+
+
+def _prepare(user_code: bool, behind: bool) -> None:
+    """In a worker: one BLAS thread, Ctrl-C left to the parent, and no life beyond it."""
+    if behind and hasattr(os, "nice"):
+        os.nice(BEHIND)  # the page comes first
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(limits=1)
+    permit_user_code(user_code).__enter__()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def leave() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=leave, daemon=True).start()
+
+
+class Background:
+    """One process for what the user waits for, the others for what makes dragging better.
+
+    `then` and `failed` are called in another thread.
+    """
+
+    def __init__(self, workers: int, user_code: bool = True) -> None:
+        self._sizes = {"asked": 1, "filling": max(1, workers - 1)}
+        self._user_code = user_code
+        self._pools: dict[str, ProcessPoolExecutor] = {}  # made when they are needed
+        self._closed = False
+
+    def _pool(self, name: str) -> ProcessPoolExecutor:
+        if name not in self._pools:
+            context = multiprocessing.get_context("spawn")
+            self._pools[name] = ProcessPoolExecutor(
+                self._sizes[name], context, _prepare, (self._user_code, name == "filling")
+            )
+        return self._pools[name]
+
+    def ask(self, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed) -> Future:
+        """Do what the user waits for; one after the other."""
+        return self._submit("asked", work, task, then, failed)
+
+    def fill(self, session: Session, problem: CoDesignProblem, told: Callable[[], None]) -> None:
+        """Sample a slow plant over its box and fit the surrogate of its modes again and again.
+
+        `told` is called after every fit. What was sampled is kept in the session's folder.
+        """
+        known = session.known
+        assert known is not None
+        fitted = 0
+
+        def refit() -> None:
+            nonlocal fitted
+            if known.due(fitted):
+                fitted = len(known.exact)
+                task = (list(known.exact), list(known.exact.values()))
+                self._submit("filling", _fit, task, took, print_failure)
+                known.save(session.folder)
+
+        def took(found: Any) -> None:
+            known.surrogate = found
+            told()
+
+        def sampled(found: tuple[Theta, Mechanics]) -> None:
+            known.exact[found[0]] = found[1]
+            refit()
+
+        refit()
+        for theta in plan(problem.lower, problem.upper):
+            if theta not in known.exact:
+                task = (problem, theta)
+                self._submit("filling", _sample, task, sampled, lambda error: None)
+
+    def _submit(
+        self, pool: str, work: Callable[[Any], Any], task: Any, then: Then,
+        failed: Failed,
+    ) -> Future:  # fmt: skip
+        def done(future: Future) -> None:
+            if self._closed or future.cancelled():
+                return
+            error = future.exception()
+            if error is None:
+                then(future.result())
+            else:
+                failed(error)
+
+        future = self._pool(pool).submit(work, task)
+        future.add_done_callback(done)
+        return future
+
+    def close(self) -> None:
+        """End what is under way."""
+        self._closed = True
+        for pool in self._pools.values():
+            running = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:
+                process.terminate()
+
+
+def print_failure(error: BaseException) -> None:
+    """On stderr: what the page can do without."""
+    print(f"warning: {error}", file=sys.stderr)
+
+
+def _sample(task: tuple[CoDesignProblem, Theta]) -> tuple[Theta, Mechanics]:
+    return task[1], elements_at(*task).system
+
+
+def _fit(task: tuple[list[Theta], list[Mechanics]]) -> Any:
+    return fit_modes(*task)
+
+
+class Solve:
+    """`python -m ccd_casadi.solve` of a case, in a process of its own, into a folder."""
+
+    def __init__(
+        self, case: Path, folder: Path, workers: int, tell: Callable[[str], None],
+        ended: Callable[[int], None],
+    ) -> None:  # fmt: skip
+        """`tell` is given every line, `ended` the exit code, both in another thread."""
+        command = [sys.executable, "-m", "ccd_casadi.solve", str(case), "--out", str(folder)]
+        self._process = subprocess.Popen(
+            [*command, "--workers", str(workers)],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            text=True, encoding="utf-8", errors="replace",
+        )  # fmt: skip
+
+        def read() -> None:
+            assert self._process.stdout is not None
+            for line in self._process.stdout:  # universal newlines: a bar's \r ends one too
+                tell(line.rstrip())
+            ended(self._process.wait())
+
+        self._asked = False
+        threading.Thread(target=read, daemon=True).start()
+
+    def stop(self) -> None:
+        """As Ctrl-C does, and what is sampled is kept; asked again, without more ado."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGTERM if self._asked else signal.SIGINT)
+            self._asked = True

@@ -1,0 +1,124 @@
+"""The sliders, and what they say together."""
+
+from typing import Any
+
+import numpy as np
+from bokeh.models import CustomJSTickFormatter
+from bokeh.models.widgets.inputs import Checkbox, Select
+from bokeh.models.widgets.sliders import RangeSlider, Slider
+
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.explorer.knobs import Knobs
+
+STEPS = 1000  # of a slider of θ
+WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case
+DARK = ".bk-input { background-color: #2b3238; color: #e0e0e0; }"  # the theme is of figures only
+STRUCTURES: tuple[Any, ...] = ("h_infinity", "h_infinity_disturbance", "sections")
+
+
+class Controls:
+    """Widgets for all that `Knobs` says; `changed` is called with True when one is let go."""
+
+    def __init__(self, case: Case, start: Knobs, changed: Any, dark: bool) -> None:
+        self._scale = [1e3 if p.unit == "m" else 1.0 for p in case.theta]  # shown in mm
+        self._start, self._theta = start, []
+        self.quiet = False  # while they are set from here
+        for p, k, value in zip(case.theta, self._scale, start.theta, strict=True):
+            unit = "mm" if k != 1.0 else p.unit
+            self._theta.append(Slider(
+                name=f"theta_{p.name}", title=f"{p.name} ({unit})" if unit else p.name,
+                start=k * p.lower, end=k * p.upper, step=k * (p.upper - p.lower) / STEPS,
+                value=k * value, format="0.000",
+            ))  # fmt: skip
+        high = max(3.0, 1.2 * start.S_max)
+        self.S_max = Slider(name="S_max", title="S_max", start=1.05, end=high, step=0.005,
+                            value=start.S_max, format="0.000")  # fmt: skip
+        self.omega_S = _frequencies("omega_S", "ω_S (Hz), range searched", start.omega_S_hz)
+        self.omega_T = _frequencies("omega_T", "ω_T (Hz), range searched", start.omega_T_hz)
+        self.shift = Slider(name="shift", title="resonances known to ± (share)", start=0.0, end=0.2,
+                            step=0.005, value=start.resonance_shift, format="0.000")  # fmt: skip
+        self.sampled = Checkbox(name="sampled", label="as sampled: hold and delay",
+                                active=start.sampled)  # fmt: skip
+        self.rate = Slider(name="rate", title="rate (Hz)", start=3.0, end=5.0, step=0.01,
+                           value=float(np.log10(start.rate_hz)), format=_power())  # fmt: skip
+        self.delay = Slider(name="delay", title="delay (µs)", start=0.0,
+                            end=max(1000.0, start.delay_us), step=5.0, value=start.delay_us,
+                            format="0")  # fmt: skip
+        self.structure = Select(name="structure", title="controller", value=start.structure,
+                                options=[*STRUCTURES],
+                                stylesheets=[DARK] if dark else [])  # fmt: skip
+        self.always = Checkbox(name="always", label="full search while dragging", active=False)
+        sliders = [*self._theta, self.S_max, self.omega_S, self.omega_T, self.shift, self.rate,
+                   self.delay]  # fmt: skip
+        for slider in sliders:
+            slider.on_change("value", lambda attr, old, new: self._tell(changed, False))
+            slider.on_change("value_throttled", lambda attr, old, new: self._tell(changed, True))
+        self.structure.on_change("value", lambda attr, old, new: self._tell(changed, True))
+        self.sampled.on_change("active", lambda attr, old, new: self._tell(changed, True))
+
+    def _tell(self, changed: Any, let_go: bool) -> None:
+        if not self.quiet:
+            changed(let_go)
+
+    def all(self) -> list[Any]:
+        """The widgets, from top to bottom."""
+        return [*self._theta, self.S_max, self.omega_S, self.omega_T, self.structure, self.shift,
+                self.sampled, self.rate, self.delay, self.always]  # fmt: skip
+
+    def knobs(self) -> Knobs:
+        """What they say."""
+        sliders = zip(self._theta, self._scale, strict=True)
+        return Knobs(
+            theta=tuple(float(np.clip(s.value, s.start, s.end)) / k for s, k in sliders),
+            S_max=float(self.S_max.value),
+            omega_S_hz=_hz(self.omega_S, self._start.omega_S_hz),
+            omega_T_hz=_hz(self.omega_T, self._start.omega_T_hz),
+            structure=self.structure.value,
+            resonance_shift=float(self.shift.value),
+            sampled=bool(self.sampled.active),
+            rate_hz=_near(10.0 ** float(self.rate.value), self._start.rate_hz),
+            delay_us=float(self.delay.value),
+        )
+
+    def put(self, knobs: Knobs) -> None:
+        """Move the sliders, without an answer to each."""
+        self.quiet = True
+        try:
+            for slider, k, value in zip(self._theta, self._scale, knobs.theta, strict=True):
+                slider.value = k * value
+            self.S_max.value, self.shift.value = knobs.S_max, knobs.resonance_shift
+            self.omega_S.value = _logarithms(knobs.omega_S_hz)
+            self.omega_T.value = _logarithms(knobs.omega_T_hz)
+            self.structure.value, self.sampled.active = knobs.structure, knobs.sampled
+            self.rate.value, self.delay.value = float(np.log10(knobs.rate_hz)), knobs.delay_us
+        finally:
+            self.quiet = False
+
+
+def _power() -> CustomJSTickFormatter:
+    """A slider of a logarithm shows the number itself."""
+    return CustomJSTickFormatter(code="return Number(Math.pow(10, tick).toPrecision(4)).toString()")
+
+
+def _frequencies(name: str, title: str, hz: tuple[float, float]) -> RangeSlider:
+    low, high = _logarithms(hz)
+    reach = float(np.log10(WIDER))
+    return RangeSlider(
+        name=name, title=title, start=low - reach, end=high + reach, step=0.01, value=(low, high),
+        format=_power(),
+    )  # fmt: skip
+
+
+def _hz(slider: RangeSlider, start: tuple[float, float]) -> tuple[float, float]:
+    low, high = (10.0 ** float(v) for v in slider.value)
+    low, high = _near(low, start[0]), _near(high, start[1])
+    return low, max(high, 1.01 * low)
+
+
+def _near(value: float, exact: float) -> float:
+    """The case's own number where a logarithm and back is within rounding of it."""
+    return exact if abs(value / exact - 1.0) < 1e-9 else value
+
+
+def _logarithms(pair: tuple[float, float]) -> tuple[float, float]:
+    return float(np.log10(pair[0])), float(np.log10(pair[1]))

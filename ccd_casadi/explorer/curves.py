@@ -1,0 +1,157 @@
+"""What is drawn of one design: gains, Nyquist, poles, a step and a move; pure functions of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.explorer.signals import Moved, in_discrete_time, signals_of
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import responses
+
+POINTS = 180  # of the frequency grid, besides those around resonances
+LIGHT = 0.3  # damping ratio below which a pole is a resonance
+FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
+FAR = 30.0  # |L| beyond which a locus leaves the drawing
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Of one design. Gains are largest singular values of S, KS (N/m) and T, rows (3, k) over Hz.
+
+    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `loci` (k, p): eigenvalues of L = GK, NaN where one
+    is too large to be drawn. `poles` of the closed loop, of K and of G in Hz, complex. `step`: y of
+    the first output after a step of its reference, over s.
+    """
+
+    hz: Array
+    gains: Array
+    bounds: Array
+    loci: np.ndarray
+    poles: np.ndarray
+    controller_poles: np.ndarray
+    plant_poles: np.ndarray
+    step_time: Array
+    step: Array
+    move: Moved
+
+
+@dataclass(frozen=True)
+class AsSampled:
+    """The same controller by Tustin's rule at a rate, hold and delay exact: judged, not designed.
+
+    `stable`, ω_b in Hz and ‖S‖∞ are of the sampled loop; σ_max(S) over Hz up to half the rate.
+    """
+
+    stable: bool
+    bandwidth_hz: float
+    peak: float
+    hz: Array
+    gain: Array
+
+
+def curves_of(look: Look) -> Curves | None:
+    """The curves of a design; None where its synthesis ended without a controller."""
+    if look.controller is None:
+        return None
+    plant, K = look.plant, look.controller
+    hz = grid_of(look)
+    run_at = sampling_of(look)
+    if run_at is None:
+        G, k, S = responses(plant, K, HZ * hz)
+    else:  # it was designed for hold and delay
+        hz = hz[hz < 0.499 * run_at.rate_hz]
+        G, k = in_discrete_time(K, run_at).responses(plant, HZ * hz)
+        S = np.linalg.inv(np.eye(G.shape[1]) + G @ k)
+    KS = k @ S
+    gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in (S, KS, G @ KS)])
+    bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
+    signals = signals_of(look.problem, look.elements.system, plant, K, run_at, bandwidth)
+    return Curves(
+        hz=hz,
+        gains=gains,
+        bounds=bounds_of(look, hz),
+        loci=loci_of(G @ k),
+        poles=signals.poles / HZ,
+        controller_poles=np.linalg.eigvals(K.A) / HZ,
+        plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
+        step_time=signals.step_time,
+        step=signals.step,
+        move=signals.move,
+    )
+
+
+def sampling_of(look: Look) -> Sampling | None:
+    """The sampled loop that a design is made for; None where that is a continuous one."""
+    sections = look.problem.sections
+    return None if sections is None else sections.sampling
+
+
+def bounds_of(look: Look, hz: Array) -> Array:
+    """What σ_max of S, KS and T must not pass (3, k): γ/|W|, or the bounds of the sections."""
+    size = np.abs(look.weights.responses(HZ * hz))
+    sections = look.problem.sections
+    if sections is None:
+        return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
+    level = np.nan if sections.weighted_level is None else sections.weighted_level
+    shape = np.nan if sections.shape is None else sections.shape
+    below = np.where(hz <= look.bandwidth_hz, shape * hz / look.bandwidth_hz * 2.0**-0.5, np.nan)
+    return np.array([below, *(level / size[1:])])
+
+
+def grid_of(look: Look) -> Array:
+    """Frequencies in Hz from ω_low/5 to far beyond ω_b and the modes, fine where either needs it.
+
+    It holds the peak of S and ω_b themselves.
+    """
+    plant, figures = look.plant, look.figures
+    low = look.problem.inner.omega_low / HZ / 5.0
+    natural = plant.natural[plant.natural > 0.0] / HZ
+    bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
+    high = max(30.0 * bandwidth, 3.0 * float(natural.max(initial=0.0)))
+    poles = np.linalg.eigvals(plant.A) * plant.omega_0 / HZ
+    if look.controller is not None:
+        poles = np.concatenate([poles, np.linalg.eigvals(look.controller.A) / HZ])
+    light = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))]
+    # even steps of the phase around a resonance, so that its circle in the Nyquist plot is round
+    around = (np.abs(light.imag)[:, None] + np.abs(light.real)[:, None] * FLANKS).ravel()
+    special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
+    grid = np.concatenate([np.geomspace(low, high, POINTS), around, special])
+    return np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
+
+
+def loci_of(L: np.ndarray) -> np.ndarray:
+    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > FAR."""
+    values = np.linalg.eigvals(L)
+    if values.shape[1] > 1:
+        for i in range(1, len(values)):
+            away = np.abs(values[i - 1][:, None] - values[i][None, :])
+            values[i] = values[i][linear_sum_assignment(away)[1]]
+    return np.where(np.abs(values) <= FAR, values, np.nan)
+
+
+def sampled_of(look: Look) -> AsSampled | None:
+    """A certified design at the rate and delay of its sliders; None where it is designed for it."""
+    if look.controller is None or look.problem.sections is not None:
+        return None
+    if look.standing is Standing.REFUSED:
+        return None
+    return as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
+
+
+def as_sampled(
+    plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float
+) -> AsSampled:
+    """A controller in discrete time on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
+    sampled = in_discrete_time(controller, Sampling(rate_hz, delay_us))
+    stable, bandwidth, peak, _ = sampled.judge(plant)
+    near = plant.grid * plant.omega_0 / HZ
+    hz = np.unique(np.concatenate([np.geomspace(1e-4 * rate_hz, 0.499 * rate_hz, POINTS), near]))
+    hz = hz[(hz >= 1e-4 * rate_hz) & (hz <= 0.499 * rate_hz)]
+    G, K = sampled.responses(plant, HZ * hz)
+    S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
+    return AsSampled(stable, bandwidth / HZ, peak, hz, np.linalg.norm(S, 2, axis=(1, 2)))

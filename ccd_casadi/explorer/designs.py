@@ -1,0 +1,209 @@
+"""The designs that the explorer shows: certified syntheses of the true problem, and no others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    best_choice,
+    design_choices,
+    plant_of,
+    scaled_system,
+)
+from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_by
+from ccd_casadi.plants.modal import ModalPlant, modal_plant
+from ccd_casadi.plants.plant import Mechanics, constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from ccd_casadi.synthesis.weights import Weights
+
+
+class How(StrEnum):
+    """How the controller was chosen."""
+
+    PRESENT = "one synthesis at the present weights"
+    SEARCHED = "full inner search: the largest bandwidth at this θ"
+    RUN = "the design of the run"
+    SECTIONS = "fixed structure, climbed from its anchors at this θ"
+    HELD = "fixed structure, the controller designed last, judged at this θ"
+
+
+class Standing(StrEnum):
+    """What may be said of a design."""
+
+    KEPT = "certified, keeps its bounds"
+    MISSED = "certified, misses a bound"
+    REFUSED = "not certified"
+
+
+@dataclass(frozen=True)
+class Elements:
+    """The plant's matrices at θ, and what they are: `exact` ones are the model's own."""
+
+    system: Mechanics
+    exact: bool = True
+    words: str = "the model's own"
+
+
+# Name of a bound -> the figure that it is on, in words.
+FIGURES = {"S_max": "peak of S", "S_low": "|S(jω_low)|", "compliance_max": "compliance"}
+
+
+@dataclass(frozen=True)
+class Look:
+    """A design that was looked at: where, on which plant, what it is worth.
+
+    `figures` (rad/s) are NaN past the point where a synthesis failed; `reason` says in words why
+    a design is not KEPT. `controller` in SI, None where a synthesis ended before there was one.
+    `problem` has its design plant chosen, `weights` the frequencies that were used. `kappa`: of a
+    fixed structure.
+    """
+
+    knobs: Knobs
+    problem: CoDesignProblem
+    elements: Elements
+    modal: ModalPlant
+    plant: ScaledPlant
+    weights: Weights
+    figures: DesignFigures
+    controller: StateSpace | None
+    how: How
+    standing: Standing
+    reason: str
+    cost: float
+    active: tuple[str, ...]
+    seconds: float
+    result: InnerResult | None = None
+    kappa: Array | None = None
+
+    @property
+    def theta(self) -> tuple[float, ...]:
+        """Of the sliders."""
+        return self.knobs.theta
+
+    @property
+    def bandwidth_hz(self) -> float:
+        """ω_b of the certified loop; NaN where there is none."""
+        return self.figures.bandwidth / HZ if self.standing is not Standing.REFUSED else np.nan
+
+    @property
+    def objective(self) -> float:
+        """J = w1 f(θ) + w2 ω_b."""
+        return self.problem.w1 * self.cost + self.problem.w2 * HZ * self.bandwidth_hz
+
+
+def elements_at(problem: CoDesignProblem, theta: Sequence[float]) -> Elements:
+    """The model's own matrices at θ; without derivatives where these cost extra.
+
+    Raises PlantError where the model is no plant there.
+    """
+    plant = plant_of(problem)
+    if plant.values is not None:
+        return Elements(plant.values(theta))
+    return Elements(mechanics(plant, theta))
+
+
+def present(
+    problem: CoDesignProblem,
+    knobs: Knobs,
+    elements: Elements,
+    point: tuple[float, float],
+) -> Look:
+    """One certified synthesis at θ and `point` = (ω_S, ω_T) in rad/s, clipped to the ranges."""
+    began = perf_counter()
+    inner = problem.inner
+    point = (float(np.clip(point[0], *inner.omega_S)), float(np.clip(point[1], *inner.omega_T)))
+    choices = design_choices(problem)
+    looks = [_look(choice, knobs, elements, point, How.PRESENT, began) for choice in choices]
+    return min(
+        looks, key=lambda look: float(np.nan_to_num(look.figures.sensitivity_peak, nan=np.inf))
+    )
+
+
+def searched(problem: CoDesignProblem, knobs: Knobs, elements: Elements) -> Look:
+    """The inner problem at θ, as the command `inner` solves it, and the controller there.
+
+    Where no design is feasible: the one nearest to it, if any was certified.
+    """
+    began = perf_counter()
+    choice, found = best_choice(problem, knobs.theta, elements.system)
+    if found.optimum is not None:
+        figures = found.optimum.figures
+        point = (figures.omega_S, figures.omega_T)
+        look = _look(choice, knobs, elements, point, How.SEARCHED, began)
+        return replace(look, result=found)
+    certified = [row for row in found.rows if row.certified]
+    row = min(certified or found.rows, key=lambda row: _excess(choice, row))
+    look = _look(choice, knobs, elements, (row.omega_S, row.omega_T), How.SEARCHED, began)
+    standing = Standing.MISSED if look.standing is Standing.KEPT else look.standing
+    return replace(look, standing=standing, reason=found.shortfall, result=found)
+
+
+def _look(
+    problem: CoDesignProblem,
+    knobs: Knobs,
+    elements: Elements,
+    point: tuple[float, float],
+    how: How,
+    began: float,
+) -> Look:
+    plant = scaled_system(problem, elements.system)
+    weights = problem.weights.at(*point)
+    inner = problem.inner
+    made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
+    made = handed_out(plant, made, inner.omega_low)
+    cost, broken = hardware_at(problem, knobs.theta)
+    standing, reason = judged(problem, made.figures, broken)
+    finite = all(np.isfinite(part).all() for part in vars(made.controller).values())
+    return Look(
+        knobs=knobs,
+        problem=problem,
+        elements=elements,
+        modal=modal_plant(elements.system, problem.suspension),
+        plant=plant,
+        weights=weights,
+        figures=made.figures,
+        controller=made.controller if finite and made.controller.A.size else None,
+        how=how,
+        standing=standing,
+        reason=reason,
+        cost=cost,
+        active=active_constraints(inner, made.figures) if standing is Standing.KEPT else (),
+        seconds=perf_counter() - began,
+    )
+
+
+def judged(
+    problem: CoDesignProblem, figures: DesignFigures, broken: Sequence[str] = ()
+) -> tuple[Standing, str]:
+    """What may be said of a design's figures, and why no more; `broken`: constraints on θ."""
+    if not figures.certified:
+        return Standing.REFUSED, figures.outcome.value
+    missed = [
+        f"{FIGURES[name]} {missed_by(getattr(figures, of), bound)} where {name} = {bound:g} is asked"
+        for name, (of, bound) in problem.inner.bounds.items()
+        if getattr(figures, of) > bound
+    ]
+    missed += [f"the constraint {name} on θ is not met" for name in broken]
+    return (Standing.MISSED, "; ".join(missed)) if missed else (Standing.KEPT, "")
+
+
+def hardware_at(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[float, list[str]]:
+    """f(θ), and the names of the constraints on θ that are not met."""
+    plant = plant_of(problem)
+    values = constraint_values(plant, theta)
+    broken = [n for n, v in zip(plant.constraint_names, values, strict=True) if v > 1e-9]
+    return hardware_cost(plant, theta), broken
+
+
+def _excess(problem: CoDesignProblem, row: DesignFigures) -> float:
+    ratios = [getattr(row, of) / bound for of, bound in problem.inner.bounds.values()]
+    return max(float(np.nan_to_num(ratio, nan=np.inf)) for ratio in ratios)

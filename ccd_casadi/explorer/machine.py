@@ -1,0 +1,188 @@
+"""The machine as a picture: masses and springs, or the rib stage; and the shapes of its modes.
+
+Pictures are inline SVG of their own, without a script. Words in them take the page's colour.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.modal import ModalPlant
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rib_stage.pictures import mode_shape
+from ccd_casadi.plants.rib_stage.plant import stage_of
+from ccd_casadi.reporting.page import escape, number
+from ccd_casadi.reporting.stage_drawing import draw_stages
+from ccd_casadi.reporting.stage_pictures import surface_of
+from ccd_casadi.reporting.svg import BLUE, GREEN, ORANGE
+from ccd_casadi.reporting.turntable import Picture, still
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+SMALL = 1e-9  # share of the largest entry below which there is no spring
+MOST_NODES = 12
+SHOWN_MODES = 3
+STEP, MIDDLE, ROW = 150.0, 78.0, 46.0  # between masses, height of their row, of a mode's row
+SIDE = 86.0  # of the reference mass's block
+
+
+@dataclass(frozen=True)
+class Lumped:
+    """Masses on one line: kg each, springs (i, j, N/m) between them and to the ground (j = -1)."""
+
+    masses: Array
+    springs: tuple[tuple[int, int, float], ...]
+    driven: tuple[int, ...]
+    measured: tuple[int, ...]
+
+
+def lumped(system: Mechanics) -> Lumped | None:
+    """The masses and springs that M and K are of; None where they are of something else.
+
+    M is diagonal, K has no positive entry beside its diagonal and no negative row sum, and some
+    spring joins two masses: matrices in modal coordinates have none.
+    """
+    n = len(system.M)
+    m, K = np.diag(system.M), system.K
+    apart = np.abs(system.M - np.diag(m)).max() <= SMALL * np.abs(m).max()
+    level = SMALL * np.abs(K).max()
+    off = K - np.diag(np.diag(K))
+    ground = K.sum(axis=1)
+    if n > MOST_NODES or not apart or off.max(initial=0.0) > level or ground.min() < -n * level:
+        return None
+    springs = [
+        (i, j, float(-K[i, j])) for i in range(n) for j in range(i + 1, n) if -K[i, j] > level
+    ]
+    if not springs:
+        return None
+    springs += [(i, -1, float(ground[i])) for i in range(n) if ground[i] > n * level]
+    driven = tuple(map(int, np.flatnonzero(np.abs(system.B).max(axis=1) > 0.0)))
+    measured = tuple(map(int, np.flatnonzero(np.abs(system.C).max(axis=0) > 0.0)))
+    return Lumped(np.array(m), tuple(springs), driven, measured)
+
+
+def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
+    """Masses as blocks whose areas are as their masses, springs, force and sensor; modes below.
+
+    `reference` in kg has the block of full size, alike at every θ.
+    """
+    n = len(found.masses)
+    at = [STEP * (i + 0.75) for i in range(n)]
+    side = SIDE * np.sqrt(np.abs(found.masses) / reference)
+    parts = [_spring(at, side, *spring) for spring in found.springs]
+    for i, (x, s) in enumerate(zip(at, side, strict=True)):
+        corner = f'x="{x - s / 2:.1f}" y="{MIDDLE - s / 2:.1f}" width="{s:.1f}" height="{s:.1f}"'
+        parts.append(f'<rect {corner} rx="3" fill="{BLUE}" fill-opacity=".28" stroke="{BLUE}"/>')
+        parts.append(_text(x, MIDDLE + 4, f"{number(float(found.masses[i]), 4)} kg"))
+        if i in found.driven:
+            parts.append(_arrow(x - s / 2 - 34, x - s / 2 - 2, MIDDLE, ORANGE))
+            parts.append(_text(x - s / 2 - 20, MIDDLE - 8, "u"))
+        if i in found.measured:
+            parts.append(_arrow(x, x + 26, MIDDLE - s / 2 - 8, GREEN))
+            parts.append(_text(x + 33, MIDDLE - s / 2 - 4, "y"))
+    flexible = np.flatnonzero(~modal.rigid)[:SHOWN_MODES]
+    for row, mode in enumerate(flexible):
+        y = 2.0 * MIDDLE + ROW * (row + 0.5)
+        shape = modal.modes[:, mode] / np.abs(modal.modes[:, mode]).max()
+        for x, move in zip(at, shape, strict=True):
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{BLUE}"/>')
+            parts.append(_arrow(x, x + 46.0 * move, y, BLUE))
+        words = f"mode {row + 1}: {number(modal.natural[mode] / HZ, 4)} Hz"
+        parts.append(_text(6.0, y - 12, words, "start"))
+    high, wide = 2.0 * MIDDLE + ROW * len(flexible), STEP * (n + 0.5)
+    return (
+        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="masses and springs" '
+        f'style="width:100%;max-width:{1.4 * wide:.0f}px" font-size="12">{"".join(parts)}</svg>'
+    )
+
+
+def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) -> str:
+    """A zigzag between neighbours, an arc between others, a zigzag to the left to the ground."""
+    words = f"{number(stiffness, 3)} N/m"
+    look = f'fill="none" stroke="{GREEN}" stroke-width="1.6"'
+    if j > i + 1:
+        x0, x1, top = at[i], at[j], MIDDLE - SIDE / 2 - 4
+        arc = f'<path d="M{x0:.1f} {top}Q{(x0 + x1) / 2:.1f} -20 {x1:.1f} {top}" {look}/>'
+        return arc + _text((x0 + x1) / 2, 20, words)
+    low = MIDDLE + 14.0
+    if j < 0:
+        x0, x1 = at[i] - side[i] / 2 - 40.0, at[i] - side[i] / 2
+    else:
+        x0, x1 = at[i] + side[i] / 2, at[j] - side[j] / 2
+    turns = np.linspace(x0, x1, 12)
+    heights = low + np.array([0, 0, *([7, -7] * 4), 0, 0])
+    d = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(turns, heights, strict=True))
+    wall = f'<path d="M{x0:.1f} {low - 14}v28" {look}/>' if j < 0 else ""
+    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, low + 38, words)
+
+
+def _arrow(x0: float, x1: float, y: float, colour: str) -> str:
+    tip = min(6.0, abs(x1 - x0)) * np.sign(x1 - x0)
+    return (
+        f'<path d="M{x0:.1f} {y:.1f}L{x1:.1f} {y:.1f}m{-tip:.1f} -4L{x1:.1f} {y:.1f}l{-tip:.1f} 4" '
+        f'stroke="{colour}" stroke-width="2" fill="none"/>'
+    )
+
+
+def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
+    place = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
+    return f'<text {place} fill="currentColor">{escape(words)}</text>'
+
+
+def machine_html(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    start: Sequence[float],
+    system: Mechanics,
+    modal: ModalPlant,
+    reference: float,
+) -> str:
+    """The machine at θ: the stage beside the stage of the start, masses and springs, or its modes.
+
+    `system` and `modal` are of θ, or of what stands for it; `reference`: see `lumped_svg`.
+    """
+    plant = plant_of(problem)
+    stage = stage_of(plant, theta)
+    if stage is not None:
+        before = stage_of(plant, start)
+        assert before is not None
+        drawn = draw_stages(stage[0].geometry, {"this design": stage[1], "the start": before[1]})
+        return f'<div style="background:#fff;color:#1a1a1a">{drawn}</div>'
+    found = lumped(system)
+    if found is None:
+        return modes_html(modal)
+    return lumped_svg(found, modal, reference)
+
+
+def modes_html(modal: ModalPlant) -> str:
+    """A table of the modes: frequency, damping ratio, how they are driven and measured."""
+    b, c = np.linalg.norm(modal.B, axis=1), np.linalg.norm(modal.C, axis=0)
+    rows = []
+    for i in np.argsort(modal.natural, kind="stable"):
+        omega = float(modal.natural[i])
+        hz = "rigid" if modal.rigid[i] else f"{number(omega / HZ, 4)} Hz"
+        zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
+        share = (b[i] / b.max(), c[i] / c.max())
+        rows.append(f"<tr><td>{hz}<td>{zeta}<td>{share[0]:.2g}<td>{share[1]:.2g}")
+    head = "<tr><th>mode<th>damping<th>driven<th>measured"
+    return f"<table>{head}{''.join(rows)}</table>"
+
+
+def stage_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
+    """The first flexible modes of a rib stage by finite elements; empty for another plant."""
+    found = stage_of(plant_of(problem), theta)
+    if found is None:
+        return ""
+    stage, here = found
+    modes = stage.frequencies(here)[3:]
+    order = sorted(range(len(modes)), key=lambda i: modes[i].frequency)
+    parts = []
+    for i in order[:SHOWN_MODES]:
+        shape = mode_shape(stage, here, 3 + i)
+        surface = surface_of(stage, here, shape)
+        words = f"{number(shape.frequency, 4)} Hz"
+        drawn = still(surface, Picture(shape.displacement[surface.source], words))
+        parts.append(f'<div style="flex:1 1 150px">{words}{drawn}</div>')
+    return f'<div style="display:flex;flex-wrap:wrap">{"".join(parts)}</div>'

@@ -1,0 +1,87 @@
+"""The landscape of ω_b* on the page, with the present design in it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
+from bokeh.models.widgets.inputs import Select
+from bokeh.models.widgets.markups import Div
+from bokeh.plotting import figure
+
+from ccd_casadi.explorer.controls import DARK
+from ccd_casadi.explorer.landscape import Field
+from ccd_casadi.reporting.page import escape
+from ccd_casadi.reporting.svg import GREY, ORANGE
+
+HEIGHT = 280
+MARGIN = 0.03  # of the box
+
+
+class MapFigure:
+    """Two choices of a parameter, the map over them, what it shows; `asked` when one is chosen."""
+
+    def __init__(self, names: Sequence[str], asked: Callable[[], None], dark: bool = False) -> None:
+        self.names: list[Any] = list(names)
+        self._selects = [
+            Select(name=f"axis_{i}", title=title, options=self.names, width=120,
+                   stylesheets=[DARK] if dark else [],
+                   value=self.names[min(i, len(self.names) - 1)])
+            for i, title in enumerate(("across", "up"))
+        ]  # fmt: skip
+        for select in self._selects:
+            select.on_change("value", lambda attr, old, new: asked())
+        self._colours = LinearColorMapper(palette="Viridis256", nan_color="#80808050")
+        self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
+        self._dots = ColumnDataSource({"x": [], "y": [], "hz": []})
+        self._here = ColumnDataSource({"x": [], "y": []})
+        self._x, self._y = Range1d(start=0.0, end=1.0), Range1d(start=0.0, end=1.0)
+        made: Any = figure(
+            name="landscape", height=HEIGHT, sizing_mode="stretch_width", toolbar_location="above",
+            tools="pan,wheel_zoom,reset,hover", tooltips=[("ω_b (Hz)", "@hz{0.00}")],
+            x_range=self._x, y_range=self._y,
+        )  # fmt: skip
+        made.toolbar.logo = None
+        made.image("image", "x", "y", "dw", "dh", source=self._image, color_mapper=self._colours)
+        by_value = {"field": "hz", "transform": self._colours}
+        made.scatter("x", "y", source=self._dots, size=6, fill_color=by_value, line_color=GREY)
+        made.scatter("x", "y", source=self._here, marker="star", size=18, fill_color=ORANGE,
+                     line_color="white")  # fmt: skip
+        self._figure, self._words = made, Div()
+
+    def root(self) -> Any:
+        """All of it, to be placed on the page."""
+        fill: Any = "stretch_width"
+        return column(row(*self._selects), self._figure, self._words, sizing_mode=fill)
+
+    @property
+    def axes(self) -> tuple[int, int]:
+        """The parameters chosen."""
+        i, j = (self.names.index(select.value) for select in self._selects)
+        return i, j
+
+    def mark(self, theta: Sequence[float]) -> None:
+        """The present design."""
+        i, j = self.axes
+        self._here.data = {"x": [theta[i]], "y": [theta[j]]}
+
+    def show(self, found: Field) -> None:
+        """The landscape over the parameters chosen."""
+        known = np.concatenate([found.field.ravel(), found.samples[:, 2]])
+        known = known[np.isfinite(known)]
+        if known.size:
+            self._colours.low, self._colours.high = float(known.min()), float(known.max()) + 1e-9
+        (x0, x1), (y0, y1) = found.x, found.y
+        image: dict[str, list[Any]] = {name: [] for name in self._image.data}
+        if found.field.size:
+            places = ([found.field], [x0], [y0], [x1 - x0], [y1 - y0])
+            image = dict(zip(("image", "x", "y", "dw", "dh"), places, strict=True))
+        self._image.data = image
+        self._dots.data = dict(zip(("x", "y", "hz"), found.samples.T, strict=True))
+        for axis, (low, high) in ((self._x, found.x), (self._y, found.y)):
+            margin = MARGIN * (high - low)
+            axis.update(start=low - margin, end=high + margin)
+        labels = (select.value for select in self._selects)
+        self._figure.xaxis.axis_label, self._figure.yaxis.axis_label = labels
+        self._words.text = f"<p>{escape(found.words)}</p>"

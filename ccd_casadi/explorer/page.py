@@ -1,0 +1,289 @@
+"""One browser page: sliders, figures and buttons over a session; an answer to every drag."""
+
+from collections.abc import Callable
+from typing import Any
+
+from bokeh.document import Document
+from bokeh.layouts import column, row
+from bokeh.models import ColumnDataSource
+from bokeh.models.widgets.buttons import Button
+from bokeh.models.widgets.markups import Div
+
+from ccd_casadi.explorer.background import Background, Solve
+from ccd_casadi.explorer.controls import Controls
+from ccd_casadi.explorer.curves import curves_of, sampled_of
+from ccd_casadi.explorer.designs import How, Look
+from ccd_casadi.explorer.figures import Drawn, Figures
+from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.explorer.landscape import field_of, run_surrogate
+from ccd_casadi.explorer.machine import machine_html
+from ccd_casadi.explorer.map_figure import MapFigure
+from ccd_casadi.explorer.modes import frequency_error, in_modal_form
+from ccd_casadi.explorer.pins import Pins
+from ccd_casadi.explorer.sections import Designed, anchored, designed
+from ccd_casadi.explorer.session import Session, searched_exactly
+from ccd_casadi.explorer.words import end_words, standing_html
+from ccd_casadi.reporting.page import escape
+from ccd_casadi.support.errors import UserError
+
+TOGETHER = 4  # ms: drags that come within it are answered at once
+WIDE = ".bk-clearfix { display: block; }"  # a picture takes the width that there is
+LINES = 12  # of a solve's output
+
+
+class Page:
+    """The widgets of one document, and what happens when one is moved."""
+
+    def __init__(
+        self, document: Document, session: Session, background: Background, workers: int, dark: bool
+    ) -> None:
+        self.document, self.session, self.background = document, session, background
+        self.workers = workers
+        names = [parameter.name for parameter in session.case.theta]
+        self.figures = Figures(dark)
+        self.controls = Controls(session.case, session.start, self.moved, dark)
+        self.pins = Pins(names, self.figures)
+        self.map = MapFigure(names, self.draw_map, dark)
+        run = session.run
+        self._surrogate = () if run is None else run_surrogate(run.folder)
+        self._open, self._scheduled, self._let_go = True, False, False
+        self._seen: list[Look] = []  # to be written into the store
+        self._newest: Knobs | None = None  # to be searched, while a search is under way
+        self.now: Drawn | None = None
+        self.solve: Solve | None = None
+        self._output: list[str] = []
+        # what was answered last: a watch in the browser stops when this has been drawn
+        nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
+        self.answer = ColumnDataSource(nothing, name="answer")
+        self.pins.table.tags = [self.answer]  # so that it is sent
+        self.verdict, self.note, self.output = (
+            Div(name="verdict"),
+            Div(name="note"),
+            Div(name="output"),
+        )
+        self.machine = Div(name="machine_picture", stylesheets=[WIDE])
+        self.modes = Div(stylesheets=[WIDE])
+        self.design = _button("Design sections here", "design", self.design_sections)
+        self.solve_button = _button("Solve from here", "solve", self.start_solve)
+        self.stop = _button("Stop the solve", "stop", self.stop_solve)
+        self.stop.disabled = True
+        self._place()
+        self.moved(True)
+
+    def _place(self) -> None:
+        buttons = [
+            _button("Pin this design", "pin", self.pin), _button("Go to selected", "go", self.go),
+            _button("Unpin selected", "unpin", self.pins.drop), self.design, self.solve_button,
+            self.stop, _button("Save as case", "save", self.write_case),
+        ]  # fmt: skip
+        fill: Any = "stretch_width"
+        wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
+        roots: dict[str, list[Any]] = {
+            "controls": self.controls.all(),
+            "verdict_place": [self.verdict, self.note],
+            "machine": [self.machine, self.modes],
+            "pins_place": [wrapped, self.pins.table, self.output],
+            "map_place": [self.map.root()],
+        } | {f"{name}_place": [made] for name, made in self.figures.all().items()}
+        for name, parts in roots.items():
+            for part in parts:
+                if part.sizing_mode is None:
+                    part.sizing_mode = fill
+            self.document.add_root(column(*parts, name=name, sizing_mode=fill))
+
+    # drags
+
+    def moved(self, let_go: bool) -> None:
+        """A slider moved: answer soon, once for all that moved meanwhile."""
+        self._let_go = self._let_go or let_go
+        if not self._scheduled:
+            self._scheduled = True
+            self.document.add_timeout_callback(self._answer, TOGETHER)
+
+    def improved(self) -> None:
+        """There is a better surrogate of the modes."""
+        self.moved(False)
+
+    def _answer(self) -> None:
+        self._scheduled, let_go, self._let_go = False, self._let_go, False
+        knobs = self.controls.knobs()
+        sections = knobs.structure == "sections"
+        self.design.disabled = not sections
+        full = (let_go or bool(self.controls.always.active)) and not sections
+        behind = full and self.session.known is not None
+        try:
+            here = full and not behind
+            look = self.session.full(knobs) if here else self.session.live(knobs)
+        except UserError as error:
+            self._complain(str(error))
+            return
+        self.note.text = ""
+        self.show(look)
+        if behind:
+            self._search_behind(knobs)
+        if let_go:
+            self.settle()
+
+    def _complain(self, words: str) -> None:
+        self.note.text = f'<p class="refused">{escape(words)}</p>'
+
+    def show(self, look: Look) -> None:
+        """Draw a design, and say that this is the answer."""
+        sampled = sampled_of(look) if look.knobs.sampled else None
+        self.now = Drawn(look, curves_of(look), sampled)
+        self.figures.show(self.now)
+        if look.how is not How.PRESENT:
+            self.figures.frame(self.now)
+        session = self.session
+        self.verdict.text = standing_html(look, sampled)
+        self.machine.text = machine_html(
+            look.problem, look.theta, session.start.theta, look.elements.system, look.modal,
+            session.reference,
+        )  # fmt: skip
+        self.map.mark(look.theta)
+        self._seen.append(look)
+        serial = self.answer.data["serial"][0] + 1
+        self.answer.data = {
+            "serial": [serial], "theta": [list(look.theta)], "how": [look.how.value],
+        }  # fmt: skip
+
+    def settle(self) -> None:
+        """When the answer is on its way: write what was looked at, draw the landscape."""
+        self.document.add_next_tick_callback(self._settled)
+
+    def _settled(self) -> None:
+        seen, self._seen = self._seen, []
+        self.session.keep(seen)
+        self.draw_map()
+
+    def draw_map(self) -> None:
+        """The landscape at the present settings."""
+        if self.now is None:
+            return
+        run, store = self.session.run, self.session.store.path
+        made_for = None if run is None else run.problem
+        look = self.now.look
+        self.map.show(
+            field_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
+        )
+        self.map.mark(look.theta)
+
+    # the background
+
+    def _then(self, action: Callable[[Any], None]) -> Callable[[Any], None]:
+        """The action in this document's own turn, whatever thread calls."""
+
+        def later(found: Any) -> None:
+            if self._open:
+                self.document.add_next_tick_callback(lambda: action(found))
+
+        return later
+
+    def _search_behind(self, knobs: Knobs) -> None:
+        """The exact elements and the full search of the newest place, one at a time."""
+        busy, self._newest = self._newest is not None, knobs
+        self.note.text = "<p>solving the model and searching at this θ …</p>"
+        if not busy:
+            task = (self.session.problems.at(knobs), knobs)
+            done, failed = self._then(self._searched), self._then(self._failed)
+            self.background.ask(searched_exactly, task, done, failed)
+
+    def _searched(self, found: tuple[Look, str]) -> None:
+        look, modes = found
+        newest, self._newest = self._newest, None
+        known = self.session.known
+        assert known is not None
+        self.note.text = ""
+        if known.surrogate is not None and in_modal_form(look.elements.system):
+            off = frequency_error(known.surrogate.at(look.theta), look.elements.system)
+            words = f"the surrogate's frequencies are off by {100.0 * off:.2g} % at most here"
+            self.note.text = f"<p>{words}</p>"
+        self.session.took(look)
+        self.modes.text = modes
+        if newest is None or newest == look.knobs:
+            if self.controls.knobs() == look.knobs:
+                self.show(look)
+            else:
+                self._seen.append(look)
+        else:
+            self._seen.append(look)
+            self._search_behind(newest)
+        self.settle()
+
+    def _failed(self, error: BaseException) -> None:
+        self._newest = None
+        self._complain(str(error))
+
+    def design_sections(self) -> None:
+        """A controller of fixed structure at this θ."""
+        knobs = self.controls.knobs()
+        problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
+        self.design.disabled = True
+        self.note.text = "<p>designing a controller at this θ …</p>"
+        done, failed = self._then(self._designed), self._then(self._failed)
+        self.background.ask(designed, (problem, knobs), done, failed)
+
+    def _designed(self, found: Designed) -> None:
+        self.design.disabled, self.note.text = False, ""
+        look = self.session.took_sections(found)
+        if look is None:
+            self._complain(found.words)
+            return
+        self.show(look)
+        self.settle()
+
+    # pins, files, solves
+
+    def pin(self) -> None:
+        """Keep the present design beside those to come."""
+        if self.now is not None:
+            self.pins.add(self.now)
+
+    def go(self) -> None:
+        """Move the sliders to the selected pin."""
+        pinned = self.pins.selected()
+        if pinned is not None:
+            self.controls.put(pinned.look.knobs)
+            self.moved(True)
+
+    def write_case(self) -> None:
+        """Save as case."""
+        place = self.session.save(self.controls.knobs())
+        self.output.text = f"<p>saved {escape(str(place))}</p>"
+
+    def start_solve(self) -> None:
+        """Solve from here, in the background."""
+        folder, case = self.session.folder_for_solve(self.controls.knobs())
+        self._output = [f"solving into {folder}"]
+        self.solve_button.disabled, self.stop.disabled = True, False
+        said, ended = self._then(self._said), self._then(self._ended)
+        self.solve = Solve(case, folder, self.workers, said, ended)
+        self._said("")
+
+    def stop_solve(self) -> None:
+        """As Ctrl-C."""
+        if self.solve is not None:
+            self.solve.stop()
+
+    def _said(self, line: str) -> None:
+        if line:
+            self._output.append(line)
+        shown = "\n".join(self._output[:1] + self._output[1:][-LINES:])
+        self.output.text = f"<pre>{escape(shown)}</pre>"
+
+    def _ended(self, code: int) -> None:
+        self.solve_button.disabled, self.stop.disabled = False, True
+        self._said(f"the solve ended: {end_words(code)}")
+
+    def close(self) -> None:
+        """The page was closed: a solve goes on only while somebody sees it."""
+        self._open = False
+        self.stop_solve()
+        self.session.keep(self._seen)
+        self._seen = []
+
+
+def _button(label: str, name: str, action: Callable[[], None]) -> Button:
+    made = Button(label=label, name=name, width=150)
+    made.on_click(action)
+    return made

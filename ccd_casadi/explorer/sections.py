@@ -1,0 +1,159 @@
+"""Controllers of fixed structure in the explorer: designed behind it, judged while one drags.
+
+A design takes seconds, the judge of a known controller on the corners of its plant set a part of
+one: while one drags, the last controller is judged at the new θ, and it says so.
+"""
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.explorer.designs import Elements, How, Look, Standing, elements_at, hardware_at
+from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.fixed_structure import Certificate as SetCertificate
+from ccd_casadi.fixed_structure.channel_structure import controller_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_system
+from ccd_casadi.inner_problem.sections_bandwidth import (
+    judged_corners,
+    prepared,
+    sections_of_problem,
+    structure_of,
+    with_range,
+)
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.sampling.sampler import sections_unit
+from ccd_casadi.sampling.store import Sample, problem_hash, sample_key
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
+
+Unit = tuple[str, str, tuple[float, ...], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Designed:
+    """A controller at a θ: κ in SI (None: none was found), the problem with its anchors and set.
+
+    `rows` and `unit` go into the store under the hash of that problem.
+    """
+
+    problem: CoDesignProblem
+    knobs: Knobs
+    kappa: Array | None
+    words: str
+    rows: tuple[Sample, ...]
+    unit: Unit
+
+
+def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesignProblem:
+    """The problem with the anchors, plant set and channels of one that was designed before."""
+    if known is None:
+        return problem
+    mine, theirs = sections_of_problem(problem), sections_of_problem(known)
+    members = theirs.members if mine.uncertainty == theirs.uncertainty else ()
+    taken = replace(
+        mine, anchors=theirs.anchors, members=members, channels=theirs.channels,
+        frequencies=theirs.frequencies, seed=theirs.seed,
+    )  # fmt: skip
+    return replace(problem, sections=taken, start=known.start)
+
+
+def designed(task: tuple[CoDesignProblem, Knobs]) -> Designed:
+    """The best certified controller at θ from the problem's anchors; a race where it has none."""
+    problem, knobs = task
+    if not sections_of_problem(problem).anchors:
+        problem = prepared(replace(problem, start=knobs.theta))[0]
+    problem = with_range(problem)
+    designs = problem_hash(problem.identity())
+    inner = problem_hash({"problem": designs, "inner": problem.inner_identity()})
+    own = sample_key(inner, knobs.theta, 0.0, 0.0)
+    rows, (_, theta, payload) = sections_unit(problem, own, knobs.theta)
+    kappa = np.array(payload["kappa"]) if payload["kappa"] else None
+    return Designed(
+        problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, theta, payload)
+    )
+
+
+def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) -> Look:
+    """A known controller at θ, judged on the model and the corners of its plant set."""
+    began = perf_counter()
+    controller = controller_of(structure_of(problem), kappa)
+    found = judged_corners(problem, knobs.theta, controller)
+    elements = elements_at(problem, knobs.theta)
+    cost, broken = hardware_at(problem, knobs.theta)
+    standing, reason = _standing(found)
+    if standing is Standing.KEPT and broken:
+        standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"
+    return Look(
+        knobs=knobs,
+        problem=problem,
+        elements=elements,
+        modal=modal_plant(elements.system, problem.suspension),
+        plant=scaled_system(problem, elements.system),
+        weights=problem.weights,
+        figures=_figures(found),
+        controller=controller,
+        how=how,
+        standing=standing,
+        reason=reason,
+        cost=cost,
+        active=(),
+        seconds=perf_counter() - began,
+        kappa=kappa,
+    )
+
+
+def empty_look(problem: CoDesignProblem, knobs: Knobs, elements: Elements, words: str) -> Look:
+    """A place without a controller yet."""
+    nan = float("nan")
+    cost, _ = hardware_at(problem, knobs.theta)
+    return Look(
+        knobs=knobs,
+        problem=problem,
+        elements=elements,
+        modal=modal_plant(elements.system, problem.suspension),
+        plant=scaled_system(problem, elements.system),
+        weights=problem.weights,
+        figures=DesignFigures(
+            0.0, 0.0, Outcome.NOT_FINITE, nan, nan, nan, False, nan, nan, nan, nan,
+            Certificate(False, nan, nan, nan, False),
+        ),
+        controller=None,
+        how=How.SECTIONS,
+        standing=Standing.REFUSED,
+        reason=words,
+        cost=cost,
+        active=(),
+        seconds=0.0,
+    )  # fmt: skip
+
+
+def _standing(found: SetCertificate) -> tuple[Standing, str]:
+    if found.passed:
+        return Standing.KEPT, ""
+    stable = all(plant.stable for plant in found.plants)
+    return Standing.MISSED if stable and found.bandwidth > 0.0 else Standing.REFUSED, found.words
+
+
+def _figures(found: SetCertificate) -> DesignFigures:
+    """The worst of the set; ω_S and ω_T are 0, and the norm is the largest share of a bound."""
+    stable = all(plant.stable for plant in found.plants)
+    nan = float("nan")
+    highest = max(found.plants, key=lambda plant: float(np.nan_to_num(plant.S_peak, nan=np.inf)))
+    worst = max(found.worst.values(), default=nan)
+    pole = max(plant.stability for plant in found.plants)
+    return DesignFigures(
+        omega_S=0.0,
+        omega_T=0.0,
+        outcome=Outcome.CERTIFIED if found.passed else Outcome.NOT_ROBUST,
+        gamma_opt=nan,
+        gamma_lower_bound=nan,
+        gamma=worst,
+        limited_by_bound=False,
+        bandwidth=found.bandwidth,
+        sensitivity_peak=highest.S_peak,
+        sensitivity_peak_frequency=highest.S_peak_frequency,
+        sensitivity_low=max(plant.S_low for plant in found.plants),
+        certificate=Certificate(stable, pole, worst, 1.0, found.passed),
+    )

@@ -1,0 +1,85 @@
+"""The page on the loopback address: one port, a token in the path, nothing from outside."""
+
+import secrets
+import webbrowser
+from pathlib import Path
+
+from bokeh.document import Document
+from bokeh.events import ClientReconnected, ConnectionLost
+from bokeh.models import CustomJS
+from bokeh.server.server import Server
+from jinja2 import Template
+
+from ccd_casadi.explorer.background import Background
+from ccd_casadi.explorer.page import Page
+from ccd_casadi.explorer.session import Session
+
+HOST = "127.0.0.1"
+TEMPLATE = Path(__file__).with_name("page.html")
+
+
+class Explorer:
+    """Serves a session until `stop`; `url` has the token, without which every path is refused."""
+
+    def __init__(
+        self, session: Session, *, workers: int, user_code: bool = True, port: int = 0
+    ) -> None:
+        self.session = session
+        self.background = Background(workers, user_code)
+        self._pages: list[Page] = []
+        self._workers = workers
+        token = secrets.token_urlsafe(16)
+        self._server = Server(
+            {"/": self._document},
+            prefix=token,  # of every path, the socket's and the scripts' too
+            address=HOST,
+            port=port,
+            allow_websocket_origin=[f"{HOST}:{port}"] if port else None,
+            use_index=False,
+            num_procs=1,
+        )
+        self.url = f"http://{HOST}:{self._server.port}/{token}/"
+        self._server._tornado._websocket_origins.add(f"{HOST}:{self._server.port}")
+        problem = session.problems.at(session.start)
+        if session.known is not None:
+            self.background.fill(session, problem, self._surrogate_made)
+
+    def _document(self, document: Document) -> None:
+        context = document.session_context
+        arguments = getattr(getattr(context, "request", None), "arguments", {})
+        dark = arguments.get("dark", [b"0"])[0] == b"1"
+        document.title = f"Explorer: {self.session.case.path.name}"
+        document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
+        document.template_variables["case"] = str(self.session.case.path)
+        document.template_variables["folder"] = str(self.session.folder)
+        document.template_variables["dark"] = dark
+        shown = 'document.getElementById("lost").hidden = '
+        document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
+        document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
+        document.theme = "dark_minimal" if dark else "light_minimal"
+        page = Page(document, self.session, self.background, self._workers, dark)
+        self._pages.append(page)
+        document.on_session_destroyed(lambda context: self._gone(page))
+
+    def _gone(self, page: Page) -> None:
+        self._pages.remove(page)
+        page.close()
+
+    def _surrogate_made(self) -> None:
+        for page in list(self._pages):
+            page.document.add_next_tick_callback(page.improved)
+
+    def run(self, *, show: bool) -> None:
+        """Serve until Ctrl-C."""
+        self._server.start()
+        if show:
+            self._server.io_loop.add_callback(webbrowser.open, self.url)
+        self._server.io_loop.start()
+
+    def close(self) -> None:
+        """End what is under way; what was looked at is written."""
+        for page in self._pages:
+            page.close()
+        self.background.close()
+        self._server.stop()
+        self.session.store.close()

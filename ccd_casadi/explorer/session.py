@@ -1,0 +1,159 @@
+"""What the explorer knows while it runs: the case, the store of its looks, pins, files written."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.explorer.designs import Elements, How, Look, elements_at, present, searched
+from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
+from ccd_casadi.explorer.machine import lumped, stage_modes_html
+from ccd_casadi.explorer.modes import KnownModes, in_modal_form
+from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.sampling.sampler import sample_of, unit_of
+from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from surrogates.files import write_whole
+
+SLOW = 0.1  # s that the model may take at a θ before it is solved in the background
+
+
+class Session:
+    """One case, one folder; `live` answers at once, `full` takes what the inner search takes."""
+
+    def __init__(self, case: Case, folder: Path, run: FinishedRun | None = None) -> None:
+        self.case, self.folder, self.run = case, folder, run
+        self.problems = Problems(case)
+        self.start = knobs_of(case)
+        if run is not None:
+            self.start = replace(self.start, theta=run.theta)
+        self.store = SampleStore(folder / "samples.sqlite")
+        # of a fixed structure: the last controller, and the problem that it was designed for
+        self.kappa = None if run is None else run.kappa
+        self.designed_for = None if self.kappa is None or run is None else run.problem
+        problem = self.problems.at(self.start)
+        began = perf_counter()
+        first = elements_at(problem, self.start.theta)
+        self.slow = perf_counter() - began > SLOW
+        found = lumped(first.system)
+        self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
+        self.known: KnownModes | None = None
+        if self.slow:
+            key = problem_hash(problem.source.identity() | {"theta": list(problem.names)})
+            self.known = KnownModes(problem.lower, problem.upper, key)
+            self.known.exact[self.start.theta] = first.system
+            if in_modal_form(first.system):
+                self.known.load(folder, first.system)
+        inner = problem.inner
+        # until something was searched: the middle of the ranges
+        self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
+
+    def elements(self, problem: CoDesignProblem, theta: tuple[float, ...]) -> Elements:
+        """The plant's matrices at θ as fast as one drags."""
+        return elements_at(problem, theta) if self.known is None else self.known.at(theta)
+
+    def live(self, knobs: Knobs) -> Look:
+        """One certified synthesis at the weights of the last search.
+
+        Of a fixed structure: the last controller, judged at this θ.
+        """
+        problem = self.problems.at(knobs)
+        if problem.sections is not None:
+            return self._held(problem, knobs)
+        elements = self.elements(problem, knobs.theta)
+        return present(problem, knobs, elements, (self.point[0], self.point[1]))
+
+    def _held(self, problem: CoDesignProblem, knobs: Knobs) -> Look:
+        problem = anchored(problem, self.designed_for)
+        if self.kappa is None:
+            elements = elements_at(problem, knobs.theta)
+            return empty_look(problem, knobs, elements, "no controller yet: design one here")
+        return judged_look(problem, knobs, self.kappa, How.HELD)
+
+    def took_sections(self, found: Designed) -> Look | None:
+        """A design of a fixed structure ended: into the store, and the controller of looks to come.
+
+        None where no controller was found.
+        """
+        key = problem_hash(found.problem.identity())
+        self.store.put_problem(key, found.problem.identity())
+        self.store.put_unit(found.rows, found.unit, key)
+        if found.kappa is None:
+            return None
+        self.kappa, self.designed_for = found.kappa, found.problem
+        return judged_look(found.problem, found.knobs, found.kappa, How.SECTIONS)
+
+    def full(self, knobs: Knobs) -> Look:
+        """The inner problem at θ on the model itself."""
+        problem = self.problems.at(knobs)
+        look = searched(problem, knobs, elements_at(problem, knobs.theta))
+        self.took(look)
+        return look
+
+    def took(self, look: Look) -> None:
+        """A full search ended: its weights are those of the syntheses to come."""
+        self.point = (look.figures.omega_S, look.figures.omega_T)
+        if self.known is not None and look.elements.exact:
+            self.known.exact[look.theta] = look.elements.system
+
+    def keep(self, looks: Sequence[Look]) -> None:
+        """Write designs that were looked at into the store: a search with every synthesis of it.
+
+        What was made on other matrices than the model's is kept as another problem's.
+        """
+        for look in looks:
+            problem = look.problem.identity()
+            if look.how is How.SECTIONS:
+                continue  # with its unit, or there is none
+            if look.kappa is not None:
+                problem = problem | {"held": [float(v) for v in look.kappa]}
+            if not look.elements.exact:
+                problem = problem | {"elements": look.elements.words}
+            key = problem_hash(problem)
+            self.store.put_problem(key, problem)
+            if look.result is None:
+                f = look.figures
+                own = sample_key(key, look.theta, f.omega_S, f.omega_T)
+                self.store.put([sample_of(own, look.theta, f, look.seconds)], key)
+                continue
+            each = look.seconds / max(look.result.syntheses, 1)
+            rows, payload = unit_of(key, look.theta, look.result, look.problem.inner, each)
+            optimum = look.result.optimum
+            if optimum is not None and optimum.to_theta.shape[1] != len(look.theta):
+                self.store.put(rows, key)  # of matrices without derivatives: no sample of ω_b*(θ)
+                continue
+            inner = problem_hash({"problem": key, "inner": look.problem.inner_identity()})
+            unit = (sample_key(inner, look.theta, 0.0, 0.0), inner, look.theta, payload)
+            self.store.put_unit(rows, unit, key)
+
+    def save(self, knobs: Knobs) -> Path:
+        """The sliders as a case file, beside the store, under a number of its own."""
+        place = self._numbered("explored", ".toml")
+        write_whole(place, case_to_toml(case_at(self.case, knobs)))
+        return place
+
+    def folder_for_solve(self, knobs: Knobs) -> tuple[Path, Path]:
+        """A new folder for a solve from the sliders' θ, and its case file."""
+        folder = self._numbered("solved", "")
+        folder.mkdir()
+        place = folder / "from_here.toml"
+        write_whole(place, case_to_toml(case_at(self.case, knobs)))
+        return folder, place
+
+    def _numbered(self, name: str, suffix: str) -> Path:
+        number = 1
+        while (self.folder / f"{name}_{number}{suffix}").exists():
+            number += 1
+        return self.folder / f"{name}_{number}{suffix}"
+
+
+def searched_exactly(task: tuple[CoDesignProblem, Knobs]) -> tuple[Look, str]:
+    """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
+    problem, knobs = task
+    elements = elements_at(problem, knobs.theta)
+    return searched(problem, knobs, elements), stage_modes_html(problem, knobs.theta)

@@ -1,0 +1,88 @@
+"""What the explorer says of a design, as text and as HTML."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.explorer.curves import AsSampled
+from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.reporting.page import escape, number
+from ccd_casadi.support.units import HZ
+
+CLASSES = {Standing.KEPT: "kept", Standing.MISSED: "missed", Standing.REFUSED: "refused"}
+
+
+def standing_html(look: Look, sampled: AsSampled | None) -> str:
+    """The verdict, the figures, how the controller was chosen and on which plant."""
+    f, on = look.figures, look.elements
+    standing = look.standing.value + (f": {look.reason}" if look.reason else "")
+    if not on.exact and look.standing is not Standing.REFUSED:
+        standing += "; on a plant close to the model, not on the model"
+    facts = []
+    if look.standing is not Standing.REFUSED:
+        c = f.certificate
+        facts = [
+            f"ω_b = {number(look.bandwidth_hz, 5)} Hz",
+            f"‖S‖∞ = {number(f.sensitivity_peak, 5)} at "
+            f"{number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
+            f"J = {number(look.objective, 6)}",
+            f"hardware cost {number(look.cost, 6)}",
+        ]
+        if look.kappa is None:
+            facts.append(
+                f"ω_S = {number(f.omega_S / HZ, 4)} Hz, ω_T = {number(f.omega_T / HZ, 4)} Hz"
+            )
+            facts.append(f"norm {c.norm:.6g} ≤ {c.norm_bound:.6g}")
+        else:
+            facts.append(f"at most {c.norm:.5g} of a bound on the corners of the plant set")
+        if look.active:
+            facts.append(f"binding: {', '.join(look.active)}")
+    how = f"{look.how.value}; modes: {on.words}"
+    shown = f'<p class="{CLASSES[look.standing]}"><b>{escape(standing)}</b></p>'
+    shown += f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
+    if sampled is not None:
+        shown += f"<p>{escape(sampled_words(sampled, look.problem.inner.S_max))}</p>"
+    return shown
+
+
+def sampled_words(sampled: AsSampled, S_max: float) -> str:
+    """What hold and delay make of the loop; they are no part of an H∞ synthesis."""
+    if not sampled.stable:
+        return "Run at this rate and delay the loop is NOT stable (hold and delay exact)."
+    over = 100.0 * (sampled.peak / S_max - 1.0)
+    return (
+        "Run at this rate and delay (exact, dash-dotted, not designed for it): ω_b = "
+        f"{number(sampled.bandwidth_hz, 4)} Hz, ‖S‖∞ = {number(sampled.peak, 4)}, {over:+.2g} % of "
+        "S_max."
+    )
+
+
+def end_words(code: int) -> str:
+    """An exit code of `solve` in words."""
+    found = {
+        0: "done and verified",
+        3: "no feasible design",
+        4: "finished, not verified",
+        130: "stopped; what is sampled is kept",
+    }
+    return found.get(code, f"exit code {code}")
+
+
+def pin_columns(names: Sequence[str], pins: Sequence[tuple[str, Look]]) -> dict[str, list[Any]]:
+    """The table of pinned designs, a list a column."""
+    looks = [look for _, look in pins]
+    found: dict[str, list[Any]] = {"design": [name for name, _ in pins]}
+    for i, name in enumerate(names):
+        found[f"theta_{name}"] = [look.theta[i] for look in looks]
+    found["S_max"] = [look.knobs.S_max for look in looks]
+    found["bandwidth"] = [look.bandwidth_hz for look in looks]
+    found["peak"] = [look.figures.sensitivity_peak for look in looks]
+    found["cost"] = [look.cost for look in looks]
+    found["objective"] = [look.objective for look in looks]
+    found["standing"] = [look.standing.value for look in looks]
+    return {key: [_plain(v) for v in column] for key, column in found.items()}
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value

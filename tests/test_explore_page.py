@@ -1,0 +1,146 @@
+"""The explorer in a real browser: dragged, refused with a bad token, its server killed."""
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ccd_casadi import explore
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.explorer.session import Session
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support import optional_packages
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PATIENCE = 240e3  # ms: the machine may be busy
+READY = "Bokeh?.documents[0]?.get_model_by_name('answer')?.data.serial[0] > 0"
+
+
+@pytest.fixture
+def server(tmp_path):
+    """The command as a user gives it, and the address that it prints."""
+    command = [sys.executable, "-m", "ccd_casadi.explore", "runs/two_mass.toml", "--no-open"]
+    started = subprocess.Popen(
+        [*command, "--out", str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    found = re.search(r"http://127\.0\.0\.1:\d+/\S+", started.stdout.readline())
+    assert found is not None
+    yield started, found[0]
+    started.kill()
+    started.communicate()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium, where there is one."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    place = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if place is None:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is installed: the page is not driven")
+    with api.sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=place, args=["--no-sandbox"])
+        yield made
+        made.close()
+
+
+def opened(browser, url, width=1300, scheme="light"):
+    """The page, ready, and the list to which its complaints are added."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page, heard = context.new_page(), []
+    page.set_default_timeout(PATIENCE)
+    page.on("console", lambda said: heard.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    page.on("request", lambda sent: heard.append(sent.url) if "127.0.0.1" not in sent.url else None)
+    page.goto(url)
+    page.wait_for_function(READY)
+    return page, heard
+
+
+def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server, tmp_path):
+    started, url = server
+    page, heard = opened(browser, url)
+    before = page.evaluate("Bokeh.documents[0].get_model_by_name('answer').data.serial[0]")
+    handle = page.locator(".noUi-handle").first.bounding_box()
+    track = page.locator(".noUi-target").first.bounding_box()
+    page.mouse.move(handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2)
+    page.mouse.down()
+    for share in (0.7, 0.5, 0.3):
+        page.mouse.move(track["x"] + share * track["width"], handle["y"] + handle["height"] / 2)
+    page.mouse.up()
+    # let go: the answer of a full search at the slider's own value
+    page.wait_for_function(
+        """() => {
+          const model = name => Bokeh.documents[0].get_model_by_name(name)
+          const {theta, how} = model("answer").data
+          return theta[0][0] == model("theta_m1").value && how[0].startsWith("full inner search")
+        }"""
+    )
+    after, theta = page.evaluate(
+        "(d => [d.serial[0], d.theta[0]])(Bokeh.documents[0].get_model_by_name('answer').data)"
+    )
+    assert after > before
+    assert 55.0 < theta[0] < 67.0
+    page.get_by_text("certified, keeps its bounds").wait_for()
+    page.get_by_role("button", name="Save as case").click()
+    page.get_by_text("explored_1.toml").wait_for()
+    assert not heard
+    started.send_signal(signal.SIGKILL)
+    page.get_by_role("alert").wait_for(state="visible")
+    assert "does not answer" in page.get_by_role("alert").inner_text()
+    with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
+        assert tuple(theta) in {sample.theta for sample in store.select()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1300, 390])
+def test_it_fits_and_does_not_complain(browser, server, width, scheme):
+    page, heard = opened(browser, server[1], width, scheme)
+    page.wait_for_timeout(2000)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.locator("canvas").count() > 8
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
+    assert light == (scheme == "light")
+    assert not heard
+
+
+def test_without_the_token_every_path_is_refused(tmp_path):
+    client = pytest.importorskip("tornado.httpclient").AsyncHTTPClient
+    server = pytest.importorskip("ccd_casadi.explorer.server", reason="bokeh is not installed")
+    explorer = server.Explorer(Session(load_case("runs/two_mass.toml"), tmp_path), workers=1)
+    token = explorer.url.rstrip("/").rsplit("/", 1)[1]
+    root = explorer.url.split(token)[0]
+    wrong = f"{token[:-1]}{'A' if token[-1] != 'A' else 'B'}"
+    paths = ("", "ws", "autoload.js", "static/js/bokeh.min.js", f"{wrong}/", f"{wrong}/ws", "none/")
+
+    async def codes():
+        explorer._server.start()
+        found = {}
+        for path in (*paths, f"{token}/static/js/bokeh.min.js"):
+            answer = await client().fetch(root + path, raise_error=False, follow_redirects=False)
+            found[path] = answer.code
+            assert token not in str(answer.headers)
+        return found
+
+    found = explorer._server.io_loop.run_sync(codes)
+    explorer.close()
+    assert found.pop(f"{token}/static/js/bokeh.min.js") == 200  # the page's own scripts, from here
+    assert set(found.values()) <= {403, 404}
+    assert root.startswith("http://127.0.0.1:")
+
+
+def test_a_package_that_is_missing_is_asked_for_before_anything_is_done(
+    monkeypatch, capsys, tmp_path
+):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(optional_packages, "import_module", missing)
+    assert explore.main(["runs/two_mass.toml", "--out", str(tmp_path / "none"), "--no-open"]) == 2
+    assert "pip install 'ccd-casadi[explore]'" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
