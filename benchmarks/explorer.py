@@ -9,6 +9,7 @@ to it. Needs `playwright` and a Chromium; the machine should have nothing else t
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import psutil
 from playwright.sync_api import sync_playwright
 
 WATCH = """([name, scale, figures]) => {
@@ -74,7 +76,7 @@ def main() -> None:
         assert server.stdout is not None
         found = re.search(r"http://\S+", server.stdout.readline())
         assert found is not None, "the explorer printed no address"
-        latencies, answers = drag(found[0], given)
+        latencies, answers, spent = drag(found[0], given)
     finally:
         server.terminate()
         server.wait()
@@ -82,19 +84,20 @@ def main() -> None:
     print(json.dumps({
         "moves": given.moves, "answers": answers, "timed": len(ms),
         "median_ms": float(np.median(ms)), "p90_ms": float(np.quantile(ms, 0.9)),
-        "largest_ms": float(ms.max()),
+        "largest_ms": float(ms.max()), "cpu_ms_per_answer": 1e3 * spent / max(answers, 1),
+        "load": os.getloadavg()[0],
     }))  # fmt: skip
 
 
-def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int]:
-    """Latencies in ms, and how many answers came."""
+def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int, float]:
+    """Latencies in ms, how many answers came, and the processor time that all took."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=given.chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1300, "height": 1000})
+        page.set_default_timeout(400e3)
         page.goto(url)
         page.wait_for_function(
             "window.Bokeh?.documents[0]?.get_model_by_name('verdict')?.text?.length > 10",
-            timeout=120e3,
         )
         page.wait_for_timeout(2000.0 + 1e3 * given.wait)
         scale = page.evaluate(
@@ -102,6 +105,7 @@ def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int]:
             " return s.title.includes('(mm)') ? 1e3 : 1 }", given.parameter,
         )  # fmt: skip
         page.evaluate(WATCH, [given.parameter, scale, FIGURES])
+        before = cpu_seconds()
         place = page.evaluate(
             """name => {
               const model = Bokeh.documents[0].get_model_by_name(`theta_${name}`)
@@ -124,8 +128,15 @@ def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int]:
         page.mouse.up()
         page.wait_for_timeout(2000)
         found = page.evaluate("[window.latencies, window.answers]")
+        spent = cpu_seconds() - before
         browser.close()
-    return found[0], found[1]
+    return found[0], found[1], spent
+
+
+def cpu_seconds() -> float:
+    """Processor time of server and browser so far, which depends less on a machine's other work."""
+    times = [each.cpu_times() for each in psutil.Process().children(recursive=True)]
+    return sum(each.user + each.system for each in times)
 
 
 if __name__ == "__main__":

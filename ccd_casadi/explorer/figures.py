@@ -158,6 +158,7 @@ class Figures:
             )  # fmt: skip
             tips = [(words, "@hz{0.000} Hz, ζ = @damping{0.0000}")]
             made.add_tools(HoverTool(renderers=[found], tooltips=tips))
+        made.add_layout(made.legend[0], "above")  # it would lie over poles
         made.legend.orientation = "horizontal"
         made.legend.label_text_font_size = "11px"
         made.legend.background_fill_alpha = 0.4

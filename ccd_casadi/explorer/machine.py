@@ -184,5 +184,5 @@ def stage_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
         surface = surface_of(stage, here, shape)
         words = f"{number(shape.frequency, 4)} Hz"
         drawn = still(surface, Picture(shape.displacement[surface.source], words))
-        parts.append(f'<div style="flex:1 1 150px">{words}{drawn}</div>')
+        parts.append(f'<div style="flex:1 1 85px">{words}{drawn}</div>')
     return f'<div style="display:flex;flex-wrap:wrap">{"".join(parts)}</div>'

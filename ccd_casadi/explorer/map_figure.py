@@ -10,7 +10,8 @@ from bokeh.models.widgets.inputs import Select
 from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
-from ccd_casadi.explorer.controls import DARK
+from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.explorer.controls import DARK, shown_unit
 from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import GREY, ORANGE
@@ -22,8 +23,11 @@ MARGIN = 0.03  # of the box
 class MapFigure:
     """Two choices of a parameter, the map over them, what it shows; `asked` when one is chosen."""
 
-    def __init__(self, names: Sequence[str], asked: Callable[[], None], dark: bool = False) -> None:
-        self.names: list[Any] = list(names)
+    def __init__(
+        self, parameters: Sequence[Parameter], asked: Callable[[], None], dark: bool
+    ) -> None:
+        self.names: list[Any] = [parameter.name for parameter in parameters]
+        self._units = [shown_unit(parameter.unit) for parameter in parameters]
         self._selects = [
             Select(name=f"axis_{i}", title=title, options=self.names, width=120,
                    stylesheets=[DARK] if dark else [],
@@ -63,8 +67,12 @@ class MapFigure:
 
     def mark(self, theta: Sequence[float]) -> None:
         """The present design."""
+        (i, j), (k, m) = self.axes, self._scales()
+        self._here.data = {"x": [k * theta[i]], "y": [m * theta[j]]}
+
+    def _scales(self) -> tuple[float, float]:
         i, j = self.axes
-        self._here.data = {"x": [theta[i]], "y": [theta[j]]}
+        return self._units[i][0], self._units[j][0]
 
     def show(self, found: Field) -> None:
         """The landscape over the parameters chosen."""
@@ -72,16 +80,18 @@ class MapFigure:
         known = known[np.isfinite(known)]
         if known.size:
             self._colours.low, self._colours.high = float(known.min()), float(known.max()) + 1e-9
-        (x0, x1), (y0, y1) = found.x, found.y
+        k, m = self._scales()
+        x0, x1, y0, y1 = k * found.x[0], k * found.x[1], m * found.y[0], m * found.y[1]
         image: dict[str, list[Any]] = {name: [] for name in self._image.data}
         if found.field.size:
             places = ([found.field], [x0], [y0], [x1 - x0], [y1 - y0])
             image = dict(zip(("image", "x", "y", "dw", "dh"), places, strict=True))
         self._image.data = image
-        self._dots.data = dict(zip(("x", "y", "hz"), found.samples.T, strict=True))
-        for axis, (low, high) in ((self._x, found.x), (self._y, found.y)):
+        x, y, hz = found.samples.T
+        self._dots.data = {"x": k * x, "y": m * y, "hz": hz}
+        for axis, low, high in ((self._x, x0, x1), (self._y, y0, y1)):
             margin = MARGIN * (high - low)
             axis.update(start=low - margin, end=high + margin)
-        labels = (select.value for select in self._selects)
+        labels = [f"{self.names[i]} ({self._units[i][1]})".replace(" ()", "") for i in self.axes]
         self._figure.xaxis.axis_label, self._figure.yaxis.axis_label = labels
         self._words.text = f"<p>{escape(found.words)}</p>"

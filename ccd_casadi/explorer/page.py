@@ -27,7 +27,7 @@ from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
 
 TOGETHER = 4  # ms: drags that come within it are answered at once
-WIDE = ".bk-clearfix { display: block; }"  # a picture takes the width that there is
+WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
 LINES = 12  # of a solve's output
 
 
@@ -39,11 +39,11 @@ class Page:
     ) -> None:
         self.document, self.session, self.background = document, session, background
         self.workers = workers
-        names = [parameter.name for parameter in session.case.theta]
+        parameters = session.case.theta
         self.figures = Figures(dark)
         self.controls = Controls(session.case, session.start, self.moved, dark)
-        self.pins = Pins(names, self.figures)
-        self.map = MapFigure(names, self.draw_map, dark)
+        self.pins = Pins(parameters, self.figures)
+        self.map = MapFigure(parameters, self.draw_map, dark)
         run = session.run
         self._surrogate = () if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go = True, False, False
@@ -102,7 +102,8 @@ class Page:
 
     def improved(self) -> None:
         """There is a better surrogate of the modes."""
-        self.moved(False)
+        if self.now is not None and not self.now.look.elements.exact:
+            self.moved(False)
 
     def _answer(self) -> None:
         self._scheduled, let_go, self._let_go = False, self._let_go, False
@@ -194,7 +195,8 @@ class Page:
         known = self.session.known
         assert known is not None
         self.note.text = ""
-        if known.surrogate is not None and in_modal_form(look.elements.system):
+        fresh = look.theta not in known.exact  # a sample of the surrogate's own checks nothing
+        if fresh and known.surrogate is not None and in_modal_form(look.elements.system):
             off = frequency_error(known.surrogate.at(look.theta), look.elements.system)
             words = f"the surrogate's frequencies are off by {100.0 * off:.2g} % at most here"
             self.note.text = f"<p>{words}</p>"

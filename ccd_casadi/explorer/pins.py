@@ -6,6 +6,8 @@ from typing import Any
 from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.tables import DataTable, NumberFormatter, TableColumn
 
+from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.explorer.controls import shown_unit
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.words import pin_columns
 
@@ -15,12 +17,18 @@ HEIGHT = 150
 class Pins:
     """Pinned designs by name, in the order in which they were pinned."""
 
-    def __init__(self, names: Sequence[str], figures: Figures) -> None:
-        self.names, self.figures = names, figures
+    def __init__(self, parameters: Sequence[Parameter], figures: Figures) -> None:
+        self.names, self.figures = [p.name for p in parameters], figures
+        units = [shown_unit(p.unit) for p in parameters]
+        self._scales = [scale for scale, _ in units]
         self.pinned: list[tuple[str, Drawn]] = []
         self.count = 0
-        self.source = ColumnDataSource(pin_columns(names, []))
-        heads = [("design", "design", ""), *((f"theta_{name}", name, "0.0000") for name in names),
+        self.source = ColumnDataSource(pin_columns(self.names, self._scales, []))
+        thetas = [
+            (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000")
+            for name, (_, unit) in zip(self.names, units, strict=True)
+        ]
+        heads = [("design", "design", ""), *thetas,
                  ("S_max", "S_max", "0.000"), ("bandwidth", "ω_b (Hz)", "0.0000"),
                  ("peak", "‖S‖∞", "0.0000"), ("cost", "hardware cost", "0.0000"),
                  ("objective", "J", "0.0000"), ("standing", "standing", "")]  # fmt: skip
@@ -53,7 +61,7 @@ class Pins:
     def _show(self) -> None:
         self.source.selected.indices = []
         looks = [(name, drawn.look) for name, drawn in self.pinned]
-        self.source.data = pin_columns(self.names, looks)
+        self.source.data = pin_columns(self.names, self._scales, looks)
         self.figures.pin(self.pinned)
 
 

@@ -69,12 +69,14 @@ def end_words(code: int) -> str:
     return found.get(code, f"exit code {code}")
 
 
-def pin_columns(names: Sequence[str], pins: Sequence[tuple[str, Look]]) -> dict[str, list[Any]]:
-    """The table of pinned designs, a list a column."""
+def pin_columns(
+    names: Sequence[str], scales: Sequence[float], pins: Sequence[tuple[str, Look]]
+) -> dict[str, list[Any]]:
+    """The table of pinned designs, a list a column; θ times `scales`, as the sliders show it."""
     looks = [look for _, look in pins]
     found: dict[str, list[Any]] = {"design": [name for name, _ in pins]}
     for i, name in enumerate(names):
-        found[f"theta_{name}"] = [look.theta[i] for look in looks]
+        found[f"theta_{name}"] = [scales[i] * look.theta[i] for look in looks]
     found["S_max"] = [look.knobs.S_max for look in looks]
     found["bandwidth"] = [look.bandwidth_hz for look in looks]
     found["peak"] = [look.figures.sensitivity_peak for look in looks]
