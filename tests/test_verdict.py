@@ -16,7 +16,7 @@ from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.box_look import BoxLook, _starts
 from ccd_casadi.codesign.direct import acceptable, objective
-from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import FORMULATIONS, formulation_of, solve
@@ -239,8 +239,16 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
     found = quantities.at(end)
     assert acceptable(case, end, found)
     assert kkt_certificate(case, end, found).stationarity <= SMOOTH
-    assert objective(case, end, found) < objective(case, start, quantities.at(start))
+    J = objective(case, end, found)
+    assert objective(case, start, quantities.at(start)) > J
     assert len(quantities.designs) < 40
+    # another that knows this end stops near it, and goes on past one that is worse than it is
+    again, past = TrueQuantities(case), TrueQuantities(case)
+    near = descend(case, again, start, ended=[(end, J)])
+    assert np.abs((near - end) / (upper - lower)).max() <= BASIN
+    assert len(again.designs) < len(quantities.designs)
+    through = descend(case, past, start, ended=[(end, J + 1e9)])
+    np.testing.assert_array_equal(through, end)
 
 
 @pytest.fixture(scope="module")

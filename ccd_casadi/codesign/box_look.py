@@ -10,9 +10,10 @@ maximum of S is near -3 dB),
 do not reach the J at hand. The `CHECKED` most promising of those are solved all the same, and all
 of them where one is better than the surrogates' optimism allowed. What is better than its
 neighbours, and after that the best of the rest, start local solves on the true problem
-(`kinked.descend`); the best end wins. A basin is often entered by points that are no better than
-their neighbours: with these alone one random problem of six ended above its optimum. What this
-excludes is a better optimum whose basin one of the starts lies in, and no more.
+(`kinked.descend`), none of which goes on near a stationary point that is known; the best end wins.
+A basin is often entered by points that are no better than their neighbours: with these alone one
+random problem of six ended above its optimum. What this excludes is a better optimum whose basin
+one of the starts lies in, and no more.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, objective
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import HALF_POWER
+from ccd_casadi.codesign.kkt import HALF_POWER, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -37,6 +38,7 @@ BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
+STATIONARY = 1e-4  # scaled residual of an end whose basin is not looked into again
 OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
 CHECKED = 4  # of those passed over that are solved nevertheless
 COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
@@ -92,13 +94,23 @@ def look_over_box(
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best = None, J
     starts = _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
+    ended: list[tuple[Array, float]] = []
+
+    def note(place: Array, value: float) -> None:
+        kkt = kkt_certificate(problem, place, quantities.at(place))
+        if kkt.stationarity <= STATIONARY:
+            ended.append((place, value))
+
+    if starts and np.isfinite(J):
+        note(x, J)
     for sample in starts:
         begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-        end = descend(problem, quantities, begin)
+        end = descend(problem, quantities, begin, ended=ended)
         for place in (end, begin):
             found = quantities.at(place)
             if acceptable(problem, place, found):
                 value = objective(problem, place, found)
+                note(place, value)
                 if value < best - margin:
                     best_x, best = place, value
                 break

@@ -8,6 +8,7 @@ one gradient alone stalls. A step is taken where the merit J + ρ Σ max(0, g) f
 design is certified; H is the damped BFGS matrix of the Lagrangian (Nocedal and Wright, 18.3).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -27,6 +28,7 @@ FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
 SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
 FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
+BASIN = 1e-2  # of the box: this close to an end that is known, and no lower, is its basin
 SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
 
@@ -54,10 +56,12 @@ def descend(
     steps: int = 30,
     radius: float = FIRST,
     settled: float = SETTLED,
+    ended: Sequence[tuple[Array, float]] = (),
 ) -> Array:
     """From a certified design to the nearest optimum of the true problem; the best x found.
 
-    At most `steps` designs are asked for. Returns the start where it is not certified.
+    At most `steps` designs are asked for; none more once it is in the basin of an optimum (x, J)
+    where others `ended`. Returns the start where it is not certified.
     """
     lower, upper = lifted_bounds(problem)
     width = upper - lower
@@ -76,6 +80,8 @@ def descend(
     rho = scale
     bend = SHELF
     for _ in range(steps):
+        if any(_in_basin(here, (known - lower) / width, J) for known, J in ended):
+            break
         d, mu, model = _step(here, H, radius, rho, bend)
         while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
             radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
@@ -95,6 +101,10 @@ def descend(
         if there is not None and gained > 1e-4 * model:
             here = there
     return lower + width * here.z
+
+
+def _in_basin(here: _Point, z: Array, J: float) -> bool:
+    return bool(here.J >= J and np.abs(here.z - z).max() <= BASIN)
 
 
 def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) -> _Point | None:
