@@ -107,6 +107,7 @@ def shared(lasting: Any) -> Any:
     if not lasting.whole():
         lasting.kill()
         lasting.start()
+        lasting.answers()
     return lasting
 
 

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -66,6 +67,14 @@ class Processes:
             self._start("worker", self.address, "--nthreads", "1", "--no-dashboard", nanny)
             for _ in range(2)
         ]
+
+    def answers(self) -> None:
+        """Wait until the scheduler does: on a busy machine its imports take longer than a patience."""
+        assert self.scheduler is not None
+        while self.scheduler.poll() is None:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), timeout=1.0):
+                return
+            time.sleep(0.1)
 
     def whole(self) -> bool:
         processes = [*self.started, self.scheduler]

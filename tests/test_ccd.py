@@ -77,7 +77,7 @@ def test_every_case_of_the_project_is_one_by_its_schema(path: Path) -> None:
     [
         {"inner": {"S_maxx": 2.0}},
         {"inner": {"S_max": "2"}},
-        {"objective": {"w2": 1.0}},
+        {"objective": {"w1": -1.0}},
         {"controller": {"structure": "pid"}},
         {"theta": {"m1": {"lower": 1.0}}},
         {"budget": {"force": {"level": 1.0, "unit": "lbf"}}},

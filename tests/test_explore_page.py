@@ -34,7 +34,7 @@ def server(tmp_path):
     started.communicate()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture  # of one test: while Playwright is open its event loop runs in this thread
 def browser():
     """Headless Chromium, where there is one."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

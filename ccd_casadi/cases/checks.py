@@ -53,6 +53,19 @@ def number(low: float, high: float, remedy: str, *, closed: bool = False) -> Che
     return Check(check, schema)
 
 
+def signed(remedy: str) -> Check:
+    """A number of either sign, but none that is lost beside others."""
+    finite = number(-math.inf, math.inf, remedy)
+
+    def check(value: Any) -> str | None:
+        wrong = finite(value)
+        if wrong is not None or not 0.0 < abs(value) < SMALLEST:
+            return wrong
+        return f"is {value:g}; give a size from {SMALLEST:g} to {LARGEST:g}, in another unit"
+
+    return Check(check, finite.schema)
+
+
 def count(least: int) -> Check:
     def check(value: Any) -> str | None:
         good = isinstance(value, int) and not isinstance(value, bool) and value >= least

@@ -23,6 +23,7 @@ from ccd_casadi.cases.checks import (
     interval,
     number,
     points,
+    signed,
     steps,
     table,
     tables,
@@ -66,7 +67,7 @@ class ObjectiveSection:
         says="what a unit of the hardware cost f(θ) weighs in J",
     )
     w2: float = _key(
-        number(-math.inf, math.inf, "give a negative number: J must reward bandwidth"),
+        signed("give a negative number: J must reward bandwidth"),
         says="what bandwidth is worth in J, negative, in 1/(rad/s); of an RMS error positive, 1/m",
     )
 

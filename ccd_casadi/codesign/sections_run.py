@@ -157,7 +157,7 @@ class _End:
     @property
     def gap(self) -> float:
         """By how much (relative) the race beats the design."""
-        if not np.isnan(self.best.error):
+        if self.best.error is not None:
             return self.best.error / self.raced.error - 1.0 if self.raced.certified else 0.0
         return self.raced.bandwidth / self.design.bandwidth - 1.0 if self.raced.certified else 0.0
 

@@ -188,9 +188,9 @@ def judged(
     if not figures.certified:
         return Standing.REFUSED, figures.outcome.value
     missed = [
-        f"{FIGURES[name]} {missed_by(getattr(figures, of), bound)} where {name} = {bound:g} is asked"
-        for name, (of, bound) in problem.inner.bounds.items()
-        if getattr(figures, of) > bound
+        f"{FIGURES[name]} {missed_by(getattr(figures, of), most)} where {name} = {most:g} is asked"
+        for name, (of, most) in problem.inner.bounds.items()
+        if getattr(figures, of) > most
     ]
     missed += [f"the constraint {name} on θ is not met" for name in broken]
     return (Standing.MISSED, "; ".join(missed)) if missed else (Standing.KEPT, "")

@@ -43,12 +43,12 @@ class BandwidthSample:
     violation: float
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
-    error: float = float("nan")
+    error: float | None = None
 
     @property
     def value(self) -> float:
         """What J counts: the error where the inner problem is of that, else ω_b*."""
-        return self.bandwidth if np.isnan(self.error) else self.error
+        return self.bandwidth if self.error is None else self.error
 
     @property
     def feasible(self) -> bool:
@@ -388,7 +388,7 @@ def _bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSampl
         violation=np.inf if violation is None else violation,
         syntheses=syntheses,
         kappa=tuple(kappa or ()),
-        error=nan if error is None else error,
+        error=error,
     )
 
 
