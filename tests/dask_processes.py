@@ -69,7 +69,7 @@ class Processes:
         ]
 
     def answers(self) -> None:
-        """Wait until the scheduler does: on a busy machine its imports take longer than a patience."""
+        """Wait until the scheduler does: on a busy machine its imports take long."""
         assert self.scheduler is not None
         while self.scheduler.poll() is None:
             with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), timeout=1.0):
