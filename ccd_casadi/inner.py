@@ -14,6 +14,7 @@ from surrogates.options import positive
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.inner_problem.problem import CoDesignProblem
+    from ccd_casadi.support.process_pool import Pool
     from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
@@ -42,7 +43,10 @@ def command(options: argparse.Namespace) -> ExitCode:
         "hardware_cost": cost,
     }
     if problem.sections is not None:
-        return _sections(problem, theta, head, options, began)
+        from ccd_casadi.support.process_pool import Workers
+
+        with Workers(options.workers) as workers:
+            return _sections(problem, theta, head, options, began, workers)
     rows: tuple[DesignFigures, ...] = ()
     if single[0] is not None:
         point = (HZ * single[0], HZ * single[1])
@@ -88,16 +92,23 @@ def _sections(
     head: dict[str, Any],
     options: argparse.Namespace,
     began: float,
+    workers: "Pool",
 ) -> ExitCode:
-    """A full race of a fixed structure at θ, worst plants added, and the judge over the box."""
+    """A full race of a fixed structure at θ, worst plants added, judge and proof over the box."""
     import numpy as np
 
     from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import write_json
-    from ccd_casadi.codesign.sections_result import active_of, design_dict, sections_controller
+    from ccd_casadi.codesign.sections_result import (
+        active_of,
+        design_dict,
+        proof_dict,
+        sections_controller,
+    )
     from ccd_casadi.inner_problem.sections_bandwidth import (
         judged_widely,
         prepared,
+        proof_of,
         sections_of_problem,
         too_slow,
         with_range,
@@ -108,7 +119,7 @@ def _sections(
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)
     tell = None if options.quiet else lambda words: print(words, file=sys.stderr, flush=True)
-    asked, made = prepared(asked, tell)
+    asked, made = prepared(asked, tell, workers)
     if not made.certified:
         answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
         _print(answer, (), options, began)
@@ -132,9 +143,11 @@ def _sections(
         }
     worst = worst_members(asked, theta, made)[0]
     assert made.controller is not None
-    wide, checked = judged_widely(asked, theta, made.controller, worst)
+    wide, checked = judged_widely(asked, theta, made.controller, worst, workers)
+    proof = proof_of(asked, theta, made)
+    passed = wide.passed and not proof.refuted
     answer = head | {
-        "status": "verified" if wide.passed else "not_verified",
+        "status": "verified" if passed else "not_verified",
         **design_dict(asked, made),
         "active": active_of(made),
         "feasible": True,
@@ -146,6 +159,7 @@ def _sections(
             "bandwidth_hz": wide.bandwidth / HZ,
             "worst_excess": float(np.expm1(worst.value)),
         },
+        "proof": proof_dict(proof),
         "syntheses": 1,
         **budget_entry(asked, theta, made.controller),
     }
@@ -153,7 +167,7 @@ def _sections(
         folder = run_folder(options.case, options.out)
         write_json(folder / "controller.json", sections_controller(asked, made))
     _print(answer, (), options, began)
-    return ExitCode.DONE if wide.passed else ExitCode.NOT_VERIFIED
+    return ExitCode.DONE if passed else ExitCode.NOT_VERIFIED
 
 
 def _design(

@@ -79,7 +79,7 @@ def synthesise(
     def channels(limits: Bounds, before: Sequence[SectionsDesign] = ()) -> list[SectionsDesign]:
         """A design for each channel, on its entry of every plant; one for all that are alike.
 
-        Climbs from `before`, the same with wider limits, where there are such.
+        Climbs from `before`, the same with wider limits, if it is given.
         """
         found: list[SectionsDesign] = []
         own_plants: list[list[ScaledPlant]] = []
