@@ -1,6 +1,7 @@
 """The explorer without its page: sliders as problems, certified looks, their curves, the store."""
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.explorer.background import Solve
 from ccd_casadi.explorer.curves import curves_of, sampled_of
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
@@ -16,6 +18,7 @@ from ccd_casadi.explorer.landscape import field_of
 from ccd_casadi.explorer.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
+from ccd_casadi.explorer.words import end_words
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.support.units import HZ
@@ -232,3 +235,18 @@ def test_the_surrogate_of_the_modes_is_as_good_as_it_says(tmp_path):
     other = KnownModes(lower, upper, "another plant")
     other.load(tmp_path, family(thetas[0]))
     assert not other.exact
+
+
+def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
+    said, codes, over = [], [], threading.Event()
+
+    def ended(code):
+        codes.append(code)
+        over.set()
+
+    solve = Solve(tmp_path / "none.toml", tmp_path / "out", 1, said.append, ended)
+    assert over.wait(300.0)
+    assert codes == [2]
+    assert "none.toml: there is no such file" in said[0]
+    assert "not verified" in end_words(4)
+    solve.stop()  # there is nothing left to stop

@@ -155,8 +155,9 @@ class Solve:
 
         def read() -> None:
             assert self._process.stdout is not None
-            for line in self._process.stdout:  # universal newlines: a bar's \r ends one too
-                tell(line.rstrip())
+            with self._process.stdout as lines:  # universal newlines: a bar's \r ends one too
+                for line in lines:
+                    tell(line.rstrip())
             ended(self._process.wait())
 
         self._asked = False

@@ -21,9 +21,7 @@ TEMPLATE = Path(__file__).with_name("page.html")
 class Explorer:
     """Serves a session until `stop`; `url` has the token, without which every path is refused."""
 
-    def __init__(
-        self, session: Session, *, workers: int, user_code: bool = True, port: int = 0
-    ) -> None:
+    def __init__(self, session: Session, *, workers: int, user_code: bool = True) -> None:
         self.session = session
         self.background = Background(workers, user_code)
         self._pages: list[Page] = []
@@ -33,13 +31,13 @@ class Explorer:
             {"/": self._document},
             prefix=token,  # of every path, the socket's and the scripts' too
             address=HOST,
-            port=port,
-            allow_websocket_origin=[f"{HOST}:{port}"] if port else None,
+            port=0,
             use_index=False,
             num_procs=1,
         )
         self.url = f"http://{HOST}:{self._server.port}/{token}/"
-        self._server._tornado._websocket_origins.add(f"{HOST}:{self._server.port}")
+        # known only now; Bokeh's own default is localhost by name
+        self._server._tornado._websocket_origins = {f"{HOST}:{self._server.port}"}
         problem = session.problems.at(session.start)
         if session.known is not None:
             self.background.fill(session, problem, self._surrogate_made)
