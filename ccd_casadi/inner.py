@@ -13,6 +13,7 @@ from ccd_casadi.support.units import HZ
 from surrogates.options import positive
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.cases.measured_case import MeasuredCase
     from ccd_casadi.inner_problem.problem import CoDesignProblem
     from ccd_casadi.support.process_pool import Pool
     from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -21,10 +22,18 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+    from ccd_casadi.cases.measured_case import measured_case
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.inner_problem.problem import best_choice, plant_of
     from ccd_casadi.plants.plant import hardware_cost
 
+    measured = measured_case(options.case)
+    if measured is not None:
+        return _measured(measured, options)
+    if options.theta is None:
+        raise CaseError(
+            f"{options.case}: --theta is missing; give the hardware, --theta m1=60,m2=60"
+        )
     case = load_case(options.case)
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
@@ -70,6 +79,61 @@ def command(options: argparse.Namespace) -> ExitCode:
         write_json(folder / "controller.json", controller)
     _print(answer, rows, options, began)
     return code
+
+
+def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
+    """Sections on a measured response: designed and judged on its lines."""
+    from ccd_casadi.cases.case import CaseError
+    from ccd_casadi.codesign.result import controller_dict, write_json
+    from ccd_casadi.fixed_structure.measured_design import design_on_data
+    from ccd_casadi.inner_problem.sections_words import sections_dict
+
+    given = (options.theta, options.omega_S_hz, options.omega_T_hz)
+    if any(value is not None for value in given):
+        words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
+        raise CaseError(f"{case.path}: {words}, --omega-s-hz and --omega-t-hz")
+    began, hz = perf_counter(), case.response.hz
+    tell = None if options.quiet else lambda words: print(words, file=sys.stderr, flush=True)
+    made = design_on_data(
+        case.response, case.structure, case.bounds, period=case.period,
+        unstable_poles=case.unstable_poles, poles_at_zero=case.poles_at_zero, starts=case.starts,
+        seed=options.seed, progress=tell,
+    )  # fmt: skip
+    plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
+    answer: dict[str, Any] = {"plant": plant, "theta": {}, "words": made.words, "syntheses": 1}
+    if made.controller is None or made.figures is None:
+        _print(answer | {"status": "infeasible", "reason": made.words}, (), options, began)
+        return ExitCode.INFEASIBLE
+    f = made.figures
+    parts = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
+    answer |= {
+        "status": "verified" if made.usable else "not_verified",
+        "reason": "" if made.usable else made.words,
+        "bandwidth_hz": made.bandwidth / HZ,
+        "sensitivity_peak": f.S_peak,
+        "sensitivity_peak_hz": f.S_peak_frequency / HZ,
+        "sensitivity_peak_between_lines": f.S_between,
+        "sensitivity_low": f.S_low,
+        "compliance_max": f.GS,
+        "KS_max": f.KS,
+        "certificate": {
+            "stable": f.stable,
+            "sure": f.sure,
+            "right_half_plane_poles": f.right_half_plane,
+            "passed": made.usable,
+            "figures_over_bounds": f.over(case.bounds),
+        },
+        "controller": parts,
+    }
+    if options.out is not None:
+        loop: dict[str, Any] = {} if case.period is None else {
+            "loop": {"rate_hz": 1.0 / case.period, "delay_us": 0.0, "method": "tustin"}
+        }  # fmt: skip
+        folder = run_folder(options.case, options.out)
+        controller = controller_dict(made.controller) | {"sections": parts | loop}
+        write_json(folder / "controller.json", controller)
+    _print(answer, (), options, began)
+    return ExitCode.DONE if made.usable else ExitCode.NOT_VERIFIED
 
 
 def _best_at(
@@ -241,7 +305,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser(
         "ccd_casadi.inner", "The true inner problem at one theta, as JSON on stdout."
     )
-    arguments.add_argument("--theta", required=True, metavar="m1=60,m2=60")
+    arguments.add_argument(
+        "--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"
+    )
     for name in ("S", "T"):
         arguments.add_argument(
             f"--omega-{name.lower()}-hz",

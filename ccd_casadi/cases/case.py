@@ -34,6 +34,7 @@ from ccd_casadi.cases.kinds import (
     read_options,
     require_channels,
     sections_problem,
+    weights_of,
 )
 from ccd_casadi.cases.sections import (
     SECTIONS,
@@ -53,7 +54,6 @@ from ccd_casadi.plants.rib_stage.model import OUTPUTS
 from ccd_casadi.plants.rib_stage.plant import MESHES
 from ccd_casadi.support.errors import PlantError, UserError, described, one_line
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.weights import Weights
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
@@ -100,6 +100,11 @@ def load_case(path: str | Path) -> Case:
     Parameter(name='m1', lower=55.0, upper=70.0, start=67.56, unit='kg')
     """
     path = Path(path)
+    return parse_case(read_toml(path), path)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a case file, unchecked. Raises CaseError where it is no TOML."""
 
     def fail(words: str) -> CaseError:
         return CaseError(one_line(f"{path}: {words}"))
@@ -121,14 +126,13 @@ def load_case(path: str | Path) -> Case:
         reason = getattr(error, "strerror", None) or error
         raise fail(f"cannot be read: {reason}; name a readable file") from None
     try:
-        data = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise fail(f"is not valid TOML: {error}; mend that line") from None
     except RecursionError:
         raise fail("is not valid TOML: nested too deeply; flatten its arrays") from None
     except ValueError:
         raise fail("holds an integer of thousands of digits; write it as a float") from None
-    return parse_case(data, path)
 
 
 def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
@@ -158,12 +162,12 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         required = any(item.default is MISSING for item in fields(kind))
         if required and name not in data:
             raise fail(name, f"is missing; add a table [{name}]")
-        sections[name] = _section(kind, name, data.get(name, {}), fail)
+        sections[name] = section_of(kind, name, data.get(name, {}), fail)
     controller = sections["controller"]
     if controller.channel:
         own = data["controller"]["channel"]
         channel = tuple(
-            (key, _section(ChannelSection, f"controller.channel.{key}", own[key], fail))
+            (key, section_of(ChannelSection, f"controller.channel.{key}", own[key], fail))
             for key in own
         )
         sections["controller"] = replace(controller, channel=channel)
@@ -194,9 +198,10 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     return Case(path=path, plant=plant, theta=theta, **sections)
 
 
-def _section(
+def section_of(
     kind: type, name: str, table: Mapping[str, Any], fail: Callable[[str, str], CaseError]
 ) -> Any:
+    """A table as its dataclass, every key checked."""
     allowed = {item.name: item for item in fields(kind)}
     for key in table:
         if key not in allowed:
@@ -226,6 +231,9 @@ def _plant(
     model, function = table.get("model"), table.get("function")
     if (model is None) == (function is None):
         raise fail("plant", "give either model or function, and not both")
+    if model == "measured":
+        words = "is one frequency response and has no theta: it goes with the command inner alone"
+        raise fail("plant.model", words)
     if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
         hint = _closest(str(model), _KNOWN_MODELS)
         raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
@@ -389,18 +397,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         start=tuple(p.start for p in case.theta),
         w1=case.objective.w1,
         w2=case.objective.w2,
-        weights=Weights(
-            M_S=w.M_S,
-            A_S=w.A_S,
-            omega_S=HZ * inner.omega_S_hz[0],
-            c_K=w.c_K,
-            omega_K=HZ * w.omega_K_hz,
-            M_K=w.M_K,
-            A_l=w.A_l,
-            A_u=w.A_u,
-            omega_T=HZ * inner.omega_T_hz[0],
-            disturbance=disturbance_of(case.controller, w),
-        ),
+        weights=weights_of(w, inner, disturbance_of(case.controller, w)),
         inner=InnerProblem(
             S_max=inner.S_max,
             S_low=inner.S_low,

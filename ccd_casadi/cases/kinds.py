@@ -25,6 +25,7 @@ from ccd_casadi.inner_problem.sections_problem import (
 from ccd_casadi.plants.plant import Plant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.weights import Weights
 
 SHAPE = 1.1  # of sections, where the case gives none
 DISTURBANCE = 10.0  # W_d over M_K, where the case gives none
@@ -116,6 +117,34 @@ def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> fl
     return DISTURBANCE * weights.M_K if weights.disturbance is None else weights.disturbance
 
 
+def structure_of(controller: ControllerSection) -> Structure:
+    """The sections that [controller] names."""
+    return Structure(
+        integrator=controller.integrator,
+        lead=controller.lead,
+        biquads=controller.biquads,
+        roll_off=controller.roll_off,
+        least_damping=controller.least_damping,
+    )
+
+
+def weights_of(weights: WeightsSection, inner: InnerSection, disturbance: float) -> Weights:
+    """The weights, in SI, with ω_S and ω_T at the lower ends of their ranges."""
+    w = weights
+    return Weights(
+        M_S=w.M_S,
+        A_S=w.A_S,
+        omega_S=HZ * inner.omega_S_hz[0],
+        c_K=w.c_K,
+        omega_K=HZ * w.omega_K_hz,
+        M_K=w.M_K,
+        A_l=w.A_l,
+        A_u=w.A_u,
+        omega_T=HZ * inner.omega_T_hz[0],
+        disturbance=disturbance,
+    )
+
+
 def read_options(path: Path) -> dict[str, Any]:
     """An option set of the plant: a TOML file of plain keys. Raises ValueError with a remedy."""
     try:
@@ -173,13 +202,7 @@ def sections_problem(
     if controller.structure != "sections":
         return None
     return SectionsProblem(
-        structure=Structure(
-            integrator=controller.integrator,
-            lead=controller.lead,
-            biquads=controller.biquads,
-            roll_off=controller.roll_off,
-            least_damping=controller.least_damping,
-        ),
+        structure=structure_of(controller),
         shape=SHAPE if inner.shape is None else inner.shape,
         weighted_level=controller.weighted_level,
         compliance_max=inner.compliance_max,

@@ -29,7 +29,7 @@ from scipy.io import loadmat
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ
 
 HALF_POWER = 2.0**-0.5
@@ -94,9 +94,9 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     G is displacement over force, m/N. Raises UserError with what is missing.
     """
     path = Path(path)
+    if path.suffix.lower() == ".mat":
+        return _of_columns(_mat(path), path)
     try:
-        if path.suffix.lower() == ".mat":
-            return _of_columns(_mat(path), path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
         names = [name.strip().lower() for name in rows[0]]
@@ -119,10 +119,19 @@ def from_control(system: Any) -> MeasuredResponse:
 
 
 def _mat(path: Path) -> dict[str, np.ndarray]:
+    try:
+        variables = loadmat(path)
+    except OSError as error:
+        words = f"cannot be read as a frequency response: {error.strerror or error}"
+        raise UserError(f"{path}: {words}") from None
+    except Exception as error:  # whatever its reader stumbles over in a damaged or newer file
+        words = f"is no .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
+        raise UserError(f"{path}: {words}") from None
     found = {}
-    for name, value in loadmat(path).items():
-        if not name.startswith("__"):
-            found[COLUMNS.get(name.lower(), name)] = np.asarray(value).ravel()
+    for name, value in variables.items():
+        numbers = np.asarray(value).ravel()
+        if not name.startswith("__") and numbers.dtype.kind in "iufc":
+            found[COLUMNS.get(name.lower(), name)] = numbers
     return found
 
 

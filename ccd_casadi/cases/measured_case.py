@@ -1,0 +1,143 @@
+"""A case whose plant is a measured frequency response: a controller of fixed structure, no θ.
+
+[plant]
+model = "measured"
+file = "stage.csv"            # or .mat: displacement over force, m/N, see `read_frequency_response`
+unstable_poles = 0            # of the plant; default 0
+poles_at_zero = 2             # default: by the slope of its first lines
+
+with [inner], [controller] structure = "sections", [weights] where weighted_level is given, and
+[loop] rate_hz: then the response was measured as the controller sees it, hold and delay in it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.case import CaseError, read_toml, section_of
+from ccd_casadi.cases.checks import count, shown, text
+from ccd_casadi.cases.kinds import check_kind, structure_of, weights_of
+from ccd_casadi.cases.sections import (
+    SECTIONS,
+    BudgetSection,
+    InnerSection,
+    ObjectiveSection,
+    RobustSection,
+)
+from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
+from ccd_casadi.support.errors import UserError, one_line
+from ccd_casadi.support.units import HZ
+
+MODEL = "measured"
+_TABLES = ("weights", "inner", "controller", "loop")
+_PLANT = {"file": text, "unstable_poles": count(0), "poles_at_zero": count(0)}
+
+
+@dataclass(frozen=True)
+class MeasuredCase:
+    """The checked case; `period` in s, None for a continuous controller."""
+
+    path: Path
+    file: str
+    response: MeasuredResponse
+    structure: Structure
+    bounds: Bounds
+    period: float | None
+    unstable_poles: int
+    poles_at_zero: int | None
+    starts: int
+
+
+def measured_case(path: Path) -> MeasuredCase | None:
+    """The case of a measured plant; None for any other. Raises CaseError on the first mistake."""
+    data = read_toml(path)
+    plant = data.get("plant")
+    if not isinstance(plant, Mapping) or plant.get("model") != MODEL:
+        return None
+
+    def fail(key: str, words: str) -> CaseError:
+        return CaseError(one_line(f"{path}: {key}: {words}"))
+
+    for name, table in data.items():
+        if name not in ("plant", *_TABLES):
+            raise fail(
+                name, f'has no effect on plant.model = "{MODEL}", which has no theta; drop it'
+            )
+        if not isinstance(table, Mapping):
+            raise fail(name, f"is {shown(table)}; write a table [{name}]")
+    response = _response(plant, path, fail)
+    if "inner" not in data:
+        raise fail("inner", "is missing; add a table [inner]")
+    sections = {
+        name: section_of(SECTIONS[name], name, data.get(name, {}), fail)
+        for name in _TABLES
+        if name != "weights" or name in data
+    }
+    _check(sections, fail)
+    inner, controller, loop = (sections[name] for name in ("inner", "controller", "loop"))
+    weights = None
+    if controller.weighted_level is not None:
+        weights = weights_of(sections["weights"], inner, 0.0)
+    return MeasuredCase(
+        path=path,
+        file=str(plant["file"]),
+        response=response,
+        structure=structure_of(controller),
+        bounds=_bounds(inner, controller.weighted_level, weights),
+        period=None if loop.rate_hz is None else 1.0 / loop.rate_hz,
+        unstable_poles=int(plant.get("unstable_poles", 0)),
+        poles_at_zero=plant.get("poles_at_zero"),
+        starts=controller.starts,
+    )
+
+
+def _response(
+    plant: Mapping[str, Any], path: Path, fail: Callable[[str, str], CaseError]
+) -> MeasuredResponse:
+    for key, value in plant.items():
+        if key != "model" and key not in _PLANT:
+            raise fail(f"plant.{key}", f"is no option of {MODEL}; known are {', '.join(_PLANT)}")
+        wrong = None if key == "model" else _PLANT[key](value)
+        if wrong is not None:
+            raise fail(f"plant.{key}", wrong)
+    if "file" not in plant:
+        raise fail("plant.file", f"is missing; add it, which {MODEL} needs")
+    try:
+        return read_frequency_response(path.parent / plant["file"])
+    except UserError as error:
+        raise fail("plant.file", str(error)) from error
+
+
+def _check(sections: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:
+    inner, controller, loop = (sections[name] for name in ("inner", "controller", "loop"))
+    if controller.structure != "sections":
+        words = 'needs structure = "sections": a synthesis of full order has no model to start from'
+        raise fail("controller.structure", words)
+    if controller.channel:
+        raise fail("controller.channel", "a measured response is of one channel; drop it")
+    if controller.weighted_level is not None and "weights" not in sections:
+        raise fail("weights", "is missing, and controller.weighted_level is of them; add a table")
+    if inner.minimise != "bandwidth":
+        raise fail("inner.minimise", "needs a model, a measured response is none; drop it")
+    if loop.delay_us:
+        words = "is in a response that was measured as the controller sees it; drop it"
+        raise fail("loop.delay_us", words)
+    others = {"objective": ObjectiveSection(0.0, -1.0), "robust": RobustSection(),
+              "budget": BudgetSection()}  # fmt: skip
+    if "weights" in sections:
+        check_kind({**sections, **others}, fail)
+
+
+def _bounds(inner: InnerSection, level: float | None, weights: Any) -> Bounds:
+    shape = 1.1 if inner.shape is None else inner.shape
+    return Bounds(
+        S_max=inner.S_max,
+        S_low=inner.S_low,
+        omega_low=HZ * inner.omega_low_hz,
+        shape=shape,
+        weighted_level=level,
+        weights=weights,
+        compliance_max=inner.compliance_max,
+    )

@@ -1,0 +1,136 @@
+"""A measured frequency response as the plant of a case: designed with, and refused in words."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixed_structure_loops import FAST
+from scipy.io import savemat
+from test_measured import measured
+
+from ccd_casadi.cases.case import CaseError
+from ccd_casadi.cases.measured_case import measured_case
+from ccd_casadi.fixed_structure.measured import judge
+from ccd_casadi.inner import main as inner
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.solve import main as solve
+from ccd_casadi.support.units import HZ
+
+CASE = """
+[plant]
+model = "measured"
+file = "stage.csv"
+[inner]
+S_max = 2.0
+S_low = 0.2
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1800.0]
+omega_T_hz = [25.0, 1000.0]
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 2e7
+A_l = 1.0
+A_u = 1e-2
+[controller]
+structure = "sections"
+starts = 4
+weighted_level = 8.426
+biquads = 0
+"""
+
+
+def written(folder: Path, text: str = CASE, sampled: bool = False, lines: int = 1200) -> Path:
+    found = measured(FAST if sampled else None, lines)
+    rows = np.column_stack([found.hz, found.G.real, found.G.imag])
+    np.savetxt(folder / "stage.csv", rows, delimiter=",", header="f_hz,re,im", comments="")
+    path = folder / "case.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_inner_designs_on_the_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], sampled: bool
+) -> None:
+    """What is printed is what the judge finds of the controller that is written."""
+    loop = f"[loop]\nrate_hz = {FAST.rate_hz}\n" if sampled else ""
+    path = written(tmp_path, CASE + loop, sampled)
+    code = inner([str(path), "--out", str(tmp_path / "run"), "--quiet"])
+    answer = json.loads(capsys.readouterr().out)
+    assert (code, answer["status"]) == (0, "verified")
+    assert "winding" in answer["words"]
+    assert answer["plant"]["lines"] == 1200
+    kept = json.loads((tmp_path / "run" / "controller.json").read_text())
+    K = StateSpace(*(np.array(kept[name]) for name in "ABCD"))
+    case = measured_case(path)
+    assert case is not None
+    assert (case.period is not None) == sampled
+    figures = judge(case.response, K, case.bounds, period=case.period)
+    assert figures.stable
+    assert figures.S_peak <= 2.0
+    assert figures.bandwidth == pytest.approx(HZ * answer["bandwidth_hz"], rel=1e-6)
+
+
+def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
+    path = written(tmp_path, CASE.replace("stage.csv", "stage.mat"), lines=50)
+    found = measured(None, 50)
+    savemat(tmp_path / "stage.mat", {"f_hz": found.hz, "G": found.G, "note": "by hand"})
+    case = measured_case(path)
+    assert case is not None
+    np.testing.assert_allclose(case.response.G, found.G)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("stage.csv", "none.csv", "plant.file.*No such file"),
+        ('file = "stage.csv"', "", "plant.file: is missing"),
+        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: is no option"),
+        ('file = "stage.csv"', 'file = "stage.csv"\nunstable_poles = -1', "unstable_poles"),
+        ("biquads = 0", "[theta.m]\nlower = 1.0\nupper = 2.0", "theta: has no effect"),
+        ('structure = "sections"', "", "controller.structure: needs"),
+        ("A_u = 1e-2", "", "weights.A_u: is missing"),
+        ("S_max = 2.0", "S_max = 0.5", "inner.S_max"),
+        ("biquads = 0", "biquads = 0\n[loop]\nrate_hz = 1e4\ndelay_us = 10.0", "loop.delay_us"),
+        ("[inner]", '[inner]\nminimise = "rms_error"', "inner.minimise: needs a model"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(CaseError, match=words):
+        measured_case(written(tmp_path, CASE.replace(old, new), lines=20))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.csv", b"", "no table of numbers"),
+        ("a.csv", b"f_hz,re,im\n1,2,three\n", "no table of numbers"),
+        ("a.csv", b"f_hz,re,im\n1,2\n", "no table of numbers"),
+        ("a.csv", b"time,re,im\n1,2,3\n", "no column f_hz"),
+        ("a.csv", b"f_hz,re\n1,2\n", "needs re and im"),
+        ("a.csv", b"f_hz,re,im\n" + b"1,2,3\n" * 6, "have to rise"),
+        ("a.csv", b"f_hz,re,im\n1,2,3\n", "five lines or more"),
+        ("a.csv", b"\xff\xfe\x00\x01", "no table of numbers"),
+        ("a.mat", b"no such thing", r"\.mat file"),
+        ("a.mat", b"\x89HDF\r\n\x1a\n" + bytes(600), r"\.mat file"),
+    ],
+)
+def test_bad_files_are_one_line(tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    path = written(tmp_path, CASE.replace("stage.csv", name), lines=20)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(CaseError, match=words) as caught:
+        measured_case(path)
+    assert "plant.file" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_commands_say_whose_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path, CASE + "[theta.m]\nlower = 1.0\nupper = 2.0\n", lines=20)
+    assert solve([str(path)]) == 2
+    path = written(tmp_path, lines=20)
+    assert inner([str(path), "--theta", "m=1"]) == 2
+    assert "has no theta" in capsys.readouterr().err
