@@ -121,7 +121,7 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
             "sure": f.sure,
             "right_half_plane_poles": f.right_half_plane,
             "passed": made.usable,
-            "figures_over_bounds": f.over(case.bounds),
+            "figures_over_bounds": case.bounds.shares(f),
         },
         "controller": parts,
     }
