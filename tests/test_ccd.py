@@ -94,6 +94,14 @@ def test_what_the_schema_refuses_the_checks_refuse(change: dict[str, dict[str, o
         parse_case(changed, ROOT / "runs/two_mass.toml")
 
 
+def test_a_measured_plant_needs_no_theta() -> None:
+    data = tomllib.loads((ROOT / "runs/two_mass.toml").read_text())
+    measured = {"plant": {"model": "measured", "file": "stage.csv"}, "inner": data["inner"]}
+    jsonschema.validate(measured, case_schema())
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(measured | {"plant": {"model": "two_mass"}}, case_schema())
+
+
 def test_the_page_of_all_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["keys"]) == 0
     page = capsys.readouterr().out

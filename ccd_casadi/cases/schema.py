@@ -9,6 +9,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
+from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.sections import SECTIONS, ChannelSection
 from ccd_casadi.plants.registry import BUILDERS, MODELS
 
@@ -21,7 +22,7 @@ _THETA = {
     "unit": ("string", "for tables and pages; what the plant function takes"),
 }
 _PLANT = {
-    "model": "a model of the package; or give function",
+    "model": 'a model of the package, or "measured": a frequency response; or give function',
     "function": '"my_plant.py:model", relative to the case file: a Python function of θ',
 }
 
@@ -33,7 +34,7 @@ def case_schema() -> dict[str, Any]:
             "type": "object",
             "description": "The plant; every other key goes to the model or function.",
             "properties": {
-                "model": {"enum": sorted({**MODELS, **BUILDERS}), "description": _PLANT["model"]},
+                "model": {"enum": sorted({**MODELS, **BUILDERS, MEASURED: None}), "description": _PLANT["model"]},
                 "function": {
                     "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],
                 },
@@ -68,12 +69,15 @@ def case_schema() -> dict[str, Any]:
         entry = tables["budget"]["properties"][kind.value]
         entry["anyOf"] = [spectrum, {"type": "array", "items": spectrum}]
     required = [name for name, kind in SECTIONS.items() if any(_required(f) for f in fields(kind))]
+    of_data = {"plant": {"properties": {"model": {"const": MEASURED}}, "required": ["model"]}}
     return {
         "$schema": DRAFT,
         "title": "A case of ccd-casadi",
         "type": "object",
         "properties": tables,
-        "required": ["plant", "theta", *required],
+        "required": ["plant", "inner"],
+        "if": {"properties": of_data},
+        "else": {"required": ["theta", *required]},  # what was measured has no θ to choose
         "additionalProperties": False,
     }
 
