@@ -34,7 +34,9 @@ def case_schema() -> dict[str, Any]:
             "type": "object",
             "description": "The plant; every other key goes to the model or function.",
             "properties": {
-                "model": {"enum": sorted({**MODELS, **BUILDERS, MEASURED: None}), "description": _PLANT["model"]},
+                "model": {
+                    "enum": sorted({*MODELS, *BUILDERS, MEASURED}), "description": _PLANT["model"],
+                },
                 "function": {
                     "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],
                 },
