@@ -7,6 +7,7 @@ ends with ω_b on every plant and writes the controllers (see `README.md`).
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,32 +38,43 @@ STRUCTURE = ChannelStructure(
         Structure(integrator=False, lead=1, biquads=3, roll_off=1, least_damping=0.05),
     ),
 )
-# What the benchmark's own controllers reach: the peak of |S|, and |S| at 100 Hz.
-BOUNDS = Bounds(S_max=2.087, S_low=0.00314, omega_low=100.0 * HZ, shape=1.1)
-FREQUENCIES = (300.0 * HZ, 2.0 * drive.RATE_HZ)  # of K's roots
+# What the benchmark's own controllers reach: the peak of |S|, and |S| at 300 Hz. Roots of K from 500 Hz on
+# leave none to gain at 300 Hz alone; below it S falls with the third power of frequency.
+BOUNDS = Bounds(S_max=2.087, S_low=0.0345, omega_low=300.0 * HZ, shape=1.1)
+FREQUENCIES = (500.0 * HZ, 2.0 * drive.RATE_HZ)
 SOFT_HZ = 1.0
 GAIN = 0.01  # M_K: with it ω₀ is 9 kHz, where the bandwidth is looked for
 
 
-def scaled(temperatures: tuple[float, ...]) -> list[ScaledPlant]:
-    """The plants at these temperatures as the synthesis takes them."""
-    return [scale_state_space(one, GAIN) for one in drive.plants(temperatures, SOFT_HZ)]
+def scaled(temperatures: Sequence[float], gains: Sequence[float]) -> list[ScaledPlant]:
+    """The plants at these temperatures and gains as the synthesis takes them."""
+    found = drive.plants(temperatures, gains, SOFT_HZ)
+    return [scale_state_space(one, GAIN) for one in found]
 
 
 def design(
-    temperatures: tuple[float, ...] = (-1.0, 0.0, 1.0),
-    *,
     structure: ChannelStructure = STRUCTURE,
+    *,
     starts: int = 8,
-    seed: int = 1,
+    seed: int = 2,
     workers: int = 1,
-    initial: list[np.ndarray] | None = None,
     progress: Progress | None = None,
 ) -> SectionsDesign:
-    """The largest bandwidth on the plants at these temperatures; `initial` κ alone, if there are any."""
+    """The largest bandwidth on 17 temperatures with each of the PZT's gains.
+
+    First a race on nine temperatures at its nominal gain, then from its end on all. The benchmark's three
+    temperatures alone are not enough: a controller for these was unstable between them.
+    """
+    first = synthesise(
+        scaled(np.linspace(-1.0, 1.0, 9).tolist(), [1.0]), structure, BOUNDS, sampling=SAMPLING,
+        starts=starts, seed=seed, frequencies=FREQUENCIES, workers=Workers(workers),
+        progress=progress,
+    )  # fmt: skip
+    if not first.certified:
+        return first
     return synthesise(
-        scaled(temperatures), structure, BOUNDS, sampling=SAMPLING, starts=starts, seed=seed,
-        initial=initial or [], only_initial=bool(initial), frequencies=FREQUENCIES,
+        scaled(np.linspace(-1.0, 1.0, 17).tolist(), drive.PZT_GAINS), structure, BOUNDS,
+        sampling=SAMPLING, initial=[first.kappa], only_initial=True, frequencies=FREQUENCIES,
         workers=Workers(workers), progress=progress,
     )  # fmt: skip
 
@@ -79,7 +91,7 @@ def written(made: SectionsDesign) -> dict[str, dict[str, float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("disk_drive_controller.json"))
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=2)
     parser.add_argument("--starts", type=int, default=8)
     parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()

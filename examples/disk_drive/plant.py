@@ -30,7 +30,6 @@ PZT = {
 }
 TEMPERATURES = {"cold": -1.0, "room": 0.0, "hot": 1.0}
 PZT_GAINS = (1.0, 1.05, 0.95)
-NAMES = tuple(f"{name}, PZT x {gain:g}" for gain in PZT_GAINS for name in TEMPERATURES)
 
 
 def factors(temperature: float) -> tuple[float, float, float]:
@@ -38,14 +37,18 @@ def factors(temperature: float) -> tuple[float, float, float]:
     return 1.0 - 0.04 * temperature, 1.0 - 0.06 * temperature, 1.0 + 0.2 * temperature
 
 
-def plants(temperatures: Sequence[float] = (-1.0, 0.0, 1.0), soft_hz: float = 0.0) -> list[StateSpace]:
+def plants(
+    temperatures: Sequence[float] = tuple(TEMPERATURES.values()),
+    gains: Sequence[float] = PZT_GAINS,
+    soft_hz: float = 0.0,
+) -> list[StateSpace]:
     """Plants in SI (state space, two inputs): at these temperatures, with each of the PZT's gains.
 
     By default the nine of the benchmark in the order of its cases. `soft_hz` > 0 holds the arm by a
-    spring with damping ratio 0.7 at this frequency in place of the double integrator, since the synthesis
-    takes stable plants: at 100 `soft_hz` the two differ by 1.4 %, at 1000 `soft_hz` by 0.14 %.
+    spring with damping ratio 0.7 at this frequency in place of the double integrator, since the
+    synthesis takes stable plants: at 100 `soft_hz` the two differ by 1.4 %, at 1000 by 0.14 %.
     """
-    return [_plant(factors(t), gain, soft_hz) for gain in PZT_GAINS for t in temperatures]
+    return [_plant(factors(t), gain, soft_hz) for gain in gains for t in temperatures]
 
 
 def _plant(scales: tuple[float, float, float], pzt_gain: float, soft_hz: float) -> StateSpace:
