@@ -3,12 +3,12 @@
     python benchmarks/disk_drive.py [--design] [--seed N] [--workers N] [--theirs DIR] [--write]
 
 judges the controllers kept in benchmarks/disk_drive.json, or with `--design` those that
-`examples/disk_drive/design.py` finds (minutes), on the nine plants and on 123 between their temperatures,
-with code of its own (SciPy alone: sections by the bilinear rule, every mode's exact zero-order hold,
-eigenvalues of the whole loop, |S| at the sampling instants on a dense grid). `--theirs` is a checkout of
-github.com/liuzd1997/PyHDDBenchmark: its controllers are read from `utils.py` there and judged alike, with
-their filters at twice the rate; otherwise their figures are those kept. `--write` keeps the results, and the
-picture docs/disk_drive.png.
+`examples/disk_drive/design.py` finds (minutes), on the nine plants and on 63 over the range of
+temperatures, with code of its own (SciPy alone: sections by the bilinear rule, every mode's exact
+zero-order hold, eigenvalues of the whole loop, |S| at the sampling instants on a dense grid).
+`--theirs` is a checkout of github.com/liuzd1997/PyHDDBenchmark: its controllers are read from
+`utils.py` there and judged alike, with their filters at twice the rate; otherwise their figures are
+those kept. `--write` keeps the results, and the picture docs/disk_drive.png.
 """
 
 import argparse
@@ -31,7 +31,7 @@ RESULTS = Path(__file__).with_suffix(".json")
 PICTURE = ROOT / "docs" / "disk_drive.png"
 OURS, THEIRS = "sections", "PyHDDBenchmark"
 NINE = [(t, g) for g in drive.PZT_GAINS for t in drive.TEMPERATURES.values()]
-BETWEEN = [(t, g) for g in drive.PZT_GAINS for t in np.linspace(-1.0, 1.0, 41).tolist()]
+BETWEEN = [(t, g) for g in drive.PZT_GAINS for t in np.linspace(-1.0, 1.0, 21).tolist()]
 T = 1.0 / drive.RATE_HZ
 FLANKS = np.array([-3, -1, -0.4, 0, 0.4, 1, 3])
 System = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -53,10 +53,8 @@ def modes(temperature: float, pzt_gain: float) -> list[np.ndarray]:
     for which, on_hz in ((drive.VCM, on_vcm), (drive.PZT, on_pzt)):
         omega = 2.0 * np.pi * on_hz * np.array(which["hz"], float)
         kappa = np.array(which["kappa"], float)
-        if which is drive.PZT:
-            size = pzt_gain / abs((kappa / omega**2).sum())
-        else:
-            size = which["gain"]
+        static = abs((kappa / omega**2).sum()) if which is drive.PZT else 1.0
+        size = which.get("gain", pzt_gain / static)
         found.append(np.column_stack([omega, on_damping * np.array(which["zeta"]), size * kappa]))
     return found
 
@@ -76,12 +74,12 @@ def held(rows: np.ndarray, period: float) -> System:
 
 
 def response(system: System, z: np.ndarray) -> np.ndarray:
-    """C (z - A)⁻¹ B + D of a SISO system, by the eigenvalues of its diagonal blocks where it can."""
+    """C (z - A)⁻¹ B + D of a SISO system, block by block where there are many and all are 2 x 2."""
     A, B, C, D = system
     out = np.full(len(z), D[0, 0], complex)
     n = len(A)
-    pairs = n > 40 and not np.any(A - block_diag(*(A[i : i + 2, i : i + 2] for i in range(0, n, 2))))
-    if not pairs:
+    blocks = [A[i : i + 2, i : i + 2] for i in range(0, n, 2)]
+    if n < 16 or np.any(A - block_diag(*blocks)):
         for i in range(0, len(z), 4096):
             part = z[i : i + 4096, None, None]
             out[i : i + 4096] += (C @ np.linalg.solve(part * np.eye(n) - A, B + 0j))[:, 0, 0]
@@ -140,8 +138,10 @@ def closed_poles(branches: list[Branch], plants: list[np.ndarray]) -> np.ndarray
 
 
 def judge(branches: list[Branch], temperature: float, pzt_gain: float) -> dict:
-    """On one plant: the largest pole, the peak of |S| and its first -3 dB, |S| at some frequencies, and the
-    peaks of |K_v S| and |K_p S| at the instants (theirs in front of their filters)."""
+    """On one plant: the largest pole, the peak of |S|, its first -3 dB, and more.
+
+    |S| at some frequencies; the peaks of |K_v S| and |K_p S| (theirs in front of their filters).
+    """
     rows = modes(temperature, pzt_gain)
 
     def S(omega: np.ndarray) -> np.ndarray:
@@ -173,8 +173,8 @@ def judge(branches: list[Branch], temperature: float, pzt_gain: float) -> dict:
         "bandwidth_hz": float(crossing) / (2.0 * np.pi),
         "S_at_hz": {str(f): float(S(2.0 * np.pi * np.array([float(f)]))[0])
                     for f in (10, 30, 100, 300, 1000)},
-        "KS_peak": [float((value * np.abs(response(branch.controller, np.exp(1j * grid * T)))).max())
-                    for branch in branches],
+        "KS_peak": [float((value * np.abs(response(one.controller, np.exp(1j * grid * T)))).max())
+                    for one in branches],
     }  # fmt: skip
 
 
@@ -185,11 +185,12 @@ def sensitivity(branches: list[Branch], rows: list[np.ndarray], omega: np.ndarra
 
 
 def ours(sections: dict[str, dict[str, float]]) -> list[Branch]:
-    """Sections as `design.py` writes them, by z = (1 + sT/2)/(1 - sT/2), in one controllable cascade."""
+    """Sections as `design.py` writes them, by z = (1 + sT/2)/(1 - sT/2), in a cascade."""
     found = []
     for name in ("VCM", "PZT"):
         own = sections[name]
-        systems = [(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[own["gain"]]]))]
+        gain = np.array([[own["gain"]]])
+        systems = [(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), gain)]
 
         def pair(key: str, own: dict = own) -> list[float]:
             omega, zeta = 2.0 * np.pi * own[key], own[f"{key} damping"]
@@ -225,9 +226,10 @@ def theirs(folder: Path) -> list[Branch]:
             parts = {}
             for line in node.body:
                 if isinstance(line, ast.Assign) and isinstance(line.value, ast.Call):
-                    parts[line.targets[0].id] = np.array(ast.literal_eval(line.value.args[0]), float)
-            shapes = {"C": (1, -1), "D": (1, 1)}
-            found[node.name[8:]] = tuple(parts[k].reshape(shapes.get(k, parts[k].shape)) for k in "ABCD")
+                    number = ast.literal_eval(line.value.args[0])
+                    parts[line.targets[0].id] = np.array(number, float)
+            parts["C"], parts["D"] = parts["C"].reshape(1, -1), parts["D"].reshape(1, 1)
+            found[node.name[8:]] = tuple(parts[k] for k in "ABCD")
     return [Branch(found[f"Cd_{name}"], found[f"Fm_{name}"], 2) for name in ("vcm", "pzt")]
 
 
@@ -306,8 +308,10 @@ def main() -> None:
     sets: dict = {OURS: ours(sections)}
     if given.theirs:
         sets[THEIRS] = theirs(given.theirs)
-    print(f"{'':24s} stable   max|S|      -3 dB in Hz    |S| at 10, 30, 100, 300, 1000 Hz"
-          "             |K_v S|, |K_p S|")
+    print(
+        f"{'':24s} stable   max|S|      -3 dB in Hz    |S| at 10, 30, 100, 300, 1000 Hz"
+        "             |K_v S|, |K_p S|"
+    )
     results = dict(kept.get("results", {}))
     for name in (THEIRS, OURS):
         if name in sets:

@@ -1,4 +1,4 @@
-"""The PID rule of Delissen, van Keulen and Langelaar (2023) beside a free PID, on examples/guided_beam.
+"""The PID rule of Delissen, van Keulen and Langelaar (2023) beside a free PID, on guided beams.
 
     python benchmarks/guided_beam.py [GUIDE_MM TIP_MM]...
 
@@ -6,8 +6,9 @@ Their controller has one parameter, the bandwidth w (rad/s) that is wished for, 
 
     K(s) = 1.1 m w³ (s + w/3)(s + w/5) 15 / (s (s + 3w)(s + 5w)),    |K(jw)| = 1.1 m w²
 
-w is raised here until the loop is unstable or |1 + L| < 0.5. Ours has the same structure, its five parameters free.
-Both are judged alike, by eigenvalues and |S| on a dense grid; ω_b is the first -3 dB of S.
+w is raised here until the loop is unstable or |1 + L| < 0.5. Ours has the same structure, its five
+parameters free. Both are judged alike, by eigenvalues and |S| on a dense grid; ω_b is the first -3
+dB of S.
 """
 
 import sys
@@ -35,7 +36,7 @@ def judged(G: StateSpace, K: StateSpace) -> tuple[bool, float, float]:
     omega = np.concatenate([HZ * np.geomspace(0.1, 1e6, 20000), near.ravel()])
     omega = np.unique(omega[omega > HZ * 0.1])
     S = np.abs(1.0 / (1.0 + response(G, omega) * response(K, omega)))
-    over = omega[np.argmax(S > np.sqrt(0.5))]
+    over = omega[np.argmax(S * np.sqrt(2.0) > 1.0)]
     return bool((poles.real < 0.0).all()), float(S.max()), float(over) / HZ
 
 
@@ -53,7 +54,9 @@ def their_pid(w: float, mass: float) -> StateSpace:
 
 def main(beams: list[tuple[float, float]]) -> None:
     problem = problem_of(load_case(CASE))
-    print("guide mm  tip mm    mass kg   |  rule: w Hz   -3 dB Hz  max|S| |  free PID: -3 dB Hz  max|S|")
+    print(
+        "guide mm  tip mm   mass kg   |  rule: w Hz    -3 dB Hz  max|S| | free PID: -3 dB  max|S|"
+    )
     for guide, tip in beams:
         plant = scaled_plant(problem, (guide, tip))
         G, mass = plant.plant_si(), 2700.0 * 0.3 * 0.3 * 0.5 * (guide + tip)

@@ -122,9 +122,7 @@ def assert_derivatives(
     exact = to_theta(model, kappa, peaks)
     scale = np.abs(exact).max(1) + 1e-3 * np.abs(exact).max()
     for i, step in enumerate(h * np.eye(2)):
-        a, b, c, d = (
-            values(problem_at(tuple(1.0 + x * step)), kappa, tau) for x in (1, -1, 2, -2)
-        )
+        a, b, c, d = (values(problem_at(tuple(1.0 + x * step)), kappa, tau) for x in (1, -1, 2, -2))
         slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
         assert (np.abs(slope - exact[:, i]) / scale).max() < 1e-5
     return set(peaks.curve.tolist())

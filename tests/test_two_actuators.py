@@ -31,8 +31,8 @@ STRUCTURE = ChannelStructure(
 def one_sensor(theta: tuple[float, float] = (1.0, 1.0), off: float = 0.3) -> ScaledPlant:
     """The first output of the stage of three channels, its first two inputs."""
     whole = plant(theta, off)
-    return replace(whole, B=whole.B[:, :2], dB=whole.dB[:, :, :2], C=whole.C[:1], dC=whole.dC[:, :1],
-                   channels=())  # fmt: skip
+    B, dB, C, dC = whole.B[:, :2], whole.dB[:, :, :2], whole.C[:1], whole.dC[:, :1]
+    return replace(whole, B=B, dB=dB, C=C, dC=dC, channels=())
 
 
 def problem(theta: tuple[float, float], sampling: Sampling | None) -> MatrixProblem:

@@ -1,9 +1,9 @@
 """Where searches start when there are more actuators than sensors.
 
-Channels that share a sensor cannot be designed one by one: each alone would take the whole bandwidth. A
-start is a random controller for each, with a crossover |G_i K_i| = 1 of its own, of which those are kept
-that together hold every plant stable. Where a channel's plant is on its stiffness line at the crossover (a
-piezo) its lead is turned around into a lag.
+Channels that share a sensor cannot be designed one by one: each alone would take the whole
+bandwidth. A start is a random controller for each, with a crossover |G_i K_i| = 1 of its own, of
+which those are kept that together hold every plant stable. Where a channel's plant is on its
+stiffness line at the crossover (a piezo) its lead is turned around into a lag.
 """
 
 from collections.abc import Sequence

@@ -373,7 +373,7 @@ def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, 
 
 
 def finite_zeros(plant: LoopPlant) -> np.ndarray:
-    """Finite zeros in w: the finite eigenvalues of the system matrix's pencil; none if not square."""
+    """Finite eigenvalues of the system matrix's pencil in w; none where it is not square."""
     n, m = plant.B.shape
     if len(plant.C) != m:
         return np.empty(0, complex)

@@ -2,7 +2,8 @@
 
 Everything is in the variable w and in the units of `loop`. u = -K y with K = V diag(K_i) Uᵀ; where
 U and V are orthogonal the plants are turned into the coordinates of the channels first. There may
-be more inputs than outputs: two actuators on one sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2.
+be more inputs than outputs: two actuators on one sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2
+K_2.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from ccd_casadi.support.errors import PlantError
 
 @dataclass(frozen=True)
 class MatrixPlantSet(PlantSet):
-    """A set of p x m plants, p <= m; `matrices` (P, n, p, m) are the residues, `residues` their sizes.
+    """A set of p x m plants, p <= m; `matrices` (P, n, p, m) the residues, `residues` their sizes.
 
     `out` = Uᵀ and `into` = V in the coordinates of the plants: identities where they are turned.
     """

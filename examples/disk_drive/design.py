@@ -30,7 +30,8 @@ HZ = 2.0 * np.pi
 SAMPLING = Sampling(drive.RATE_HZ)
 # Both actuators see the one sensor: U = (1 1), V = I.
 CHANNELS = given_decoupling(("VCM", "PZT"), outputs=[[1], [1]], inputs=[[1, 0], [0, 1]])
-# One integrator for the loop: a second one would share its input, and no one would hold the difference.
+# One integrator for the loop: a second one would share its input, and no one would hold the
+# difference.
 STRUCTURE = ChannelStructure(
     CHANNELS,
     (
@@ -38,8 +39,8 @@ STRUCTURE = ChannelStructure(
         Structure(integrator=False, lead=1, biquads=3, roll_off=1, least_damping=0.05),
     ),
 )
-# What the benchmark's own controllers reach: the peak of |S|, and |S| at 300 Hz. Roots of K from 500 Hz on
-# leave none to gain at 300 Hz alone; below it S falls with the third power of frequency.
+# What the benchmark's own controllers reach: the peak of |S|, and |S| at 300 Hz. Roots of K from
+# 500 Hz on leave none to gain at 300 Hz alone; below it S falls with the third power of frequency.
 BOUNDS = Bounds(S_max=2.087, S_low=0.0345, omega_low=300.0 * HZ, shape=1.1)
 FREQUENCIES = (500.0 * HZ, 2.0 * drive.RATE_HZ)
 SOFT_HZ = 1.0
@@ -62,8 +63,8 @@ def design(
 ) -> SectionsDesign:
     """The largest bandwidth on 17 temperatures with each of the PZT's gains.
 
-    First a race on nine temperatures at its nominal gain, then from its end on all. The benchmark's three
-    temperatures alone are not enough: a controller for these was unstable between them.
+    First a race on nine temperatures at its nominal gain, then from its end on all. The benchmark's
+    three temperatures alone are not enough: a controller for these was unstable between them.
     """
     first = synthesise(
         scaled(np.linspace(-1.0, 1.0, 9).tolist(), [1.0]), structure, BOUNDS, sampling=SAMPLING,
@@ -82,7 +83,8 @@ def design(
 def written(made: SectionsDesign) -> dict[str, dict[str, float]]:
     """Every section's parameters by actuator: gains, Hz, damping ratios."""
     found: dict[str, dict[str, float]] = {name: {} for name in CHANNELS.names}
-    for name, kind, value in zip(made.structure.names, made.structure.kinds, made.kappa, strict=True):
+    names, kinds = made.structure.names, made.structure.kinds
+    for name, kind, value in zip(names, kinds, made.kappa, strict=True):
         actuator, own = name.split(": ")
         found[actuator][own] = float(np.exp(value)) / (HZ if kind == "frequency" else 1.0)
     return found

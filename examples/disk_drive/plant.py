@@ -3,8 +3,8 @@
     y = P_v u_v + P_p u_p,   P(s) = g Σ κ_i/(s² + 2 ζ_i ω_i s + ω_i²)
 
 Data: PyHDDBenchmark (github.com/liuzd1997/PyHDDBenchmark, MIT licence), a Python version of the
-Magnetic-head Positioning Control System in HDDs by T. Atsumi (IEEJ, MATLAB Central 111515); T. Atsumi
-and S. Yabui, IEEE Trans. Ind. Electron. 67(11), 2020. y in tracks, u_v and u_p as there.
+Magnetic-head Positioning Control System in HDDs by T. Atsumi (IEEJ, MATLAB Central 111515); T.
+Atsumi and S. Yabui, IEEE Trans. Ind. Electron. 67(11), 2020. y in tracks, u_v and u_p as there.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ PZT_GAINS = (1.0, 1.05, 0.95)
 
 
 def factors(temperature: float) -> tuple[float, float, float]:
-    """On frequencies of the VCM and of the PZT, and on damping ratios; from -1 (cold) to 1 (hot)."""
+    """On frequencies of VCM and PZT, and on damping ratios; from -1 (cold) to 1 (hot)."""
     return 1.0 - 0.04 * temperature, 1.0 - 0.06 * temperature, 1.0 + 0.2 * temperature
 
 

@@ -1,9 +1,9 @@
-"""A guided beam as a lift: the domain of Delissen, van Keulen and Langelaar (2023), two heights in it.
+"""A guided beam in the domain of Delissen, van Keulen and Langelaar (2023), of two heights.
 
-Their second case is a block of 300 x 100 x 300 mm aluminium (E = 65 GPa, ν = 0.3, 2700 kg/m³, plane strain) of
-which topology optimisation leaves 30 %; its left edge is guided and driven, the sensor is at the tip's upper
-corner. Here the material is a beam whose height falls linearly, in ten bending modes (Euler and Bernoulli;
-Ritz with ξ² P_k(2ξ - 1)), and the rigid body.
+Their second case is a block of 300 x 100 x 300 mm aluminium (E = 65 GPa, ν = 0.3, 2700 kg/m³, plane
+strain) of which topology optimisation leaves 30 %; its left edge is guided and driven, the sensor
+is at the tip's upper corner. Here the material is a beam whose height falls linearly, in ten
+bending modes (Euler and Bernoulli; Ritz with ξ² P_k(2ξ - 1)), and the rigid body.
 """
 
 import casadi as ca
