@@ -38,7 +38,7 @@ def actuator_starts(
     for i, own in enumerate(structure.structures):
         family = plant_set([channel_plant(plants[0], structure.decoupling, i)], sampling)
         single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
-        crossovers = np.exp(rng.uniform(*np.log(CROSSOVERS), draws))
+        crossovers = np.exp(rng.uniform(np.log(CROSSOVERS[0]), np.log(CROSSOVERS[1]), draws))
         kappa = at_random(single, crossovers, rng)
         v = family.variable(crossovers)
         G, slope = family.responses(np.zeros(draws, int), v)
