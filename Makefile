@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test test-processors lint docs bench setup setup-test clean
+.PHONY: solve test test-processors lint docs bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
@@ -33,6 +33,13 @@ docs: setup-test
 bench: setup-test
 	$(BIN)/python benchmarks/commands.py $(LONG)
 	$(BIN)/python benchmarks/synthesis.py
+
+# What runs offline beside other people's tools and designs; see docs/peers.md.
+peers: setup-test
+	$(BIN)/python benchmarks/synthesis.py
+	$(BIN)/python benchmarks/back_ends.py 10 10
+	$(BIN)/python benchmarks/disk_drive.py
+	$(BIN)/python benchmarks/guided_beam.py
 
 setup: .venv/.ready
 setup-test: .venv/.ready-test

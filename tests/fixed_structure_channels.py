@@ -1,5 +1,6 @@
 """Loops of several channels for the tests: a stage whose load may lie off centre."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import casadi as ca
@@ -10,7 +11,8 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import find_decoupling
-from ccd_casadi.fixed_structure.figures import LoopProblem, assess
+from ccd_casadi.fixed_structure.figures import Curve, LoopProblem, assess, to_theta
+from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -86,3 +88,41 @@ def loop(
         if assess(problem, kappa, -1.5).stable:
             return problem, kappa
     raise AssertionError("no random controller is stable")
+
+
+def assert_derivatives(
+    problem_at: Callable[[tuple[float, float]], MatrixProblem],
+    kappa: Array,
+    chosen: Callable[[np.ndarray], np.ndarray],
+) -> set[int]:
+    """Of simple singular values to κ, τ and θ, against differences of fourth order; their curves.
+
+    `problem_at` θ; `chosen` rows (a mask by their numbers) belong to plants that move with θ.
+    """
+    tau, model = -1.5, problem_at((1.0, 1.0))
+    peaks = assess(model, kappa, tau, depth=-2.0).peaks
+    assert peaks is not None
+    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
+    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
+    gap[range(len(peaks.v)), found.at] = np.inf
+    peaks = peaks.only(chosen(peaks.plant) & (gap.min(axis=1) > 0.03))
+
+    def values(of, kappa, tau):
+        return whole_constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
+
+    size = np.abs(peaks.to_kappa).max(1) + 1e-2
+    h = 1e-4
+    for i, step in enumerate(h * np.eye(len(kappa))):
+        a, b, c, d = (values(model, kappa + x * step, tau) for x in (1, -1, 2, -2))
+        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
+        assert (np.abs(slope - peaks.to_kappa[:, i]) / size).max() < 1e-5
+    rising = peaks.curve != Curve.CROSSING
+    slope = (values(model, kappa, tau + 1e-6) - values(model, kappa, tau - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
+    exact = to_theta(model, kappa, peaks)
+    scale = np.abs(exact).max(1) + 1e-3 * np.abs(exact).max()
+    for i, step in enumerate(h * np.eye(2)):
+        a, b, c, d = (values(problem_at(tuple(1.0 + x * step)), kappa, tau) for x in (1, -1, 2, -2))
+        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
+        assert (np.abs(slope - exact[:, i]) / scale).max() < 1e-5
+    return set(peaks.curve.tolist())

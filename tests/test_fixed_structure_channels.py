@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from fixed_structure_channels import BOUNDS, FAST, STRUCTURE, loop, plant, structure
+from fixed_structure_channels import (
+    BOUNDS,
+    FAST,
+    STRUCTURE,
+    assert_derivatives,
+    loop,
+    plant,
+    structure,
+)
 from helpers import sensitivity_gain
 
 from ccd_casadi.fixed_structure import Sampling
@@ -16,7 +24,7 @@ from ccd_casadi.fixed_structure.decoupling import (
     in_channels,
     is_decoupled,
 )
-from ccd_casadi.fixed_structure.figures import Curve, assess, to_theta
+from ccd_casadi.fixed_structure.figures import Curve, assess
 from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.support.errors import PlantError
@@ -82,38 +90,10 @@ def test_derivatives_of_singular_values(
         problem = composite_problem([plant(), plant(off=0.3)],
                                     ChannelStructure(given, problem.structure.structures),
                                     BOUNDS, sampling)  # fmt: skip
-    tau = -1.5
-    model = whole(problem, sampling)
-    peaks = assess(model, kappa, tau, depth=-2.0).peaks
-    assert peaks is not None
-    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
-    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
-    gap[range(len(peaks.v)), found.at] = np.inf
-    peaks = peaks.only((peaks.plant % 2 == 1) & (gap.min(axis=1) > 0.03))
-    assert set(peaks.curve) >= {Curve.S_MAX, Curve.S_LOW, Curve.KS, Curve.T, Curve.CROSSING}
-
-    def values(of, kappa, tau):
-        return whole_constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
-
-    size = np.abs(peaks.to_kappa).max(1) + 1e-2
-    h = 1e-4
-    for i, step in enumerate(h * np.eye(len(kappa))):
-        a, b, c, d = (values(model, kappa + x * step, tau) for x in (1, -1, 2, -2))
-        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
-        assert (np.abs(slope - peaks.to_kappa[:, i]) / size).max() < 1e-5
-    rising = peaks.curve != Curve.CROSSING
-    slope = (values(model, kappa, tau + 1e-6) - values(model, kappa, tau - 1e-6)) / 2e-6
-    np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
-    exact = to_theta(model, kappa, peaks)
-    scale = np.abs(exact).max(1) + 1e-3 * np.abs(exact).max()
-    h = 1e-4
-    for i, step in enumerate(h * np.eye(2)):
-        a, b, c, d = (
-            values(whole(problem, sampling, theta=tuple(1.0 + x * step)), kappa, tau)
-            for x in (1, -1, 2, -2)
-        )
-        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
-        assert (np.abs(slope - exact[:, i]) / scale).max() < 1e-5
+    seen = assert_derivatives(
+        lambda theta: whole(problem, sampling, theta=theta), kappa, lambda row: row % 2 == 1
+    )
+    assert seen >= {Curve.S_MAX, Curve.S_LOW, Curve.KS, Curve.T, Curve.CROSSING}
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])

@@ -27,6 +27,7 @@ TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still 
 CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
 PER_DECADE = 60
 FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
+APART = 1e-9  # relative: grid points that are closer count as one
 ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 
 
@@ -297,7 +298,9 @@ def _grid(
     count = int(PER_DECADE * np.log10(top / bottom))
     near = (np.abs(joint.imag)[:, None] + np.abs(joint.real)[:, None] * FLANKS).ravel()
     grid = np.concatenate([np.geomspace(bottom, top, count), near, np.abs(joint), [omega_low]])
-    return np.unique(grid[(grid >= bottom) & (grid <= top)])
+    grid = np.unique(grid[(grid >= bottom) & (grid <= top)])
+    # Of two points that rounding parts one may be the maximum, and its bracket end at the other.
+    return grid[np.append(True, np.diff(grid) > APART * grid[1:])]
 
 
 def _top(table: _Responses, name: str, grid: Array, value: Array) -> tuple[float, float]:

@@ -3,7 +3,8 @@
 Where every plant falls apart in the channels' coordinates each channel is designed on its own, and
 ω_b is the least of theirs. Where channels are coupled the same designs, on the diagonal of every
 plant, are where the search on the whole loop starts, with ever tighter bounds on the channels
-until together they hold every plant stable.
+until together they hold every plant stable. Where actuators share sensors (fewer outputs than
+channels) it starts from random controllers that are stable together (`actuator_starts`).
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from time import perf_counter
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import CompositeProblem, composite_problem
@@ -119,7 +121,12 @@ def synthesise(
     pool = [np.clip(kappa, *problem.box) for kappa in pool]
     field = _stable(problem, pool)
     evaluations = len(pool)
-    if not only_initial:
+    shared = len(structure.decoupling.outputs) < len(structure.structures)
+    if shared and not only_initial:
+        rng = np.random.default_rng(seed)
+        field += actuator_starts(problem, structure, alike, sampling, starts, rng)
+        evaluations += len(field)
+    elif not only_initial:
         before: list[SectionsDesign] = []
         for share in TIGHTENED:
             limits = replace(bounds, S_max=1.0 + share * (bounds.S_max - 1.0))

@@ -88,7 +88,7 @@ def composite_problem(
 ) -> CompositeProblem:
     """The problem in the units of the first plant; `frequencies` (rad/s) bound those of K's roots.
 
-    Raises PlantError for plants that are not square, not stable, or not diagonalisable.
+    Raises PlantError as `matrix_plant_set` does.
     """
     first = plants[0]
     alike = [in_units_of(plant, first) for plant in plants]

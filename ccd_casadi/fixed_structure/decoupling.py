@@ -74,11 +74,14 @@ def given_decoupling(
 ) -> Decoupling:
     """The channels that a case gives by directions, which are brought to length 1.
 
-    Raises PlantError where directions are zero, not of one length, or not independent.
+    There may be fewer outputs than channels (several actuators on one sensor: `[[1], [1]]`). Raises
+    PlantError where directions are zero, not of one length, or do not span all outputs and inputs.
     """
     found = []
     for word, rows in (("outputs", outputs), ("inputs", inputs)):
-        if len({len(row) for row in rows}) != 1 or len(rows[0]) != len(names):
+        count, most = len(rows[0]), len(names)
+        fits = count == most or (word == "outputs" and 0 < count < most)
+        if len(rows) != most or len({len(row) for row in rows}) != 1 or not fits:
             words = f"{len(names)} channels need {len(names)} {word} each; give as many numbers"
             raise PlantError(words)
         M = np.array(rows, float).T

@@ -382,7 +382,10 @@ def frequency_grid(
     regular = (order < len(problem.base)) & ~twice
     v = np.where(twice, spare * 0.5, v)
     order = np.argsort(v, axis=1)
-    return np.take_along_axis(v, order, axis=1), np.take_along_axis(regular, order, axis=1)
+    v, regular = np.take_along_axis(v, order, axis=1), np.take_along_axis(regular, order, axis=1)
+    # Conjugate roots fall together, so that nearly half were spares; one below the base is enough.
+    useless = slice(1, max(1, int((v < bottom).sum(axis=1).min())))
+    return np.delete(v, useless, axis=1), np.delete(regular, useless, axis=1)
 
 
 def _flanked(values: np.ndarray) -> Array:

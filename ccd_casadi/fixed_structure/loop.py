@@ -24,6 +24,7 @@ from ccd_casadi.support.errors import PlantError
 
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
 FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
+CANCELLING = 1e-4  # |z - e^{pT}| below which the difference loses digits, and expm1 does not
 INSTANT = 1e-9  # share of a period that counts as none
 
 
@@ -134,7 +135,10 @@ class PlantSet:
         d, late, early, grown = (part[which] for part in self.held)
         d = d[..., None]
         z = np.exp(s * T)
-        gap = grown * np.expm1((s - p) * T)
+        gap = z - grown
+        near = np.abs(gap) < CANCELLING
+        at_s, at_p, own = (np.broadcast_to(part, gap.shape)[near] for part in (s, p, grown))
+        gap[near] = own * np.expm1((at_s - at_p) * T)
         value = (late + early / z) / gap
         slope = early / (z * gap) + value * z / gap + d * value
         shift = np.exp(-s * T * d)
@@ -368,8 +372,10 @@ def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, 
 
 
 def finite_zeros(plant: LoopPlant) -> np.ndarray:
-    """Finite zeros in w: the finite eigenvalues of the system matrix's pencil."""
+    """Finite eigenvalues of the system matrix's pencil in w; none where it is not square."""
     n, m = plant.B.shape
+    if len(plant.C) != m:
+        return np.empty(0, complex)
     system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
     shape = np.zeros((n + m, n + m))
     shape[:n, :n] = np.eye(n)

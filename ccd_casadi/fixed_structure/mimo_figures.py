@@ -14,6 +14,8 @@ vectors and κ_a a parameter of channel i, each M depends on K_i by rank one,
     S G₀   -S G V           Uᵀ S G₀      -S ∂(GK) S G₀ + S ∂G₀
 
 where G₀ is the continuous plant (without hold and delay, `free_responses`) and K = V diag(K_i) Uᵀ.
+With more inputs than outputs S and T are p x p, KS is m x p, S G₀ p x m: p singular values each, of
+matrices that are filled up to m x m with zeros here.
 """
 
 from dataclasses import dataclass
@@ -50,7 +52,7 @@ OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING)
 
 @dataclass(frozen=True)
 class MatrixProblem(LoopProblem):
-    """That of square plants of several channels, as a whole."""
+    """That of plants of several channels, as a whole."""
 
     plants: MatrixPlantSet
     structure: ChannelStructure
@@ -60,8 +62,8 @@ class MatrixProblem(LoopProblem):
 class Rows:
     """M constraints at fixed frequencies: value and slope to ln v, derivatives to κ (M, n).
 
-    `U`, `s`, `V` (M, c, c) are the singular vectors and values of each row's matrix, `at` which of
-    them, `left` = Uᴴ P (M, c, channels), `right` = Q V, `inner` = Uᵀ S G V; k the channels' K_i
+    `U`, `s`, `V` (M, m, m) are the singular vectors and values of each row's matrix, `at` which of
+    them, `left` = Uᴴ P (M, m, channels), `right` = Q V, `inner` = Uᵀ S G V; k the channels' K_i
     (M, c), `log_slopes` (M, n) ∂ln K_i/∂κ.
     """
 
@@ -93,20 +95,21 @@ def evaluate_rows(
     S = np.linalg.inv(eye + G @ K)
     SG = S @ G
     SL_xS = S @ (dG @ K + G @ K_x) @ S
+    m, c = plants.into.shape
     of_t, of_ks, of_gs = (_chosen(curve, code) for code in (Curve.T, Curve.KS, Curve.GS))
-    M = np.where(of_t, eye - S, S)
-    M_x = np.where(of_t, SL_xS, -SL_xS)
-    left = np.where(of_t, SG, -SG)
-    right = plants.out @ S
+    M = _filled(np.where(of_t, eye - S, S), m, m)
+    M_x = _filled(np.where(of_t, SL_xS, -SL_xS), m, m)
+    left = _filled(np.where(of_t, SG, -SG), m, m)
+    right = _filled(plants.out @ S, c, m)
     if of_ks.any():
-        KS = K @ S
-        M, M_x = np.where(of_ks, KS, M), np.where(of_ks, K_x @ S - K @ SL_xS, M_x)
-        left = np.where(of_ks, eye - K @ SG, left)
+        M = np.where(of_ks, _filled(K @ S, m, m), M)
+        M_x = np.where(of_ks, _filled(K_x @ S - K @ SL_xS, m, m), M_x)
+        left = np.where(of_ks, np.eye(m) - K @ SG, left)
     if of_gs.any():
         free, dfree = plants.free_responses(which, v)
-        M = np.where(of_gs, S @ free, M)
-        M_x = np.where(of_gs, S @ dfree - SL_xS @ free, M_x)
-        right = np.where(of_gs, right @ free, right)
+        M = np.where(of_gs, _filled(S @ free, m, m), M)
+        M_x = np.where(of_gs, _filled(S @ dfree - SL_xS @ free, m, m), M_x)
+        right = np.where(of_gs, plants.out @ S @ free, right)
     U, s, Vh = np.linalg.svd(M)
     V = np.conj(np.swapaxes(Vh, 1, 2))
     lefts = np.conj(np.swapaxes(U, 1, 2)) @ left @ plants.into
@@ -157,7 +160,7 @@ def _(
         return Assessment(False, poles, None, None)
     v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles)
     P, count = v.shape
-    channels = len(problem.structure.structures)
+    outputs = problem.plants.matrices.shape[2]
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     found, near = [], []
     for curve, value in _levels(problem, kappa, tau, v, min(depth, -within)).items():
@@ -181,7 +184,7 @@ def _(
     # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
     whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing)
     kind, rows, top = kind[whole], rows[whole], top[whole]
-    every = np.arange(P * channels)
+    every = np.arange(P * outputs)
     low_v = float(problem.plants.variable(np.array([problem.low]))[0])
     kind = np.concatenate([kind, np.full(len(every), Curve.S_LOW),
                            np.full(len(every), Curve.CROSSING)])  # fmt: skip
@@ -211,12 +214,13 @@ def _(problem: MatrixProblem, kappa: Array, found: Constraints) -> Array:
     free, _ = plants.free_responses(which, found.v)
     of_t, of_ks, of_gs = (_chosen(found.curve, code) for code in (Curve.T, Curve.KS, Curve.GS))
     # ∂M = left ∂G right, and S ∂G₀ of the compliance
-    left = np.where(of_ks, K @ S, S) * np.where(of_t, 1.0, -1.0)
-    right = K @ S
-    right = np.where(of_gs, right @ free, right)
+    m, p = K.shape[1:]
+    own_s = _filled(S, m, p)
+    left = np.where(of_ks, K @ S, own_s) * np.where(of_t, 1.0, -1.0)
+    right = np.where(of_gs, K @ S @ free, _filled(K @ S, m, m))
     x = np.einsum("mi,mij->mj", u, left)
     y = np.einsum("mij,mj->mi", right, v)
-    x_free = np.einsum("mi,mij->mj", u, S)
+    x_free = np.einsum("mi,mij->mj", u, own_s)
     for i in np.unique(which):
         own = np.flatnonzero(which == i)
         out[own] = plants.form_to_theta(int(i), found.v[own], x[own], y[own]).real
@@ -278,7 +282,7 @@ def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:
     square = np.abs(np.conj(np.swapaxes(M, -1, -2)) @ M).sum(-1).max(-1)
     with np.errstate(divide="ignore"):
         chosen = 0.5 * np.log(square) + offset > least
-        out = np.full((*offset.shape, M.shape[-1]), -np.inf)
+        out = np.full((*offset.shape, min(M.shape[-2:])), -np.inf)
         out[chosen] = np.log(np.linalg.svd(M[chosen], compute_uv=False)) + offset[chosen][:, None]
     return out
 
@@ -310,6 +314,12 @@ def _offsets(
     if bounds.compliance_max is not None:
         out[curve == Curve.GS] = -np.log(bounds.compliance_max * plants.force)
     return out, slope
+
+
+def _filled(M: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """The matrices (k, a, b) with zeros below and beside."""
+    a, b = M.shape[1:]
+    return M if (a, b) == (rows, columns) else np.pad(M, ((0, 0), (0, rows - a), (0, columns - b)))
 
 
 def _chosen(curve: np.ndarray, code: Curve) -> np.ndarray:

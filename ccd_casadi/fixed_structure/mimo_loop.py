@@ -1,7 +1,9 @@
-"""Square plants of several channels in the loop with one controller, as `loop` has those of one.
+"""Plants of several channels in the loop with one controller, as `loop` has those of one.
 
 Everything is in the variable w and in the units of `loop`. u = -K y with K = V diag(K_i) Uᵀ; where
-U and V are orthogonal the plants are turned into the coordinates of the channels first.
+U and V are orthogonal the plants are turned into the coordinates of the channels first. There may
+be more inputs than outputs: two actuators on one sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2
+K_2.
 """
 
 from collections.abc import Sequence
@@ -26,7 +28,7 @@ from ccd_casadi.support.errors import PlantError
 
 @dataclass(frozen=True)
 class MatrixPlantSet(PlantSet):
-    """A set of p x p plants; `matrices` (P, n, p, p) are the residues, `residues` their sizes.
+    """A set of p x m plants, p <= m; `matrices` (P, n, p, m) the residues, `residues` their sizes.
 
     `out` = Uᵀ and `into` = V in the coordinates of the plants: identities where they are turned.
     """
@@ -36,7 +38,7 @@ class MatrixPlantSet(PlantSet):
     into: Array
 
     def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G (..., p, p) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
+        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
         return self._summed(which, *self.modal_terms(which, v))
 
     def free_responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
@@ -44,35 +46,40 @@ class MatrixPlantSet(PlantSet):
         return self._summed(which, *self.modal_terms(which, v, free=True))
 
     def _summed(self, which: np.ndarray, *terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        n, p = self.matrices.shape[1], self.matrices.shape[2]
-        flat = self.matrices.reshape(-1, n, p * p)
+        n, p, m = self.matrices.shape[1:]
+        flat = self.matrices.reshape(-1, n, p * m)
         found = []
         for term in terms:
-            out = np.empty((*which.shape, p * p), complex)
+            out = np.empty((*which.shape, p * m), complex)
             for i in np.unique(which):
                 at = which == i
                 out[at] = term[at] @ flat[i]
-            found.append(out.reshape(*which.shape, p, p))
+            found.append(out.reshape(*which.shape, p, m))
         return found[0], found[1]
 
 
 def matrix_plant_set(
     plants: Sequence[ScaledPlant], decoupling: Decoupling, sampling: Sampling | None = None
 ) -> MatrixPlantSet:
-    """Square plants in the units of the first, with hold and delay where the loop is sampled.
+    """The plants in the units of the first, with hold and delay where the loop is sampled.
 
-    Raises PlantError for a plant that is not square, not stable, or not diagonalisable.
+    Raises PlantError for a plant whose inputs or outputs are not those of the channels, that has
+    more outputs than inputs, is not stable, or not diagonalisable.
     """
-    c = len(decoupling.names)
+    asked = (len(decoupling.outputs), len(decoupling.inputs))
     for number, plant in enumerate(plants, 1):
         shape = (plant.C.shape[0], plant.B.shape[1])
-        if shape != (c, c):
-            words = f"has {shape[0]} outputs and {shape[1]} inputs for {c} channels"
-            raise PlantError(f"plant {number} {words}; give as many of each")
+        words = f"plant {number} has {shape[0]} outputs and {shape[1]} inputs"
+        if shape != asked:
+            given = f"the channels' directions have {asked[0]} and {asked[1]} entries"
+            raise PlantError(f"{words}, but {given}; give as many of each")
+        if shape[0] > min(shape[1], len(decoupling.names)):
+            given = f"for {len(decoupling.names)} channels"
+            raise PlantError(f"{words} {given}; leave some outputs out, or give more channels")
     out, into = decoupling.outputs.T, decoupling.inputs
     if decoupling.orthogonal:
         plants = [in_channels(plant, decoupling) for plant in plants]
-        out = into = np.eye(c)
+        out = into = np.eye(asked[0])
     found, units = loop_plants(plants, sampling)
     poles, matrices = padded_modes(found)
     sizes = np.linalg.norm(matrices, axis=(2, 3))

@@ -45,7 +45,7 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
                 values[f"biquad {i + 1} poles"] = notch * below
                 values[f"biquad {i + 1} poles damping"] = width
             found.append(_kappa(problem, values))
-    return _crossing(problem, np.array(found), np.repeat(crossovers, 4))
+    return with_crossover(problem, np.array(found), np.repeat(crossovers, 4))
 
 
 def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:
@@ -62,7 +62,7 @@ def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> 
             values[f"biquad {i + 1} poles"] = middle * np.exp(rng.normal(0.1, 0.4))
             values[f"biquad {i + 1} poles damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
         found.append(_kappa(problem, values))
-    return _crossing(problem, np.array(found), crossovers)
+    return with_crossover(problem, np.array(found), crossovers)
 
 
 def kept(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
@@ -91,8 +91,8 @@ def _kappa(problem: Problem, values: dict[str, float]) -> Array:
     return np.log(np.array([values[name] for name in problem.structure.names]))
 
 
-def _crossing(problem: Problem, kappa: Array, crossovers: Array) -> Array:
-    """The same with the gain that gives |L| = 1 at the crossover of the first plant, boxed."""
+def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
+    """κ with the gain that gives |L| = 1 at the crossover of the first plant, boxed."""
     kappa = np.clip(kappa, *problem.box)
     kinds = np.array([kind is Kind.GAIN for kind in problem.structure.kinds])
     v = problem.plants.variable(np.asarray(crossovers, float))
