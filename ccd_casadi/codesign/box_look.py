@@ -92,8 +92,7 @@ def look_over_box(
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
     values = np.array([_objective(problem, sample) for sample in feasible])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
-    best_x, best = None, J
-    starts = _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
+    best_x, best, begun = None, J, 0
     ended: list[tuple[Array, float]] = []
 
     def note(place: Array, value: float) -> None:
@@ -101,30 +100,55 @@ def look_over_box(
         if kkt.stationarity <= STATIONARY:
             ended.append((place, value))
 
-    if starts and np.isfinite(J):
-        note(x, J)
-    for sample in starts:
-        begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-        end = descend(problem, quantities, begin, ended=ended)
-        for place in (end, begin):
-            found = quantities.at(place)
-            if acceptable(problem, place, found):
-                value = objective(problem, place, found)
-                note(place, value)
-                if value < best - margin:
-                    best_x, best = place, value
-                break
+    def solve_from(starts: Sequence[BandwidthSample]) -> None:
+        nonlocal best_x, best, begun
+        begun += len(starts)
+        if starts and np.isfinite(J) and not ended:
+            note(x, J)
+        for sample in starts:
+            begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+            end = descend(problem, quantities, begin, ended=ended)
+            for place in (end, begin):
+                found = quantities.at(place)
+                if acceptable(problem, place, found):
+                    value = objective(problem, place, found)
+                    note(place, value)
+                    if value < best - margin:
+                        best_x, best = place, value
+                    break
+
+    solve_from(
+        _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
+    )
+    ends = _ends(problem, np.asarray((x if best_x is None else best_x)[:-2]))
+    if np.isfinite(best) and 2 * len(ends) <= points:
+        found = sampler.bandwidths(ends, "looking at the ends of each parameter")
+        able = [sample for sample in found if sample.feasible and _allowed(problem, sample)]
+        solve_from(able)
     return BoxLook(
         points=len(samples) + passed_over,
         solved=len(samples),
         feasible=len(feasible),
         better=int((values < J - margin).sum()),
-        starts=len(starts),
+        starts=begun,
         seed=seed,
         before=J,
         after=best,
         x=best_x,
     )
+
+
+def _ends(problem: CoDesignProblem, theta: Array) -> Array:
+    """θ (k, n_θ) with one parameter at a time at an end of its range, but for where it is so."""
+    lower, upper = box(problem)
+    found = [
+        np.where(np.arange(len(theta)) == i, end, theta)
+        for i in range(len(theta))
+        for end in (lower[i], upper[i])
+        if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
+    ]
+    allowed = [x for x in found if (constraint_values(plant_of(problem), x) <= 0.0).all()]
+    return np.array(allowed).reshape(-1, len(theta))
 
 
 def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
