@@ -233,3 +233,16 @@ def test_derivatives_of_a_plant_to_what_is_uncertain(modal: bool) -> None:
     size = np.abs(numeric).max()
     np.testing.assert_allclose(exact / q.force, numeric, rtol=1e-6, atol=1e-8 * size)
     assert len(box.corners()) == 1 + 2**3  # the common shift, the modes together, the gain
+
+
+def test_the_built_stage_has_its_channels_and_its_option_sets() -> None:
+    problem = problem_of(load_case(RUNS / "rib_stage_built.toml"))
+    structure = structure_of(problem)
+    assert isinstance(structure, ChannelStructure)
+    assert structure.decoupling.names == ("z", "tip", "tilt", "twist")
+    assert structure.decoupling.orthogonal
+    assert problem.sections is not None
+    options = [dict(item) for item in problem.sections.uncertainty.options]
+    assert [item["modes"] for item in options] == [20, 20]
+    assert options[0]["mesh"] == "fine"
+    assert "point_masses" in options[1]
