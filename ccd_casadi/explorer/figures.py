@@ -60,6 +60,7 @@ class Figures:
         self.move_figure = self._time("move", "ms", "error of a move (µm)", self.move, "um")
         self.end = Span(dimension="height", line_color=GREY, line_dash="dashed")
         self.move_figure.add_layout(self.end)
+        self._curves = list(self.all().values())
 
     def all(self) -> dict[str, Any]:
         """Figures by the name of their place on the page."""
@@ -172,7 +173,17 @@ class Figures:
         return made
 
     def show(self, drawn: Drawn) -> None:
-        """Fill in a design; where it has no controller nothing is drawn of it."""
+        """Fill in a design; where it has no controller nothing is drawn of it.
+
+        Each figure is painted once, when all of it has arrived.
+        """
+        for made in self._curves:
+            made.hold_render = True
+        self._fill(drawn)
+        for made in self._curves:
+            made.hold_render = False
+
+    def _fill(self, drawn: Drawn) -> None:
         look, c = drawn.look, drawn.curves
         inner = look.problem.inner
         self.S_max.bottom, self.disk.glyph.radius = inner.S_max, 1.0 / inner.S_max
