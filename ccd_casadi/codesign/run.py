@@ -163,8 +163,8 @@ def _with_look(
     if verified.kkt.stationarity > KKT_LEVEL:
         ends = [verify(sampler, end) for end in perturbed(sampler, verified.x, seed)]
         verified = _best([verified, *ends], formulation.tolerance)
-    if isinstance(formulation, Direct):  # the true functions predict themselves, wherever it ended
-        outcome = replace(outcome, x=verified.x, design=sampler.design(verified.x))
+        if isinstance(formulation, Direct):  # has no surrogate that could have promised another
+            outcome = replace(outcome, x=verified.x, design=sampler.design(verified.x))
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
 
 
