@@ -1,5 +1,8 @@
 """Fixed structures on plants of several channels: the whole loop's bounds and their derivatives."""
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 from fixed_structure_channels import (
@@ -13,7 +16,7 @@ from fixed_structure_channels import (
 )
 from helpers import sensitivity_gain
 
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.fixed_structure import Sampling, mimo_figures
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem, plants_of_rows
 from ccd_casadi.fixed_structure.curvature import hessians
@@ -143,3 +146,26 @@ def test_peaks_of_the_whole_are_those_of_dense_grids(off: tuple[float, ...]) -> 
         assert np.exp(own) * BOUNDS.S_max >= gain.max() * (1.0 - 1e-9)
         assert np.exp(own) * BOUNDS.S_max <= gain.max() * (1.0 + 1e-3)
     assert structure().order == 3 * STRUCTURE.order
+
+
+def test_a_maximum_beside_a_crossing_of_singular_values_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The higher of two that lie so close that no point of the grid is above its neighbours."""
+
+    def levels(problem, kappa, tau, which, v, least):  # type: ignore[no-untyped-def]
+        one, other = (top - 2e3 * (v - at) ** 2 for at, top in ((1.0, 0.0), (1.01, 0.05)))
+        return {Curve.T: np.sort(np.stack([one, other], axis=-1))[..., ::-1]}
+
+    monkeypatch.setattr(mimo_figures, "_levels", levels)
+    problem = cast(MatrixProblem, SimpleNamespace(plants=SimpleNamespace(plants=(None,))))
+    # the grid's own largest sigma_1 is elsewhere; sigma_2 is largest where the two cross
+    brackets = (np.full(2, Curve.T), np.array([0, 1]), np.array([1.0, 1.004]),
+                np.array([0.99, 1.0]), np.array([1.004, 1.03]))  # fmt: skip
+    kind, rows, start, low, high = mimo_figures._split(
+        problem, np.zeros(0), 0.0, brackets, np.array([0.0, -0.04])
+    )
+    assert ((rows == 0) & (low < 1.01) & (high > 1.01)).sum() == 1
+    assert (rows == 0).sum() == 2  # and the one that was known stays
+    assert ((low <= start) & (start <= high)).all()
+    assert (kind == Curve.T).all()

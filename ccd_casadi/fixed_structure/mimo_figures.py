@@ -47,6 +47,12 @@ from ccd_casadi.support.arrays import Array
 # singular values ripple around 1 wherever the loop has no gain.
 RELEVANT = -0.4
 WITHIN = 0.4
+# Sorted singular values may have two maxima between neighbours of the grid, where the smooth ones
+# cross: brackets of a maximum above -CLOSE are looked at again at so many places.
+CLOSE = 0.1
+FINER = 13
+# Curve, row, start, low and high end of each.
+Brackets = tuple[np.ndarray, np.ndarray, Array, Array, Array]
 OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING)
 
 
@@ -163,7 +169,8 @@ def _(
     outputs = problem.plants.matrices.shape[2]
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     found, near = [], []
-    for curve, value in _levels(problem, kappa, tau, v, min(depth, -within)).items():
+    which = np.broadcast_to(np.arange(P)[:, None], v.shape)
+    for curve, value in _levels(problem, kappa, tau, which, v, min(depth, -within)).items():
         if curve is Curve.SHAPE:
             value = np.where(v[..., None] <= crossing, value, -np.inf)
         left = np.pad(value, ((0, 0), (1, 0), (0, 0)), constant_values=-np.inf)[:, :-1]
@@ -172,7 +179,8 @@ def _(
         low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
         if curve is Curve.SHAPE:
             high = np.minimum(high, crossing)
-        found.append((np.full(len(i), curve), i + k * P, v[i, at], low, high))
+        brackets = (np.full(len(i), curve), i + k * P, v[i, at], low, high)
+        found.append(_split(problem, kappa, tau, brackets, value[i, at, k]))
         i, at, k = np.nonzero(regular[..., None] & (value > -within))
         near.append((np.full(len(i), curve), i + k * P, v[i, at]))
     kind, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -241,15 +249,53 @@ def _channels(
     return np.stack(values, -1), np.stack(ln_slopes, -1), np.concatenate(slopes, -1)
 
 
-def _levels(
-    problem: MatrixProblem, kappa: Array, tau: float, v: Array, least: float
-) -> dict[Curve, Array]:
-    """ln σ over the bound (P, k, c) of every curve, -inf where none can be above `least`.
+def _split(
+    problem: MatrixProblem, kappa: Array, tau: float, brackets: Brackets, value: Array
+) -> Brackets:
+    """Brackets of one curve's maxima with `value` there; those that hold several come apart.
 
-    σ² is never above the largest row sum of |MᴴM|: most frequencies need no decomposition.
+    A maximum of σ_k+1 where smooth ones cross has one of σ_k beside it, which the grid may miss.
+    """
+    kind, rows, start, low, high = brackets
+    at = np.flatnonzero((value > -CLOSE) & (low < high))
+    if not len(at):
+        return brackets
+    P = len(problem.plants.plants)
+    inside = np.geomspace(low[at], high[at], FINER, axis=1)
+    which = np.broadcast_to((rows[at] % P)[:, None], inside.shape)
+    level = _levels(problem, kappa, tau, which, inside, -2.0 * CLOSE)[Curve(int(kind[0]))]
+
+    def tops(row: np.ndarray) -> np.ndarray:
+        own = level[np.arange(len(at)), :, row // P]
+        return np.asarray((own[:, 1:-1] >= own[:, :-2]) & (own[:, 1:-1] > own[:, 2:]))
+
+    def bracketed(row: np.ndarray, top: np.ndarray) -> Brackets:
+        i, m = np.nonzero(top)
+        return kind[at[i]], row[i], inside[i, m + 1], inside[i, m], inside[i, m + 2]
+
+    several = tops(rows[at])
+    several &= (several.sum(axis=1) > 1)[:, None]
+    kept = np.setdiff1d(np.arange(len(start)), at[several.any(axis=1)])
+    above = np.maximum(rows[at] - P, rows[at] % P)
+    beside = tops(above) & (rows[at] >= P)[:, None]
+    known = above[:, None] == rows  # no maximum twice
+    x = inside[:, 1:-1, None]
+    beside &= ~(known[:, None] & (low <= x) & (x <= high)).any(axis=2)
+    parts = zip((part[kept] for part in brackets), bracketed(rows[at], several),
+                bracketed(above, beside), strict=True)  # fmt: skip
+    kind, rows, start, low, high = (np.concatenate(part) for part in parts)
+    return kind, rows, start, low, high
+
+
+def _levels(
+    problem: MatrixProblem, kappa: Array, tau: float, which: np.ndarray, v: Array, least: float
+) -> dict[Curve, Array]:
+    """ln σ over the bound (..., c) of every curve on the plants `which` at v, of one shape.
+
+    -inf where none can be above `least`. σ² is never above the largest row sum of |MᴴM|: most
+    frequencies need no decomposition.
     """
     plants = problem.plants
-    which = np.broadcast_to(np.arange(len(v))[:, None], v.shape)
     S, KS, T = loop_matrices(problem, kappa, which, v)
     found: dict[Curve, Array] = {}
     for curve in problem.curves:
