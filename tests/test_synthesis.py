@@ -1,5 +1,7 @@
 """Certified synthesis: the optimum, SB10AD, published figures, and invariance."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ from helpers import (
     two_mass,
     two_mass_model,
 )
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.plants.modal import Suspension
@@ -236,11 +238,30 @@ def figures_of(system: Mechanics, w: Weights, second: float, suspension: Suspens
     return values | {name: getattr(figures, name) * second for name in RATES}
 
 
-def check_equal(a: dict, b: dict, tolerance: float) -> None:
+def check_equal(a: dict, b: dict, tolerance: float, moved: dict | None = None) -> None:
+    """Equal to a relative `tolerance`, or to what rounding of the data `moved` the figure by."""
     for name, value in a.items():
+        limit = max(tolerance, (moved or {}).get(name, 0.0))
         # the top of a peak is flat: its place is known to the root of what its height is
-        limit = 1e3 * tolerance if name == "sensitivity_peak_frequency" else tolerance
+        limit = 1e3 * limit if name == "sensitivity_peak_frequency" else limit
         assert b[name] == pytest.approx(value, rel=limit), name
+
+
+def with_last_bits_changed(system: Mechanics, seed: int) -> Mechanics:
+    """The system with every entry of its matrices one rounding error up or down."""
+    rng = np.random.default_rng(seed)
+
+    def near(matrix: np.ndarray) -> np.ndarray:
+        return matrix * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], matrix.shape))
+
+    def symmetric(matrix: np.ndarray) -> np.ndarray:
+        return 0.5 * (near(matrix) + near(matrix).T)
+
+    return replace(
+        system,
+        M=symmetric(system.M), D=symmetric(system.D), K=symmetric(system.K),
+        B=near(system.B), C=near(system.C),
+    )  # fmt: skip
 
 
 def in_units(system: Mechanics, kg: float, m: float, s: float, N: float) -> Mechanics:
@@ -304,9 +325,11 @@ def test_figures_do_not_depend_on_the_coordinates(seed: int, rigid: int, more: i
     )  # fmt: skip
     w = Weights(**(vars(PAPER) | {"M_K": 1e5, "omega_S": 30.0 * HZ, "omega_T": 100.0 * HZ}))
     figures = figures_of(system, w, 1.0, SUSPENSION)
-    # channels that are all but aligned magnify rounding: at a peak of 9 it shows up to 6e-6
-    assume(figures["sensitivity_peak"] < 3.0)
-    check_equal(figures, figures_of(other, w, 1.0, SUSPENSION), 1e-7)
+    # Channels that are all but aligned magnify rounding, up to 2e-6. Of 488 draws none differed in
+    # other coordinates by more than 5.5 times what the last bits of the data make it differ by.
+    nearby = [figures_of(with_last_bits_changed(system, i), w, 1.0, SUSPENSION) for i in range(3)]
+    moved = {k: 20.0 * max(abs(near[k] / v - 1.0) for near in nearby) for k, v in figures.items()}
+    check_equal(figures, figures_of(other, w, 1.0, SUSPENSION), 1e-7, moved)
 
 
 @pytest.mark.parametrize("angle", [0.3, 0.7, 1.2])
