@@ -32,6 +32,7 @@ from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.recurrence import states
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
@@ -82,16 +83,17 @@ class Sampled:
         return held.response(omega), self.system.response(omega)
 
     def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
-        """Errors and forces from rest, plant and controller advanced one after the other."""
+        """Errors e (N, p) and forces u (N, m) from rest.
+
+        u = K e + what is fed forward; x and z are the states of plant and controller.
+        """
         G, K = sampled_plant(plant.plant_si(), self.period, self.delay), self.system
-        x, z = np.zeros(len(G.A)), np.zeros(len(K.A))
-        errors, inputs = np.empty_like(references), np.empty_like(forces)
-        for k, (r, ahead) in enumerate(zip(references, forces, strict=True)):
-            errors[k] = e = r - G.C @ x
-            inputs[k] = u = K.C @ z + K.D @ e + ahead
-            z = K.A @ z + K.B @ e
-            x = G.A @ x + G.B @ u
-        return errors, inputs
+        n = len(G.A)
+        A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+        driven = np.hstack([(references @ K.D.T + forces) @ G.B.T, references @ K.B.T])
+        joint = states(A, driven)
+        errors = references - joint[:, :n] @ G.C.T
+        return errors, joint[:, n:] @ K.C.T + errors @ K.D.T + forces
 
 
 def as_it_runs(run: FinishedRun) -> FinishedRun:
