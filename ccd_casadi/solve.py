@@ -203,10 +203,11 @@ def command(options: argparse.Namespace) -> ExitCode:
     if not options.quiet:
         print(summary(solution))
         print(f"run folder    {folder}")
-    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+    if not options.no_report:
+        from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
 
-    plant_case, solved = resolved(case, solution), solution.problem or problem
-    write_report(folder, plant_case, solved, solution, quiet=options.quiet)
+        plant_case, solved = resolved(case, solution), solution.problem or problem
+        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code
@@ -227,6 +228,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--surrogate",
         metavar="NAME",
         help="start from a version of the run folder's surrogates (0002), not by sampling",
+    )
+    arguments.add_argument(
+        "--no-report",
+        action="store_true",
+        help="write no report.html: for jobs whose result.json is read by a program",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

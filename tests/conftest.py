@@ -84,12 +84,6 @@ def two_mass_run(solved: Callable[[str], Path]) -> Path:
     return solved("lifted")
 
 
-@pytest.fixture
-def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`solve` draws no report: for tests that look at none, it is half of a small solve."""
-    monkeypatch.setattr("ccd_casadi.reporting.solve_page.write_report", lambda *_, **__: None)
-
-
 @pytest.fixture(scope="module")
 def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     from dask_processes import Processes

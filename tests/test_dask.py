@@ -39,7 +39,8 @@ def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> 
 def test_a_solve_on_a_cluster_is_the_solve_on_one_worker(shared: Processes, tmp_path: Path) -> None:
     """Result, controller, surrogate and rows, to the last bit."""
     quick = "\n[sampling]\nlifted_points = 12\n[outer]\nbox_points = 4\nmax_refinements = 0\n"
-    words = [str(changed(tmp_path, more=quick)), "--formulation", "lifted", "--quiet", "--out"]
+    words = [str(changed(tmp_path, more=quick)), "--formulation", "lifted", "--quiet"]
+    words += ["--no-report", "--out"]
     one, folder = tmp_path / "one", tmp_path / "cluster"
     assert main([*words, str(one), "--workers", "1"]) in (0, 4)
     assert main([*words, str(folder), "--scheduler", shared.address]) in (0, 4)

@@ -33,7 +33,8 @@ def robust_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     more = '\n[robust]\nresonance_shift = 0.02\nshifts = 3\ndesign_at = "low"\n'
     more += "[sampling]\nlifted_points = 24\n[outer]\nbox_points = 0\n"
     (folder / "case.toml").write_text(text + more)
-    options = ["--formulation", "lifted", "--workers", "1", "--quiet", "--out", str(folder / "run")]
+    options = ["--formulation", "lifted", "--workers", "1", "--quiet", "--no-report"]
+    options += ["--out", str(folder / "run")]
     assert solve([str(folder / "case.toml"), *options]) == 0
     return folder / "run"
 

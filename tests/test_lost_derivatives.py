@@ -31,7 +31,6 @@ def lose(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
     monkeypatch.setattr(module, "design_with_gradients", losing)
 
 
-@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("formulation", ["direct", "lifted"])
 def test_the_optimum_is_found_past_designs_without_derivatives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
@@ -39,14 +38,13 @@ def test_the_optimum_is_found_past_designs_without_derivatives(
     """By IPOPT's starts alone: without the look over the box at the end."""
     lose(monkeypatch, 0.2)
     case = changed(tmp_path, more="\n[outer]\nbox_points = 0\n")
-    words = [str(case), "--out", str(tmp_path / "run"), "--quiet", "--workers", "1"]
+    words = [str(case), "--out", str(tmp_path / "run"), "--quiet", "--no-report", "--workers", "1"]
     assert solve([*words, "--formulation", formulation]) == 0
     result = read(tmp_path / "run")
     assert result["status"] == "verified"
     assert result["objective"] == pytest.approx(-439.46482, abs=2e-5)
 
 
-@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize(
     "formulation", ["direct", "lifted", pytest.param("nested", marks=pytest.mark.slow)]
 )
@@ -57,7 +55,7 @@ def test_without_any_derivatives_nothing_is_claimed(
     formulation: str,
 ) -> None:
     lose(monkeypatch, 1.0)
-    words = [str(CASE), "--out", str(tmp_path), "--quiet", "--workers", "1"]
+    words = [str(CASE), "--out", str(tmp_path), "--quiet", "--no-report", "--workers", "1"]
     assert solve([*words, "--formulation", formulation]) in (3, 4)
     assert "certified" in capsys.readouterr().err
     result = json.loads((tmp_path / "result.json").read_text())

@@ -21,11 +21,11 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 def solved(case: Path, folder: Path) -> FinishedRun:
     options = ["--formulation", "lifted", "--out", str(folder), "--workers", "1", "--quiet"]
+    options += ["--no-report"]
     assert main([str(case), *options]) == 0
     return read_run(folder)
 
 
-@pytest.mark.usefixtures("no_page")
 def test_three_mass_axis_is_designed_between_its_bounds(tmp_path: Path) -> None:
     axis = Path(shutil.copytree(EXAMPLES / "three_mass_axis", tmp_path / "axis"))
     with (axis / "case.toml").open("a") as file:

@@ -97,6 +97,7 @@ def test_solve_starts_from_a_named_version(retrained: Path, tmp_path: Path, name
     folder = tmp_path / "run"
     shutil.copytree(retrained / "surrogates", folder / "surrogates")
     words = [str(without_look(tmp_path)), "--out", str(folder), "--workers", "1", "--quiet"]
+    words += ["--no-report"]
     assert solve([*words, "--formulation", "lifted", "--surrogate", name]) == 0
     found = result(folder)
     assert found["objective"] == pytest.approx(-439.4648, abs=1e-3)
@@ -138,6 +139,7 @@ def test_a_nested_run_is_retrained_over_theta(tmp_path: Path) -> None:
     assert newest[0].X.shape[1] == 2
     count = found["syntheses"]
     words = [str(without_look(tmp_path)), "--out", str(folder), "--workers", "1", "--quiet"]
+    words += ["--no-report"]
     assert solve([*words, "--surrogate", "0001"]) == 0
     with sqlite3.connect(folder / "samples.sqlite") as database:
         (after,) = database.execute("select count(*) from samples").fetchone()

@@ -158,7 +158,16 @@ def test_the_report_opens_offline(solved: Callable[[str], Path]) -> None:
     assert re.findall(r"""(?:url\(|@import)\s*["']?\s*(?:https?:)?//""", page) == []
 
 
-@pytest.mark.usefixtures("no_page")
+def test_a_run_without_a_report_has_everything_else(
+    solved: Callable[[str], Path], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(solved("nested"), tmp_path / "run"))
+    before = {path.name for path in folder.iterdir()}
+    assert "report.html" in before
+    assert run(folder, "--no-report") == 0
+    assert {path.name for path in folder.iterdir()} == before - {"report.html"}
+
+
 def test_a_second_run_reuses_every_sample(
     solved: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,19 +179,18 @@ def test_a_second_run_reuses_every_sample(
 
     monkeypatch.setattr(sampling, "inner_unit", untouchable)
     monkeypatch.setattr(sampling, "design_unit", untouchable)
-    assert run(folder, "--resume") == 0
+    assert run(folder, "--resume", "--no-report") == 0
     after = read(folder)
     assert after.pop("seconds") < before.pop("seconds")
     assert after == before
 
 
-@pytest.mark.usefixtures("no_page")
 def test_the_summary_says_what_matters(
     solved: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = Path(shutil.copytree(solved("direct"), tmp_path / "run"))
     words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--formulation", "direct"]
-    assert main(words) == 0
+    assert main([*words, "--no-report"]) == 0
     lines = capsys.readouterr().out.splitlines()
     found = {line.split()[0]: line for line in lines}
     assert "verified" in found["status"]
@@ -194,7 +202,6 @@ def test_the_summary_says_what_matters(
     assert str(folder) in found["run"]
 
 
-@pytest.mark.usefixtures("no_page")
 @pytest.mark.parametrize("formulation", ["lifted", pytest.param("nested", marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
@@ -205,6 +212,7 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
     case = changed(tmp_path, more=quick + "max_refinements = 0\n")
     for workers in ("1", "2"):
         words = ["--out", str(tmp_path / workers), "--quiet", "--formulation", formulation]
+        words += ["--no-report"]
         assert main([str(case), *words, "--workers", workers]) in (0, 4)
     one, two = (read(tmp_path / workers) for workers in ("1", "2"))
     assert one.pop("seconds") > 0.0 < two.pop("seconds")
@@ -216,14 +224,13 @@ def test_the_result_does_not_depend_on_the_number_of_workers(
 # ---- constraints, and cases that cannot be solved ------------------------------------------------
 
 
-@pytest.mark.usefixtures("no_page")
 def test_a_plants_own_constraint_binds_in_every_formulation(tmp_path: Path) -> None:
     quick = "\n[sampling]\npoints = 4\nlifted_points = 16\n[outer]\nstarts = 2\nbox_points = 0\n"
     case = own_plant(tmp_path, 118.0, quick)
     objectives = []
     for formulation in ("nested", "lifted", "direct"):
         folder = tmp_path / formulation
-        assert run(folder, "--formulation", formulation, case=case) == 0
+        assert run(folder, "--no-report", "--formulation", formulation, case=case) == 0
         result = read(folder)
         assert sum(result["theta"].values()) >= 118.0 - 1e-9
         assert "total" in result["active"]
@@ -268,13 +275,12 @@ def test_a_constraint_that_no_theta_meets_is_named(tmp_path: Path, formulation: 
     assert "1.5" in result["reason"], "by how much"
 
 
-@pytest.mark.usefixtures("no_page")
 def test_what_is_not_verified_is_not_called_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     strict = "[outer]\ntolerance = 1e-15\nmax_refinements = 0\nbox_points = 0\n"
     case = changed(tmp_path, more=f"\n[sampling]\npoints = 2\n{strict}")
-    assert run(tmp_path / "run", case=case) == 4
+    assert run(tmp_path / "run", "--no-report", case=case) == 4
     result = read(tmp_path / "run")
     assert result["status"] == "not_verified"
     assert result["checks"]["prediction"] is False
@@ -287,12 +293,11 @@ def test_what_is_not_verified_is_not_called_so(
     assert (tmp_path / "run" / "controller.json").exists()
 
 
-@pytest.mark.usefixtures("no_page")
 def test_an_infeasible_run_leaves_no_design_of_an_earlier_one(tmp_path: Path) -> None:
     """The folder is reused with a harder case: what lies in it must belong together."""
     small = "\n[sampling]\npoints = 2\n[outer]\nmax_refinements = 0\nbox_points = 0\n"
     case = changed(tmp_path, more=small)
-    run(tmp_path / "run", case=case)
+    run(tmp_path / "run", "--no-report", case=case)
     assert (tmp_path / "run" / "controller.json").exists()
     case = changed(tmp_path, ("S_max = 1.75", "S_max = 1.05"), more=small)
     assert run(tmp_path / "run", case=case) == 3
