@@ -14,9 +14,9 @@ def states(A: Array, driven: Array) -> Array:
     """
     steps = max(int(np.ceil(np.sqrt(len(driven)))), 1)
     pieces = -(-len(driven) // steps)
-    d = np.zeros((pieces * steps, len(A)))
-    d[: len(driven)] = driven
-    d = d.reshape(pieces, steps, len(A))
+    padded = np.zeros((pieces * steps, len(A)))
+    padded[: len(driven)] = driven
+    d = padded.reshape(pieces, steps, len(A))
     x = np.zeros((pieces, steps + 1, len(A)))
     for k in range(steps):
         x[:, k + 1] = x[:, k] @ A.T + d[:, k]
