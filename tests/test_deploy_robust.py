@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
+from ccd_casadi.deployment.compliance import sampled_compliance
 from ccd_casadi.deployment.discretise import Discretisation
 from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
 from ccd_casadi.deployment.pipeline import Timing, deploy
@@ -20,6 +22,7 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.compliance import compliance_of
 
 RUNS = Path(__file__).parent.parent / "runs"
 ONE_WAY = Timing(method=Discretisation.RAMP, lead=True)
@@ -69,6 +72,24 @@ def test_what_is_verified_holds_between_the_plants_too(
     assert worst <= (1.0 + SAMPLED_EXCESS) * run.problem.inner.S_max * (1.0 + 1e-4)
     assert worst <= found.worst.figures.sensitivity_peak * (1.0 + 1e-4)
     assert {at.shift for at, _ in found.measured_members} >= {-0.02, 0.02}
+
+
+def test_a_bound_on_the_compliance_is_kept_or_told(
+    deployed: tuple[FinishedRun, Deployment],
+) -> None:
+    run, found = deployed
+    assert found.compliance is None, "this case bounds none"
+    most = sampled_compliance(
+        run.plant.plant_si(), sensitivity_loop(found.plant, found.realisation.system)
+    )
+    whole = compliance_of(run.plant, found.reduced).gain
+    assert most == pytest.approx(whole, rel=0.05), "the rate is far above the loop's peak"
+    at = replace(found, compliance=(Perturbation(0.02), most), compliance_max=1.01 * most)
+    assert at.passed
+    broken = replace(at, compliance_max=most / 1.2)
+    assert not broken.passed
+    assert "compliance |GS|" in broken.shortfalls[0]
+    assert "resonances +2 %" in broken.shortfalls[0]
 
 
 def test_a_rate_enough_for_the_nominal_plant_alone_is_not_enough(

@@ -112,11 +112,13 @@ def deploy_as_designed(
     progress("simulation")
     worst = [max(checked, key=lambda item: item.badness).at] if checked else []
     stable = sampled.stable and all(item.figures.stable for item in checked)
+    bounded = sections.compliance_max is not None and stable
+    compliance = plants.compliance(realisation) if bounded else None
     measured, simulated = plants.simulated(realisation, worst, seed) if stable else (None, ())
     return Deployment(
         orders, limits, K, full, tuple(trials), target, rate, delay, best.conversion,
         plants.nominal, realisation, sampled, measured, checked, simulated, unverified(run),
-        statics_of(run, realisation.system),
+        statics_of(run, realisation.system), compliance, sections.compliance_max,
     )  # fmt: skip
 
 

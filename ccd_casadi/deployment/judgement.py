@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.compliance import sampled_compliance
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
 from ccd_casadi.deployment.sampled import (
@@ -25,6 +26,8 @@ class SampledSet:
         self, run: FinishedRun, members: Sequence[Member], period: float, delay: float
     ) -> None:
         self.run = run
+        self.free = {Perturbation(): run.plant.plant_si()}
+        self.free |= {m.at: m.plant.plant_si() for m in members}
         self.nominal = sampled_plant(run.plant.plant_si(), period, delay)
         self.members = {m.at: sampled_plant(m.plant.plant_si(), period, delay) for m in members}
 
@@ -36,6 +39,17 @@ class SampledSet:
             for at, plant in self.members.items()
         )
         return sampled_figures(sensitivity_loop(self.nominal, K)), loops
+
+    def compliance(self, realisation: Realisation) -> tuple[Perturbation, float]:
+        """The largest |GS| in m/N of all plants, and where; every sampled loop is stable."""
+        held = {Perturbation(): self.nominal, **self.members}
+        K = realisation.system
+        found = {
+            at: sampled_compliance(self.free[at], sensitivity_loop(plant, K))
+            for at, plant in held.items()
+        }
+        at = max(found, key=lambda item: found[item])
+        return at, found[at]
 
     def simulated(
         self, realisation: Realisation, shown: Collection[Perturbation], seed: int

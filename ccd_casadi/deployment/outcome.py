@@ -57,7 +57,8 @@ class Deployment:
     `sampled` are the exact figures of the sampled loop on the nominal plant, `measured` those of
     its simulation (None where it is unstable on any plant); `members` and `measured_members` those
     on every other plant of the run's [robust] set. `unverified`: why the run itself is not
-    verified, empty where it is.
+    verified, empty where it is. `compliance`: the largest |GS| in m/N and on which plant, where the
+    case bounds it.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -77,6 +78,8 @@ class Deployment:
     measured_members: tuple[tuple[Perturbation, MeasuredSensitivity], ...] = ()
     unverified: str = ""
     statics: Statics | None = None
+    compliance: tuple[Perturbation, float] | None = None
+    compliance_max: float | None = None
 
     @property
     def order(self) -> int:
@@ -108,6 +111,11 @@ class Deployment:
             if not (self.target.met if nominal else self.target.held)(item.figures):
                 found.append((item.badness, f"{_fault(self, item)} ({place_words(item.at)})"))
         words = [w for _, w in sorted(found, key=lambda pair: -pair[0])]
+        if self.compliance is not None and self.compliance_max is not None:
+            at, gain = self.compliance
+            if gain > (1.0 + self.target.excess) * self.compliance_max:
+                missed = missed_by(gain, self.compliance_max)
+                words.append(f"compliance |GS| in m/N {missed} ({place_words(at)})")
         if words or self.measured is None:
             return tuple(words)
         pairs = [(Perturbation(), self.measured), *self.measured_members]

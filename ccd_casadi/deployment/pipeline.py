@@ -21,12 +21,15 @@ from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing as Timing
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.compliance import compliance_of
 
-# A reduced controller keeps S_max to 0.5 % (it binds at most optima, where any change passes it a
-# little), S_low, 99 % of ω_b, and no gain more than twice the bound that γ puts on it.
+# A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
+# where any change passes them a little), S_low, 99 % of ω_b, and no gain more than twice the bound
+# that γ puts on it.
 REDUCED_PEAK, REDUCED_NORM, REDUCED_BANDWIDTH = 1.005, 2.0, 0.99
 STRICT = 1e-6  # relative: S_max kept as the design itself keeps it
 LEAST_RATE = 4.0  # samples in a period of ω_b
@@ -88,11 +91,13 @@ def deploy(
     shown = {item.at for item in family}
     if checked:
         shown.add(max(checked, key=lambda m: m.badness).at)
+    bounded = inner.compliance_max is not None and stable
+    compliance = plants.compliance(realisation) if bounded else None
     measured, simulated = plants.simulated(realisation, shown, seed) if stable else (None, ())
     return Deployment(
         orders, limits, reduced, reduced_figures, trials, target, rate, delay,
         best.conversion, plants.nominal, realisation, sampled, measured, checked, simulated,
-        unverified(run), statics_of(run, realisation.system),
+        unverified(run), statics_of(run, realisation.system), compliance, inner.compliance_max,
     )  # fmt: skip
 
 
@@ -104,20 +109,26 @@ def _orders(
     progress: Callable[[str], None],
 ) -> ChannelOrders:
     progress(f"orders of channel {channel.name}")
-    inner = run.problem.inner
+    inner, most = run.problem.inner, run.problem.inner.compliance_max
     rows = reductions(channel, run.weights, inner.omega_low)
     strict = replace(limits, peak=inner.S_max * (1.0 + STRICT))
     order = WorstFirst(family)
 
+    def compliant(plant: ScaledPlant, row: Reduced) -> bool:
+        return most is None or compliance_of(plant, row.controller).gain <= REDUCED_PEAK * most
+
     def holds(peak: float) -> Callable[[Reduced], bool]:
         def on(member: Member, row: Reduced) -> bool:
+            plant = member.seen_by(channel)
             figures = measure(
-                member.seen_by(channel), row.controller, run.weights, gamma=UNBOUNDED,
-                omega_low=inner.omega_low,
-            )  # fmt: skip
-            return figures.certificate.stable and figures.sensitivity_peak <= peak
+                plant, row.controller, run.weights, gamma=UNBOUNDED, omega_low=inner.omega_low
+            )
+            kept = figures.certificate.stable and figures.sensitivity_peak <= peak
+            return kept and compliant(plant, row)
 
-        return lambda row: order.all(lambda member: on(member, row))
+        return lambda row: (
+            compliant(channel.plant, row) and order.all(lambda member: on(member, row))
+        )
 
     return ChannelOrders(
         channel,
