@@ -17,15 +17,15 @@ from ccd_casadi.fixed_structure import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.figures import Curve, assess
 from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.starts import by_rules, kept
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
 from ccd_casadi.plants.modal import Perturbation, modal_plant
-from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import scale_plant, scale_state_space
 from ccd_casadi.synthesis.closed_loop import measure, responses
 
@@ -89,6 +89,24 @@ def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
             assert made.certified
             ends.append(made.bandwidth)
         assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slope[i], rel=2e-3)
+
+
+def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
+    """Its only pole is the suspension's; S, T and GS have their peaks a hundred times above it."""
+    still = (np.zeros((1, 1, 1)),) * 5
+    M, D, K, B, C = (np.array([[value]]) for value in (100.0, 0.0, 0.0, 1.0, 1.0))
+    mass = Mechanics(M, D, K, B, C, 0.01, still)
+    body = scale_plant(modal_plant(mass, SUSPENSION), WEIGHTS.M_K)
+    bounds = replace(EASY, weighted_level=None, weights=None)
+    problem = problem_for([body], SMALL, bounds)
+    rng = np.random.default_rng(0)
+    kappa = kept(problem, at_random(problem, np.exp(rng.uniform(-2.0, -1.0, 20)), rng))[0]
+    peaks = assess(problem, kappa, -2.0, depth=-np.inf).peaks
+    unit = problem.plants
+    controller = state_space(SMALL, SMALL.in_units(kappa, unit.omega_0, unit.force))
+    judged = certify([body], controller, bounds).plants[0]
+    found = np.exp(peaks.value[peaks.curve == Curve.S_MAX].max() - problem.margin) * bounds.S_max
+    assert found == pytest.approx(judged.S_peak, rel=1e-6)
 
 
 def test_a_gradient_is_not_made_up_away_from_an_optimum(design) -> None:

@@ -11,7 +11,10 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, root, variable
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
+from ccd_casadi.fixed_structure.figures import Curve, evaluate
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.modal_sum import modal_sum
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
@@ -75,6 +78,39 @@ def test_a_box_with_a_plant_that_fails_is_refuted_at_a_plant_that_fails(sampling
         assert worst["bandwidth"] < bandwidth
     else:
         assert worst[{"S_MAX": "S_max", "S_LOW": "S_low"}.get(name, name)] >= factor * (1.0 - 1e-9)
+
+
+@pytest.mark.parametrize("sampling", [None, LATE], ids=["continuous", "late"])
+@pytest.mark.parametrize("structure", [STRUCTURE, Structure(False, biquads=1)], ids=["I", "no I"])
+def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> None:
+    """Against the search's own figures, which small enclosures have to meet at a corner."""
+    rng, count, unit = np.random.default_rng(5), 60, 3000.0
+    kappa = KAPPA if structure.integrator else np.delete(KAPPA, 1)
+    period, delay = (sampling.period * unit, sampling.delay * unit) if sampling else (None, 0.0)
+    box = replace(BOX, resonance_shift=0.0, damping=(1.0, 1.0))
+    plant, bandwidth = modal_sum(box, 0, unit), 20.0 * HZ
+    assert plant is not None
+    family = LoopFamily(plant, box.names, structure, structure.in_units(kappa, 1.0 / unit, 1.0),
+                        BOUNDS, bandwidth, unit, period, delay)  # fmt: skip
+    omega, gain = np.exp(rng.uniform(*np.log([2.0 * HZ, 400.0 * HZ]), count)), np.zeros(count)
+    middle = np.vstack([omega, gain])
+    half = 10.0 ** rng.uniform(-5.0, -3.0, (2, count)) * np.vstack([omega, np.ones(count)])
+    scale = np.array([[(period or 1.0) / unit], [1.0]])
+    chart = np.full(count, Chart.LOW if sampling is None else Chart.SAMPLED)
+    found = family.enclose(Boxes(chart, (middle - half) * scale, (middle + half) * scale))
+    assert found.bounded.all()
+    signs = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
+    corner = (middle[:, :, None] + half[:, :, None] * signs[:, None]).reshape(2, -1)
+    plants = box.plants([(0, point) for point in corner[1:].T])
+    problem = problem_for(plants, structure, BOUNDS, sampling)
+    own = problem.plants
+    loops = evaluate(problem, in_problem_units(problem, kappa), 0.0, np.arange(len(plants)),
+                     own.variable(corner[0] / own.omega_0))  # fmt: skip
+    for curve in (Curve.S_MAX, Curve.KS, Curve.T, Curve.GS):
+        highest = found.highest[found.names.index(curve.name)]
+        value = np.exp(loops.levels[curve]).reshape(count, 4).max(axis=1)
+        assert (value <= highest * (1.0 + 1e-9)).all()
+        assert np.median(1.0 - value / highest) < 1e-4
 
 
 def test_an_unstable_corner_is_never_proven() -> None:

@@ -1,23 +1,36 @@
-"""The explorer's figures: empty once, then filled from curves as designs are looked at."""
+"""The explorer's figures: empty once, then filled from curves as designs are looked at.
 
+What a design changes is handed out as changes, which the page sends in one message.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, CrosshairTool, DataRange1d, HoverTool, Range1d
+from bokeh.events import Reset
+from bokeh.models import ColumnDataSource, CrosshairTool, CustomJS, HoverTool, Range1d
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
-from ccd_casadi.reporting.svg import AMBER, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY
+from ccd_casadi.reporting.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 
 HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there
 SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
-PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, SKY)
-DASHES = {Standing.KEPT: "solid", Standing.MISSED: "solid", Standing.REFUSED: "dashed"}
+PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
+DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.REFUSED: [6]}
+PADDING = 0.1  # of the data, that an axis reaches beyond them
+# After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
+FOLLOW = CustomJS(
+    code="""for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
+  range.have_updated_interactively = false"""
+)
+
+Change = tuple[Any, dict[str, Any]]  # a model, and new values of its properties
 
 
 @dataclass(frozen=True)
@@ -60,7 +73,6 @@ class Figures:
         self.move_figure = self._time("move", "ms", "error of a move (µm)", self.move, "um")
         self.end = Span(dimension="height", line_color=GREY, line_dash="dashed")
         self.move_figure.add_layout(self.end)
-        self._curves = list(self.all().values())
 
     def all(self) -> dict[str, Any]:
         """Figures by the name of their place on the page."""
@@ -75,6 +87,7 @@ class Figures:
             min_border_left=58, tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above",
             **options,
         )  # fmt: skip
+        made.js_on_event(Reset, FOLLOW)
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
@@ -98,12 +111,12 @@ class Figures:
             x_axis_type="log",
             y_axis_type="log",
             x_range=hz,
+            y_range=Range1d(start=1e-3, end=2.0),
         )
         made.varea("hz", f"b{name}", "top", source=self.gains, fill_color=ORANGE, fill_alpha=0.13)
         made.line("hz", f"b{name}", source=self.gains, line_color=ORANGE, line_dash="dashed")
         self._pins(made, name)
         line = self._line(made, "hz", name, self.gains)
-        renderers = [line]
         if name == "S":
             self.S_max = BoxAnnotation(
                 bottom=2.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay"
@@ -123,7 +136,6 @@ class Figures:
                 line_dash="dotdash",
                 line_width=1.6,
             )
-        made.y_range = DataRange1d(renderers=renderers, range_padding=0.12)
         made.add_tools(
             CrosshairTool(overlay=self.cursor),
             _hover(line, [("Hz", "@hz{0.00}"), (name, f"@{name}{{0.0000}}")]),
@@ -145,8 +157,8 @@ class Figures:
         return made
 
     def _poles(self) -> Any:
-        made = self._figure("poles", "|pole| (Hz)", "damping ratio", x_axis_type="log")
-        made.y_range = Range1d(start=-0.08, end=1.08)
+        ranges = {"x_range": Range1d(start=0.1, end=1e4), "y_range": Range1d(start=-0.08, end=1.08)}
+        made = self._figure("poles", "|pole| (Hz)", "damping ratio", x_axis_type="log", **ranges)
         made.add_layout(
             BoxAnnotation(top=0.0, fill_color=ORANGE, fill_alpha=0.28, level="underlay")
         )
@@ -166,64 +178,70 @@ class Figures:
         return made
 
     def _time(self, name: str, unit: str, label: str, source: ColumnDataSource, y: str) -> Any:
-        made = self._figure(name, f"time ({unit})", label)
+        ranges = {axis: Range1d(start=0.0, end=1.0) for axis in ("x_range", "y_range")}
+        made = self._figure(name, f"time ({unit})", label, **ranges)
         self._pins(made, name)
         line = self._line(made, unit, y, source)
         made.add_tools(_hover(line, [("ms", f"@{unit}{{0.00}}"), (label, f"@{y}{{0.0000}}")]))
         return made
 
-    def show(self, drawn: Drawn) -> None:
-        """Fill in a design; where it has no controller nothing is drawn of it.
+    def changes(self, drawn: Drawn, pinned: Sequence[Drawn] = ()) -> list[Change]:
+        """What shows a design; where it has no controller nothing is drawn of it.
 
-        Each figure is painted once, when all of it has arrived.
+        The axes reach over it and over those `pinned`.
         """
-        for made in self._curves:
-            made.hold_render = True
-        self._fill(drawn)
-        for made in self._curves:
-            made.hold_render = False
-
-    def _fill(self, drawn: Drawn) -> None:
-        look, c = drawn.look, drawn.curves
+        look, c, s = drawn.look, drawn.curves, drawn.sampled
         inner = look.problem.inner
-        self.S_max.bottom, self.disk.glyph.radius = inner.S_max, 1.0 / inner.S_max
-        self.S_low.right, self.S_low.bottom = inner.omega_low / (2 * np.pi), inner.S_low
         colour = {Standing.KEPT: self.main, Standing.MISSED: AMBER, Standing.REFUSED: GREY}
-        for glyph in self.lines:
-            glyph.line_color = colour[look.standing]
-            glyph.line_dash = DASHES[look.standing]
+        line = {"line_color": colour[look.standing], "line_dash": DASHES[look.standing]}
         certified = look.standing is not Standing.REFUSED
-        self.bandwidth.location = look.bandwidth_hz if certified else None
-        s = drawn.sampled
-        self.sampled.data = {"hz": [], "S": []} if s is None else {"hz": s.hz, "S": s.gain}
+        found: list[Change] = [
+            (self.S_max, {"bottom": inner.S_max}),
+            (self.disk.glyph, {"radius": 1.0 / inner.S_max}),
+            (self.S_low, {"right": inner.omega_low / (2 * np.pi), "bottom": inner.S_low}),
+            *((glyph, line) for glyph in self.lines),
+            (self.bandwidth, {"location": look.bandwidth_hz if certified else None}),
+            _data(self.sampled, hz=[], S=[]) if s is None
+            else _data(self.sampled, hz=s.hz, S=s.gain),
+        ]  # fmt: skip
         if c is None:
-            self._clear()
-            return
+            sources = (self.gains, self.loci, self.step, self.move, *self.poles.values())
+            return found + [_data(source, **{key: [] for key in source.data}) for source in sources]
         columns = {"hz": c.hz, "top": np.full(len(c.hz), TOP)}
         for i, (name, _) in enumerate(GAINS):
-            columns |= {
-                name: c.gains[i],
-                f"b{name}": c.bounds[i] if certified else np.full(len(c.hz), np.nan),
-            }
-        self.gains.data = columns
-        self.loci.data = dict(zip(("xs", "ys"), _lines(c.loci), strict=True))
+            nothing = np.full(len(c.hz), np.nan)
+            columns |= {name: c.gains[i], f"b{name}": c.bounds[i] if certified else nothing}
+        xs, ys = _lines(c.loci)
+        found += [_data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys)]
+        at_poles = []
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
             upper = roots[roots.imag >= 0.0]
             size = np.maximum(np.abs(upper), 1e-300)
             at = np.maximum(size, SLOWEST * c.hz[0])  # an integrator's has no place on the axis
-            self.poles[name].data = {"hz": at, "damping": -upper.real / size}
-        self.step.data = {"ms": 1e3 * c.step_time, "y": c.step}
-        self.move.data = {"ms": 1e3 * c.move.time, "um": 1e6 * c.move.error}
-        self.end.location = 1e3 * c.move.end
+            at_poles.append(at)
+            found.append(_data(self.poles[name], hz=at, damping=-upper.real / size))
+        ms, y = 1e3 * c.step_time, c.step
+        end, um = 1e3 * c.move.time, 1e6 * c.move.error
+        found += [
+            _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
+            (self.end, {"location": 1e3 * c.move.end}),
+        ]  # fmt: skip
+        known = [c, *(pin.curves for pin in pinned if pin.curves is not None)]
+        spans = [(made.y_range, [c.gains[i]], True) for i, made in enumerate(self.of_gain)]
+        spans += [
+            (self.pole_map.x_range, at_poles, True),
+            (self.step_figure.x_range, [1e3 * each.step_time for each in known], False),
+            (self.step_figure.y_range, [each.step for each in known], False),
+            (self.move_figure.x_range, [1e3 * each.move.time for each in known], False),
+            (self.move_figure.y_range, [1e6 * each.move.error for each in known], False),
+        ]
+        return found + [_spanned(*span) for span in spans]
 
-    def _clear(self) -> None:
-        for source in (self.gains, self.loci, self.step, self.move, *self.poles.values()):
-            source.data = {name: [] for name in source.data}
-
-    def frame(self, drawn: Drawn) -> None:
-        """Let the frequency axis reach over the present design."""
-        if drawn.curves is not None:
-            self.hz.start, self.hz.end = float(drawn.curves.hz[0]), float(drawn.curves.hz[-1])
+    def frame(self, drawn: Drawn) -> list[Change]:
+        """What lets the frequency axis reach over the present design."""
+        if drawn.curves is None:
+            return []
+        return [_ends(self.hz, float(drawn.curves.hz[0]), float(drawn.curves.hz[-1]))]
 
     def pin(self, pins: list[tuple[str, Drawn]]) -> None:
         """Draw the pinned designs beside the present one."""
@@ -241,6 +259,28 @@ class Figures:
         for name, source in self.pinned.items():
             keys = ("xs", "ys", "colour", "name")
             source.data = {key: [row[i] for row in rows[name]] for i, key in enumerate(keys)}
+
+
+def _data(source: ColumnDataSource, **columns: Any) -> Change:
+    return source, {"data": columns}
+
+
+def _ends(axis: Range1d, start: float, end: float) -> Change:
+    return axis, {"start": start, "end": end, "reset_start": start, "reset_end": end}
+
+
+def _spanned(axis: Range1d, values: Sequence[np.ndarray], log: bool) -> Change:
+    """An axis over finite values, a little wider; as it is where there are none."""
+    known = np.concatenate([np.ravel(each) for each in values])
+    known = known[np.isfinite(known) & ((known > 0.0) | (not log))]
+    if not known.size:
+        return axis, {}
+    low, high = float(known.min()), float(known.max())
+    if log:
+        factor = max((high / low) ** PADDING, 1.1)
+        return _ends(axis, low / factor, high * factor)
+    margin = PADDING * (high - low) or 1.0
+    return _ends(axis, low - margin, high + margin)
 
 
 def _lines(loci: np.ndarray) -> tuple[list[Any], list[Any]]:

@@ -12,6 +12,7 @@ from bokeh.plotting import figure
 
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.explorer.controls import DARK, shown_unit
+from ccd_casadi.explorer.figures import Change
 from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import GREY, ORANGE
@@ -65,10 +66,10 @@ class MapFigure:
         i, j = (self.names.index(select.value) for select in self._selects)
         return i, j
 
-    def mark(self, theta: Sequence[float]) -> None:
-        """The present design."""
+    def mark(self, theta: Sequence[float]) -> Change:
+        """What shows the present design."""
         (i, j), (k, m) = self.axes, self._scales()
-        self._here.data = {"x": [k * theta[i]], "y": [m * theta[j]]}
+        return self._here, {"data": {"x": [k * theta[i]], "y": [m * theta[j]]}}
 
     def _scales(self) -> tuple[float, float]:
         i, j = self.axes

@@ -3,9 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
+from bokeh.core.properties import Any as Anything
+from bokeh.core.properties import List
 from bokeh.document import Document
+from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource
+from bokeh.model import DataModel
+from bokeh.models import ColumnDataSource, CustomJS
 from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
@@ -29,6 +33,16 @@ from ccd_casadi.support.errors import UserError
 TOGETHER = 4  # ms: drags that come within it are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
 LINES = 12  # of a solve's output
+# In the browser alone: sent back they would be heard here as changes. What somebody zoomed stays.
+APPLY = """for (const [model, values] of message.changes)
+  if (!model.have_updated_interactively)
+    model.setv(values, {sync: false, check_eq: !("data" in values)})"""
+
+
+class Answer(DataModel):
+    """All that an answer changes on the page, as one message in place of some forty."""
+
+    changes: Any = List(Anything)
 
 
 class Page:
@@ -55,7 +69,11 @@ class Page:
         # what was answered last: a watch in the browser stops when this has been drawn
         nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
         self.answer = ColumnDataSource(nothing, name="answer")
-        self.pins.table.tags = [self.answer]  # so that it is sent
+        self._message, self._serial = Answer(), 0
+        apply = CustomJS(args={"message": self._message}, code=APPLY)
+        self._message.js_on_change("changes", apply)
+        document.js_on_event(DocumentReady, apply)  # what was answered before the page was there
+        self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.verdict, self.note, self.output = (
             Div(name="verdict"),
             Div(name="note"),
@@ -132,21 +150,22 @@ class Page:
         """Draw a design, and say that this is the answer."""
         sampled = sampled_of(look) if look.knobs.sampled else None
         self.now = Drawn(look, curves_of(look), sampled)
-        self.figures.show(self.now)
-        if look.how is not How.PRESENT:
-            self.figures.frame(self.now)
-        session = self.session
-        self.verdict.text = standing_html(look, sampled)
-        self.machine.text = machine_html(
+        session, pinned = self.session, [drawn for _, drawn in self.pins.pinned]
+        machine = machine_html(
             look.problem, look.theta, session.start.theta, look.elements.system, look.modal,
             session.reference,
         )  # fmt: skip
-        self.map.mark(look.theta)
+        self._serial += 1
+        answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
+        self._message.changes = [
+            *self.figures.changes(self.now, pinned),
+            *(self.figures.frame(self.now) if look.how is not How.PRESENT else []),
+            (self.verdict, {"text": standing_html(look, sampled)}),
+            (self.machine, {"text": machine}),
+            self.map.mark(look.theta),
+            (self.answer, {"data": answer}),
+        ]
         self._seen.append(look)
-        serial = self.answer.data["serial"][0] + 1
-        self.answer.data = {
-            "serial": [serial], "theta": [list(look.theta)], "how": [look.how.value],
-        }  # fmt: skip
 
     def settle(self) -> None:
         """When the answer is on its way: write what was looked at, draw the landscape."""
@@ -167,7 +186,8 @@ class Page:
         self.map.show(
             field_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
         )
-        self.map.mark(look.theta)
+        here, new = self.map.mark(look.theta)
+        here.update(**new)
 
     # the background
 

@@ -61,6 +61,7 @@ class Affine:
 
     def __add__(self, other: "Affine | complex | np.ndarray") -> "Affine":
         if isinstance(other, Affine):
+            self._same_variables(other)
             rest = self.rest + other.rest + ROUND * (self.size + other.size)
             return Affine(self.centre + other.centre, self.slope + other.slope, rest)
         size = np.abs(self.centre) + np.abs(other)
@@ -76,6 +77,7 @@ class Affine:
         if not isinstance(other, Affine):
             rest = (self.rest + ROUND * self.size) * np.abs(other)
             return Affine(self.centre * other, self.slope * other, rest)
+        self._same_variables(other)
         a, b = self.reach, other.reach
         # t_i² lies in [0, 1]: half of it goes to the centre.
         square = 0.5 * self.slope * other.slope
@@ -89,6 +91,11 @@ class Affine:
 
     __radd__ = __add__
     __rmul__ = __mul__
+
+    def _same_variables(self, other: "Affine") -> None:
+        """NumPy would spread the slope of a single variable over all of the other's."""
+        if len(self.slope) != len(other.slope):
+            raise ValueError(f"{len(self.slope)} and {len(other.slope)} variables: use `of`")
 
     def power(self, exponent: int) -> "Affine":
         """f to a power from 1 on."""

@@ -9,7 +9,7 @@ gain is confirmed by a Hamiltonian matrix (`norms`). A sampled loop is judged in
 delay exact, K by Tustin's rule; what happens between samples is not in it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ PER_DECADE = 60
 FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
 APART = 1e-9  # relative: grid points that are closer count as one
 ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
+SECTIONS = 17  # of a bracket in ten: to rounding
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def judged(
     grid = _grid(roots, sampling, bounds.omega_low, _size(G), corner)
     table = _Responses(G, loop[0], loop[1], sampling, bounds)
     values, low = table.at(grid), table.at(np.array([bounds.omega_low]))
-    tops = {name: _top(table, name, grid, value) for name, value in values.items()}
+    tops = _tops(table, grid, values)
     top, at = tops["S"]
     norm = _norm(S, sampling)
     crossing, bandwidth = _bandwidth(table, grid, values["S"], bounds, integrator)
@@ -257,10 +258,11 @@ def _sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
 
 
 def _tustin(K: StateSpace, period: float) -> StateSpace:
-    from scipy.signal import cont2discrete  # slow to import
-
-    A, B, C, D, _ = cont2discrete((K.A, K.B, K.C, K.D), period, "bilinear")
-    return StateSpace(A, B, C, D)
+    """K(z) with s = (2/T)(z - 1)/(z + 1)."""
+    one, half = np.eye(len(K.A)), 0.5 * period
+    inverse = np.linalg.inv(one - half * K.A)
+    C = K.C @ inverse
+    return StateSpace(inverse @ (one + half * K.A), period * inverse @ K.B, C, K.D + half * C @ K.B)
 
 
 def _norm(S: StateSpace, sampling: Sampling | None) -> float:
@@ -303,25 +305,49 @@ def _grid(
     return grid[np.append(True, np.diff(grid) > APART * grid[1:])]
 
 
-def _top(table: _Responses, name: str, grid: Array, value: Array) -> tuple[float, float]:
-    """The largest value and its frequency, every local maximum within 10 % of it zoomed into."""
-    inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
-    inner = inner[value[inner] > 0.9 * value.max()]
-    best = int(np.argmax(value))
-    top, at = float(value[best]), float(grid[best])
-    low, high = grid[inner - 1], grid[inner + 1]
+def _tops(
+    table: _Responses, grid: Array, values: dict[str, Array]
+) -> dict[str, tuple[float, float]]:
+    """Every curve's largest value and its frequency, local maxima within 10 % of it zoomed into.
+
+    The brackets of all curves are evaluated at once: one solve of a point serves every curve.
+    """
+    best = {name: int(np.argmax(value)) for name, value in values.items()}
+    tops = {name: (float(values[name][i]), float(grid[i])) for name, i in best.items()}
+    of, at = [], []
+    for number, value in enumerate(values.values()):
+        inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
+        at.append(inner[value[inner] > 0.9 * value.max()])
+        of.append(np.full(len(at[-1]), number))
+    curve, inner = np.concatenate(of), np.concatenate(at)
+    if not len(inner):
+        return tops
+    rows = np.arange(len(inner))
+
+    def own(points: Array) -> Array:
+        found = np.stack(list(table.at(points.ravel()).values()))
+        return found.reshape(len(found), *points.shape)[curve, rows]
+
+    points, peak, i = _zoomed(own, grid[inner - 1], grid[inner + 1])
+    for number, name in enumerate(values):
+        mine = rows[curve == number]
+        if len(mine):
+            k = mine[np.argmax(peak[mine])]
+            tops[name] = max(tops[name], (float(peak[k]), float(points[k, i[k]])))
+    return tops
+
+
+def _zoomed(
+    function: Callable[[Array], Array], low: Array, high: Array
+) -> tuple[Array, Array, np.ndarray]:
+    """The last points (N, 11) of N brackets that close in on a maximum, its value and its place."""
+    rows = np.arange(len(low))
     for _ in range(ZOOMS):
-        if not len(low):
-            break
         points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
-        found = table.at(points.ravel())[name].reshape(points.shape)
+        found = function(points)
         i = np.argmax(found, axis=1)
-        rows = np.arange(len(low))
-        k = int(np.argmax(found[rows, i]))
-        if found[k, i[k]] > top:
-            top, at = float(found[k, i[k]]), float(points[k, i[k]])
         low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
-    return top, at
+    return points, found[rows, i], i
 
 
 def _bandwidth(
@@ -332,12 +358,10 @@ def _bandwidth(
     if S[0] > HALF_POWER or not len(above):
         return np.nan, 0.0
     low, high = float(grid[above[0] - 1]), float(grid[above[0]])
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if table.at(np.array([middle]))["S"][0] > HALF_POWER:
-            high = middle
-        else:
-            low = middle
+    for _ in range(SECTIONS):
+        points = np.linspace(low, high, 11)
+        first = int(np.argmax(table.at(points)["S"][1:] > HALF_POWER))
+        low, high = float(points[first]), float(points[first + 1])
     if bounds.shape is None:
         return low, low
     # Every dip of the room h(ω) = shape ω/(√2|S|), closed in on; ω_b <= h(ω) for all ω <= ω_b.
@@ -353,14 +377,10 @@ def _bandwidth(
     value = room(omega)
     inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1
     dips = [(float(value[i]), float(omega[i])) for i in (0, len(omega) - 1)]
-    left, right = omega[inner - 1], omega[inner + 1]
-    for _ in range(ZOOMS):
-        points = left[:, None] + (right - left)[:, None] * np.linspace(0.0, 1.0, 11)
-        found = room(points.ravel()).reshape(points.shape)
-        i, rows = np.argmin(found, axis=1), np.arange(len(left))
-        left, right = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
     if len(inner):
-        dips += zip(found[rows, i].tolist(), points[rows, i].tolist(), strict=True)
+        points, height, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
+                                    omega[inner - 1], omega[inner + 1])  # fmt: skip
+        dips += zip((-height).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
     bandwidth = low
     while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
         height, at = min(broken)

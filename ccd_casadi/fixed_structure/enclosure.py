@@ -92,7 +92,7 @@ class LoopFamily:
         D, N = _picked(factors, nearest)
         R = _others(factors, nearest)
         U, P = (part.of(len(boxes.low)) for part in self._controller(x, y))
-        open_ = P * y if self.structure.integrator else P
+        open_ = P * y.of(len(boxes.low)) if self.structure.integrator else P
         through = R * D + N
         denominator = open_ * D + U * through
         over = inverse(denominator)

@@ -78,7 +78,7 @@ class LoopProblem:
         """v from far below ω_low and every root to far above, logarithmic."""
         sizes = np.abs(self.plants.poles[self.plants.residues != 0.0])
         bottom = 0.03 * min(self.low, float(sizes.min()))
-        top = 100.0 * float(sizes.max())
+        top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
         if self.bounds.weighted_level is not None and self.bounds.weights is not None:
             w = self.bounds.weights  # a K without enough roll-off has its largest W_KS KS there
             top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
@@ -200,8 +200,8 @@ def assess(
         value = loops.levels[curve]
         if curve is Curve.SHAPE:
             value = np.where(v <= crossing, value, -np.inf)
-        left = np.pad(value, ((0, 0), (1, 0)), constant_values=-np.inf)[:, :-1]
-        right = np.pad(value, ((0, 0), (0, 1)), constant_values=-np.inf)[:, 1:]
+        left, right = np.full((2, P, k), -np.inf)
+        left[:, 1:], right[:, :-1] = value[:, :-1], value[:, 1:]
         rows, at = np.nonzero((value > depth) & (value >= left) & (value > right))
         low, high = v[rows, np.maximum(at - 1, 0)], v[rows, np.minimum(at + 1, k - 1)]
         if curve is Curve.SHAPE:
@@ -255,7 +255,7 @@ def evaluate(
 ) -> Loops:
     """All curves of the plants `which` at v (any one shape), relative to their bounds.
 
-    `order` 0: levels only, 1: slopes to ln v too, 2: ∂ln K/∂κ too.
+    `order` 0: levels only, 1: slopes to ln v only, 2: both, and ∂ln K/∂κ.
     """
     plants, bounds = problem.plants, problem.bounds
     s = 1j * v
@@ -271,32 +271,35 @@ def evaluate(
     L = G * K
     S = 1.0 / (1.0 + L)
     omega = plants.frequency(v)
+    weighted, compliant = Curve.KS in problem.curves, bounds.compliance_max is not None
+    levels: dict[Curve, Array] = {}
     gradients: dict[Curve, Array] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
-        ln_S, ln_K, ln_L = np.log(np.abs(S)), np.log(np.abs(K)), np.log(np.abs(L))
-        levels = {
-            Curve.S_MAX: ln_S - np.log(bounds.S_max),
-            Curve.S_LOW: ln_S - np.log(bounds.S_low),
-            Curve.CROSSING: ln_S + HALF_POWER,
-            Curve.SHAPE: ln_S + HALF_POWER,
-        }
         shaped = shaped_at(problem, omega)
         under = np.zeros(v.shape)
         if bounds.shape is not None:
             under = np.minimum(np.log(bounds.shape * shaped) - tau, 0.0)
-            levels[Curve.SHAPE] = ln_S + HALF_POWER - under
-        weighted = Curve.KS in problem.curves
         if weighted:
-            assert bounds.weighted_level is not None
             assert bounds.weights is not None
-            ln_level = np.log(bounds.weighted_level)
             W, dW = log_weights(bounds.weights, omega * plants.omega_0)
-            levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
-            levels[Curve.T] = ln_L + ln_S + W[1] - ln_level
-        if bounds.compliance_max is not None:
+        if compliant:
             free, free_slope = plants.free_responses(which, v)
-            ceiling = np.log(bounds.compliance_max * plants.force)
-            levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
+        if order != 1:
+            ln_S = np.log(np.abs(S))
+            levels = {
+                Curve.S_MAX: ln_S - np.log(bounds.S_max),
+                Curve.S_LOW: ln_S - np.log(bounds.S_low),
+                Curve.CROSSING: ln_S + HALF_POWER,
+                Curve.SHAPE: ln_S + HALF_POWER - under,
+            }
+            if bounds.weighted_level is not None:
+                ln_level = np.log(bounds.weighted_level)
+                ln_K, ln_L = np.log(np.abs(K)), np.log(np.abs(L))
+                levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
+                levels[Curve.T] = ln_L + ln_S + W[1] - ln_level
+            if bounds.compliance_max is not None:
+                ceiling = np.log(bounds.compliance_max * plants.force)
+                levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
         if order:
             chain = chain_of(problem, v)
             slope = -(S * (K * dG + L * K_slope)).real
@@ -305,7 +308,7 @@ def evaluate(
             if weighted:
                 gradients[Curve.KS] = K_slope.real + slope + dW[0] * chain
                 gradients[Curve.T] = (K_slope + dG / G).real + slope + dW[1] * chain
-            if bounds.compliance_max is not None:
+            if compliant:
                 gradients[Curve.GS] = (free_slope / free).real + slope
     return Loops(v, which, S, K, to_kappa, levels, gradients)
 

@@ -18,11 +18,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, told apart by the colour-blind and by a grey printer.
-BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
-PURPLE, SKY, AMBER = "#CC79A7", "#56B4E9", "#E69F00"
+# After Okabe and Ito, told apart by the colour-blind and by a grey printer; each has a contrast of
+# at least 3.4 : 1 to white paper, which their pink, yellow and sky have not.
+BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
+PURPLE, AMBER, BROWN = "#b8548c", "#a87000", "#8c564b"
+SKY = "#56b4e9"  # on a dark ground alone
 BLACK, GREY = "#1a1a1a", "#767676"
-CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, SKY, BLACK)
+CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, BROWN, BLACK)
+# Colours of a figure -> the page's variable (`page.CSS`) that it becomes: (light, dark).
+THEME = {
+    "blue": (BLUE, "#5ab4ee"), "orange": (ORANGE, "#ff8f45"), "green": (GREEN, "#2fc79a"),
+    "purple": (PURPLE, "#e59cc6"), "amber": (AMBER, "#e6b23c"), "brown": (BROWN, "#c9a093"),
+    "ink": (BLACK, "#e4e6e8"), "grey": (GREY, "#9aa0a5"), "paper": ("#ffffff", "#15191c"),
+    "grid": ("#e6e6e6", "#2c3338"), "axis": ("#444444", "#aab0b5"), "shade": ("#eeeeee", "#22282c"),
+}  # fmt: skip
+VARIABLES = {light: f"var(--{name})" for name, (light, _) in THEME.items()}
+VARIABLES["#000000"] = "var(--ink)"
 COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
 LONGEST_LABEL = 40
@@ -84,10 +95,12 @@ def place(figure: "Figure", left: float, bottom: float, width: float, height: fl
     return figure.add_axes((left / w, bottom / h, width / w, height / h))
 
 
-def to_svg(figure: "Figure", key: str, title: str) -> str:
+def to_svg(figure: "Figure", key: str, title: str, data: str = "", share: float = 0.0) -> str:
     """The figure as an <svg> element for inline use; `key` is unique in the page, `title` read out.
 
-    Namespaces, metadata and global style rules are dropped: HTML needs none of them.
+    Colours become the page's variables, so that they follow its theme. Namespaces, metadata and
+    global style rules are dropped: HTML needs none of them. `data`: for the page's script; `share`
+    of the width that there is, in %: by itself that of the figure.
     """
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -107,12 +120,14 @@ def to_svg(figure: "Figure", key: str, title: str) -> str:
     text = text.replace("url(#", f"url(#{key}-")
     # the font is the page's: only size, weight and anchor stay
     text = re.sub(r"font: ([^;\"]*?)'[^;\"]*", r"font: \1sans-serif", text)
+    text = re.sub(r"(?<=: )#[0-9a-f]{6}\b", lambda c: VARIABLES.get(c[0], c[0]), text)
     box = re.search(r'viewBox="([^"]*)"', text)
     assert box is not None
     # as a share of the column, so that text has one size in all figures
-    share = 100.0 * min(1.0, float(figure.get_figwidth()) / WIDTH)
+    share = share or 100.0 * min(1.0, float(figure.get_figwidth()) / WIDTH)
     size = f'style="width: {share:.0f}%"'
-    head = f'<svg viewBox="{box[1]}" {size} role="img" aria-label="{escape(title)}">'
+    more = f' data-axes="{escape(data)}"' if data else ""
+    head = f'<svg viewBox="{box[1]}" {size} role="img" aria-label="{escape(title)}"{more}>'
     body = text[text.index(">") + 1 :]
     return re.sub(r"\n\s*", "\n", head + body).strip()
 
