@@ -46,6 +46,7 @@ _PUBLIC = {
     "problem_of": "cases.case",
     "read_run": "cases.run_folder",
     "robustness": "robust.study",
+    "samples_frame": "interop.frames",
     "scaled_plant": "inner_problem.problem",
     "solve": "codesign.run",
     "synthesise": "synthesis.synthesis",

@@ -22,6 +22,7 @@ from ccd_casadi.inner_problem.problem import scaled_plant as scaled_plant
 from ccd_casadi.inner_problem.problem import true_design as true_design
 from ccd_casadi.inner_problem.problem import true_inner as true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities as TrueQuantities
+from ccd_casadi.interop.frames import samples_frame as samples_frame
 from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -22,10 +22,15 @@ from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.notebook import Shown
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 from ccd_casadi.synthesis.weights import Weights
+
+if TYPE_CHECKING:
+    import control
 
 SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
 
@@ -48,7 +53,7 @@ class SampledController(Protocol):
 
 
 @dataclass(frozen=True)
-class FinishedRun:
+class FinishedRun(Shown):
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
@@ -68,13 +73,23 @@ class FinishedRun:
     sampled: "SampledController | None" = None
     kappa: Array | None = None  # of a fixed structure, SI
 
+    def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
+        """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
 
-def read_run(folder: Path) -> FinishedRun:
+        `control.feedback(G * K, 1)` is T. What a sampled loop of sections runs is Tustin's rule of
+        K, `control.c2d(K, period, "tustin")`, behind its delay.
+        """
+        plant, controller = named_plant(self.plant.plant_si()), named_controller(self.controller)
+        return to_control(plant, "plant"), to_control(controller, "controller")
+
+
+def read_run(folder: str | Path) -> FinishedRun:
     """The run in `folder` (case.toml, result.json, controller.json).
 
     Raises UserError with a remedy where a file is missing, damaged or foreign, where the run
     found no feasible design, or where the controller is not certified on its plant any more.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
     result = read_json(folder / "result.json")

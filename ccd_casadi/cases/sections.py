@@ -28,6 +28,7 @@ from ccd_casadi.cases.checks import (
     table,
     tables,
 )
+from ccd_casadi.support.notebook import Shown
 
 
 def _key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
@@ -404,7 +405,7 @@ class LimitsSection:
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(Shown):
     """A checked case file."""
 
     path: Path

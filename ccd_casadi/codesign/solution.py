@@ -7,11 +7,12 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.support.notebook import Shown
 from surrogates import Quality
 
 
 @dataclass(frozen=True)
-class Solution:
+class Solution(Shown):
     """Everything a run found: the JSON result, and the objects behind it (None: infeasible).
 
     `problem` is the one solved: of a robust case that leaves its design plant open, the best one's.

@@ -25,6 +25,7 @@ from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.notebook import Shown
 from ccd_casadi.support.process_pool import Pool
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
@@ -44,7 +45,7 @@ class SectionsOutcome(StrEnum):
 
 
 @dataclass(frozen=True)
-class SectionsDesign:
+class SectionsDesign(Shown):
     """A controller of fixed structure; SI, frequencies in rad/s.
 
     `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state

@@ -26,6 +26,7 @@ from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.notebook import Shown
 from ccd_casadi.support.user_code import limited, require_user_code
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
@@ -105,7 +106,7 @@ class RobustSet:
 
 
 @dataclass(frozen=True)
-class CoDesignProblem:
+class CoDesignProblem(Shown):
     """min w1 f(θ) + w2 ω_b*(θ) over the box, λ(θ) <= 0 (paper, equation (9)); SI throughout.
 
     Made by `problem_of`; `dataclasses.replace` makes variants of it:

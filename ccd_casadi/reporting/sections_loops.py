@@ -101,7 +101,14 @@ def compared_html(
     return figure_html(svg, f"The largest on the plants of the set. {'; '.join(words)}.", *tables)
 
 
-def gains_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops) -> str:
+def gains_html(
+    problem: CoDesignProblem,
+    verified: "VerifiedSections",
+    loops: Loops,
+    *,
+    key: str = "sections-loop",
+) -> str:
+    """S, KS and T of the model in a band of all plants; `key` is unique in the page."""
     inner, bandwidth = problem.inner, verified.design.bandwidth / HZ
     x = (float(loops.hz[0]), float(loops.hz[-1]))
 
@@ -120,7 +127,7 @@ def gains_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Lo
     S = panel(f"{gain('S')} (–)", loops.S, (asked, Level(2**-0.5, "-3 dB", colour=GREY), at))
     KS = panel(f"{gain('KS')} (N/m)", loops.KS, (at,))
     T = panel(f"{gain('T')} (–)", loops.T, (at,))
-    svg = figure_lines([[S], [KS, T]], key="sections-loop", heights=(3.4, 2.6),
+    svg = figure_lines([[S], [KS, T]], key=key, heights=(3.4, 2.6),
                        title="S, KS and T of every plant of the set over frequency")  # fmt: skip
     rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
     table = Table(

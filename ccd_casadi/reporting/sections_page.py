@@ -45,7 +45,7 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     loops = loops_of(verified.problem, verified.theta, verified.design)
     found = [
         _design(problem, solution.result),
-        Section("The controller", _controller(solution.result)),
+        Section("The controller", controller_html(solution.result)),
         Section("Full order beside it", _beside(problem, solution.result)),
         Section("Closed loop on every plant", gains_html(problem, verified, loops)),
     ]
@@ -183,7 +183,8 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     ]  # fmt: skip
 
 
-def _controller(result: dict[str, Any]) -> str:
+def controller_html(result: Mapping[str, Any]) -> str:
+    """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
     rows = tuple(
         (s["kind"], s["zero_hz"], s["zero_damping"], s["pole_hz"], s["pole_damping"])

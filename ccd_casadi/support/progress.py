@@ -1,7 +1,8 @@
 """A progress bar on stderr: done, rate, time left.
 
 By hand: tqdm and rich rewrite one line on a terminal only to fill a log with it elsewhere; here a
-log gets a plain line every few seconds, and a stream that fails ends the printing alone.
+log gets a plain line every few seconds, and a stream that fails ends the printing alone. In a
+notebook it is on stdout, since stderr is painted there as a failure.
 """
 
 import os
@@ -10,24 +11,30 @@ import time
 from types import TracebackType
 from typing import Self, TextIO
 
+from ccd_casadi.support.notebook import in_notebook
+
 WIDTH = 24
+CELL = 100  # characters of a line in a notebook
 
 
 class Progress:
     """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
 
-    On a terminal one line is rewritten at most ten times a second; elsewhere a plain line is
-    printed every few seconds and at the end. A stream that fails ends the printing, not the work.
+    On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
+    a plain line is printed every few seconds and at the end. A stream that fails ends the printing,
+    not the work.
     """
 
     def __init__(
         self, total: int, label: str, quiet: bool = False, stream: TextIO | None = None
     ) -> None:
         self.total, self.label, self.note = total, label, ""
-        self.stream = sys.stderr if stream is None else stream
+        cell = in_notebook(sys.stdout)
+        self.stream = stream or (sys.stdout if cell else sys.stderr)
         self.silent = quiet or total <= 0
-        self.terminal = not self.silent and self.stream.isatty()
-        self.interval = 0.1 if self.terminal else 5.0
+        self.cell = in_notebook(self.stream)
+        self.terminal = not self.silent and (self.cell or self.stream.isatty())
+        self.interval = (0.25 if self.cell else 0.1) if self.terminal else 5.0
         self.done = 0
         self._began = self._shown = time.monotonic()
 
@@ -69,8 +76,9 @@ class Progress:
         self._shown = time.monotonic()
         text = self.line()
         if self.terminal:
-            # a line that wraps could not be rewritten in place
-            text = "\r\x1b[2K" + text[: self._columns() - 1]
+            # a line that wraps could not be rewritten in place; a cell knows "\r" and no more
+            wide = CELL if self.cell else self._columns() - 1
+            text = f"\r{text[:wide]:{wide}s}" if self.cell else "\r\x1b[2K" + text[:wide]
         try:
             self.stream.write(text + end)
             self.stream.flush()

@@ -17,6 +17,7 @@ from ccd_casadi.kernels.gradients import (
 )
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.notebook import Shown
 from ccd_casadi.synthesis.compliance import compliance_over_family
 from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.synthesis.weights import Weights
@@ -26,7 +27,7 @@ _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 
 
 @dataclass(frozen=True)
-class Sensitivities:
+class Sensitivities(Shown):
     """Figures of one design with their gradients.
 
     `values` and the rows of the gradients: ω_b (rad/s), ln‖S‖∞, ln σ_max(S(jω_low)), where it was

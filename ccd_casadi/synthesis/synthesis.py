@@ -16,6 +16,7 @@ from ccd_casadi.kernels.design import sweep as _sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.notebook import Shown
 from ccd_casadi.synthesis.compliance import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
@@ -87,7 +88,7 @@ class DesignFigures:
 
 
 @dataclass(frozen=True)
-class Design:
+class Design(Shown):
     """A synthesis with its controller, input e = r - y, output u, in SI."""
 
     figures: DesignFigures

@@ -1,0 +1,206 @@
+"""Results, designs and problems as a notebook shows them: the parts of our pages, one at a time."""
+
+from collections.abc import Mapping
+from functools import singledispatch
+from itertools import count
+from typing import Any
+
+from ccd_casadi.cases.case import problem_of
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.sweep import InnerResult
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.reporting.facts import conclusion, theta_table
+from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
+from ccd_casadi.reporting.page import (
+    CSS,
+    Table,
+    escape,
+    facts_html,
+    figure_html,
+    header,
+    number,
+    paragraph,
+    table_html,
+)
+from ccd_casadi.reporting.sections_loops import gains_html, loops_of
+from ccd_casadi.reporting.sections_page import controller_html, sections_conclusion
+from ccd_casadi.reporting.solve_page import STATUS
+from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.loop_responses import loop_data
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+from ccd_casadi.synthesis.weights import Weights
+
+_OWN = """
+--ink: #1a1a1a; --soft: #5a5a5a; --line: #dcdcdc; background: #fff; color: var(--ink);
+max-width: 900px; padding: 8px 14px; font: 14px/1.5 system-ui, sans-serif;
+"""
+_SMALL = "h1 { font-size: 17px; } .lead { font-size: 14px; } th, td { white-space: normal; }"
+_figures = count()  # ids in an SVG are the whole notebook's
+
+
+@singledispatch
+def html_of(item: object) -> str:
+    """An object as HTML for a notebook's cell, its rules of style confined to that."""
+    raise TypeError(f"{type(item).__name__} has no form in a notebook")
+
+
+def _cell(*parts: str) -> str:
+    body = "\n".join(parts)
+    # the page's own rules, nested: `h1` is `.ccd h1` in here
+    return f'<div class="ccd"><style>.ccd {{{_OWN}{CSS}{_SMALL}}}</style>\n{body}\n</div>'
+
+
+@html_of.register
+def _(item: Solution) -> str:
+    result, problem = item.result, item.problem
+    parts = [_result_head(result)]
+    if item.sections is not None:
+        own = item.sections
+        loops = loops_of(own.problem, own.theta, own.design)
+        parts += [_theta(own.problem, result), controller_html(result)]
+        parts += [gains_html(own.problem, own, loops, key=f"notebook-{next(_figures)}")]
+    elif item.verified is not None and problem is not None:
+        made, plant = item.verified.design, scaled_plant(problem, item.verified.theta)
+        loop = _loop(problem, plant, made.controller, made.weights, made.figures)
+        parts += [_theta(problem, result), loop]
+    return _cell(*parts)
+
+
+@html_of.register
+def _(item: FinishedRun) -> str:
+    parts = [_result_head(item.result), _theta(item.problem, item.result)]
+    if item.problem.sections is not None:
+        parts.append(controller_html(item.result))
+    else:
+        parts.append(_loop(item.problem, item.plant, item.controller, item.weights, item.figures))
+    return _cell(*parts)
+
+
+@html_of.register
+def _(item: Case) -> str:
+    return html_of(problem_of(item))
+
+
+@html_of.register
+def _(item: CoDesignProblem) -> str:
+    inner, of_error = item.inner, item.sections is not None and item.sections.of_error
+    J = f"min {item.w1:g} f(θ) + ({item.w2:g}) {'e' if of_error else 'ω_b'}"
+    rows = []
+    for i, name in enumerate(item.names):
+        unit, factor = shown_unit(item.units[i], item.upper[i])
+        numbers = (factor * value for value in (item.lower[i], item.upper[i], item.start[i]))
+        rows.append((name, unit or "–", *numbers))
+    facts = [
+        ("Objective", J, "e in m" if of_error else "ω_b in rad/s"),
+        ("Peak of S", f"≤ {inner.S_max:g}", ""),
+        (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
+    ]
+    if inner.compliance_max is not None:
+        facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
+    if item.sections is not None:
+        sampling = item.sections.sampling
+        runs = "in continuous time" if sampling is None else f"at {number(sampling.rate_hz)} Hz"
+        facts.append(("Controller", "of fixed structure", runs))
+    else:
+        ranges = (("ω_S", inner.omega_S), ("ω_T", inner.omega_T))
+        words = (f"{name} {number(a / HZ)} to {number(b / HZ)} Hz" for name, (a, b) in ranges)
+        facts.append(("Controller", "mixed sensitivity", ", ".join(words)))
+    if item.robust is not None:
+        shifts = f"resonances ±{100.0 * item.robust.shift:g} %"
+        facts.append(("Robust set", shifts, f"made on the plant: {item.robust.design_at}"))
+    source = item.source
+    name = source.model or f"{source.file}:{source.function}"
+    head = f"<h1>{escape(f'A co-design problem: {name}')}</h1>"
+    table = table_html(Table(("θ", "unit", "lower", "upper", "start"), tuple(rows)))
+    return _cell(head, table, facts_html(facts))
+
+
+@html_of.register
+def _(item: InnerResult) -> str:
+    if item.optimum is None:
+        words = f"{item.shortfall}; {item.syntheses} syntheses"
+        return _cell(header("The inner problem", False, "infeasible", "", "", words))
+    binds = ", ".join(item.active) or "nothing"
+    words = f"The largest bandwidth of {item.syntheses} syntheses; {binds} binds."
+    return _cell(_design("The inner problem", item.optimum.figures, words))
+
+
+@html_of.register
+def _(item: Sensitivities) -> str:
+    return _cell(_design("One synthesis, with derivatives", item.figures))
+
+
+@html_of.register
+def _(item: Design) -> str:
+    order = f"A controller of {len(item.controller.A)} states."
+    return _cell(_design("One synthesis", item.figures, order))
+
+
+@html_of.register
+def _(item: SectionsDesign) -> str:
+    title, outcome = "A controller of fixed structure", item.outcome.name.lower()
+    spent = f"{item.starts} starts, {number(item.seconds, 2)} s"
+    parts = [header(title, item.certified, outcome, item.words, spent, "")]
+    if item.controller is not None:
+        hz = f"{number(item.bandwidth / HZ)} Hz"
+        parts.append(facts_html([("Bandwidth ω_b", hz, "on every plant")]))
+        parts.append(controller_html({"controller": sections_dict(item.structure, item.kappa)}))
+    return _cell(*parts)
+
+
+def _result_head(result: Mapping[str, Any]) -> str:
+    good = result["status"] == "verified"
+    said = sections_conclusion if "race" in result else conclusion
+    reason = head_words(result) if good else result["reason"]
+    return header(
+        "Co-design", good, STATUS[result["status"]], reason, "", said(dict(result)),
+        warned=worst(result) is State.WARNED, verdict=verdict_html(result),
+    )  # fmt: skip
+
+
+def _theta(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+    return table_html(theta_table(problem, result))
+
+
+def _loop(
+    problem: CoDesignProblem,
+    plant: ScaledPlant,
+    controller: StateSpace,
+    weights: Weights,
+    figures: DesignFigures,
+) -> str:
+    S_max = problem.inner.S_max
+    loop = loop_data(
+        plant, controller, weights, gamma=figures.gamma, bandwidth_hz=figures.bandwidth / HZ,
+        omega_low=problem.inner.omega_low,
+    )  # fmt: skip
+    drawn = figure_gains([loop], S_max=S_max, key=f"notebook-{next(_figures)}")
+    return figure_html(drawn, caption_gains(loop, S_max=S_max), table_gains(loop))
+
+
+def _design(title: str, figures: DesignFigures, words: str = "") -> str:
+    head = header(title, figures.certified, figures.outcome.value, "", "", "")
+    if not figures.certified:
+        return head + paragraph(words)
+    certificate = figures.certificate
+    norm = f"{number(certificate.norm, 6)} ≤ {number(certificate.norm_bound, 6)}"
+    peak = f"at {number(figures.sensitivity_peak_frequency / HZ)} Hz"
+    facts = [
+        ("Bandwidth ω_b", f"{number(figures.bandwidth / HZ)} Hz", ""),
+        ("Weights", f"ω_S {number(figures.omega_S / HZ)} Hz",
+         f"ω_T {number(figures.omega_T / HZ)} Hz"),
+        ("Peak of S", number(figures.sensitivity_peak), peak),
+        ("|S| at ω_low", number(figures.sensitivity_low), ""),
+        ("Norm against its bound", norm, f"γ_opt {number(figures.gamma_opt, 6)}"),
+        ("Slowest pole", f"{number(certificate.max_real_pole, 4)} 1/s", ""),
+    ]  # fmt: skip
+    return head + facts_html(facts) + paragraph(words)
