@@ -378,9 +378,9 @@ def _bandwidth(
     inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1
     dips = [(float(value[i]), float(omega[i])) for i in (0, len(omega) - 1)]
     if len(inner):
-        points, height, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
-                                    omega[inner - 1], omega[inner + 1])  # fmt: skip
-        dips += zip((-height).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
+        points, least, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
+                                   omega[inner - 1], omega[inner + 1])  # fmt: skip
+        dips += zip((-least).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
     bandwidth = low
     while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
         height, at = min(broken)
