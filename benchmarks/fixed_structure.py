@@ -1,6 +1,6 @@
 """What a fixed structure reaches on sets of plants, judged apart from the synthesis.
 
-    python benchmarks/fixed_structure.py [case1|pid|derivatives|stage|all] [--write]
+    python benchmarks/fixed_structure.py [case1|derivatives|stage|all] [--write]
 
 Every figure is of `certificate.certify`, which rebuilds the loops from matrices: eigenvalues, peaks
 on grids through every pole and zero, hold and delay exact; here on a lattice of 1001 plants.
@@ -18,13 +18,10 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
-from ccd_casadi.fixed_structure.certificate import judged
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
-from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.starts import at_random, kept
-from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice, synthesise_robustly
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
@@ -43,7 +40,6 @@ WEIGHTS = Weights(
 BOUNDS = Bounds(
     S_max=1.75, S_low=0.03, omega_low=HZ, shape=1.1, weighted_level=8.426, weights=WEIGHTS
 )
-LEVELS = 11  # of the grids of a PID
 SAMPLED = Sampling(10000.0, 100.0)
 
 
@@ -106,90 +102,6 @@ def case1(seed: int, chosen: str = "") -> dict[str, dict[str, object]]:
         print(f"{name:62s} asked {asked}, got {row.get('judged_bandwidth_hz', np.nan):.2f} Hz on "
               f"{row.get('judged_plants')} plants, {used:.0f} s of a processor ({spent:.0f} s), "
               f"KKT {made.design.kkt_residual:.1e}: {row.get('judge')}", flush=True)  # fmt: skip
-    return found
-
-
-def pid_plants() -> dict[str, tuple[ScaledPlant, Bounds]]:
-    """Plants on which a PID is compared with a grid; W_KS ends at 10/M_K, as a PID needs it."""
-    found = {}
-    bounds = replace(BOUNDS, weights=replace(WEIGHTS, c_K=10.0))
-    for theta in ((55.0, 55.0), (60.0, 56.0), (70.0, 55.0)):
-        modal = modal_plant(two_mass(theta), Suspension())
-        found[f"two_mass {theta}"] = (scale_plant(modal, M_K), bounds)
-    stage = replace(BOUNDS, S_max=2.0, weighted_level=None, weights=None, compliance_max=2e-5)
-    for rib in (17.0, 25.0):
-        modal = modal_plant(carriage((rib, 6.0)), Suspension())
-        found[f"tutorial stage, rib {rib:g} mm"] = (scale_plant(modal, 2e6), stage)
-    return found
-
-
-def pid_grid(plant: ScaledPlant, bounds: Bounds) -> float:
-    """The best ω_b in Hz of PID by grids over (gain, ω_i, z, p), the finer the closer to the best.
-
-    Nothing of the search's figures is used: a response on fixed frequencies for every point, and
-    the judge for the best of them.
-    """
-    structure = Structure(True, 1, 0, 0)
-    problem = problem_for([plant], structure, bounds)
-    v = np.unique(np.concatenate([problem.base, problem.fixed[0], np.geomspace(0.05, 20.0, 5000)]))
-    v = v[(v >= problem.base[0]) & (v <= problem.base[-1])]
-    G, _ = problem.plants.responses(np.zeros(len(v), int), v)
-    weights = bounds.weights or WEIGHTS
-    _, W_KS, W_T = np.abs(weights.responses(v * plant.omega_0))
-    low = np.log(np.array([1e-2, 1e-3, 1e-2, 0.3]))
-    high = np.log(np.array([1e1, 1.0, 3.0, 30.0]))
-    at_low = np.array([bounds.omega_low / plant.omega_0])
-    G_low, _ = problem.plants.responses(np.zeros(1, int), at_low)
-    best, centre = -np.inf, 0.5 * (low + high)
-    width = 0.5 * (high - low)
-    for level in range(LEVELS):
-        counts = (21, 9, 9, 9) if level == 0 else (21, 7, 7, 7)
-        axes = [c + w * np.linspace(-1.0, 1.0, count)
-                for c, w, count in zip(centre, width, counts, strict=True)]  # fmt: skip
-        points = np.clip(np.array(list(itertools.product(*axes))), *problem.box)
-        for part in np.array_split(points, max(1, len(points) // 2000)):
-            part = part[stable(closed_loops(problem.plants, structure, part)).all(1)]
-            if not len(part):
-                continue
-            K = response(structure, part.T[:, :, None], 1j * v[None])
-            S = np.abs(1.0 / (1.0 + G * K))
-            good = S.max(1) <= bounds.S_max
-            if bounds.weighted_level is not None:
-                KS = np.abs(K) * S
-                good &= (W_KS * KS * plant.force).max(1) <= bounds.weighted_level
-                good &= (W_T * KS * np.abs(G)).max(1) <= bounds.weighted_level
-            if bounds.compliance_max is not None:
-                good &= (np.abs(G) * S).max(1) / plant.force <= bounds.compliance_max
-            K_low = response(structure, part.T[:, :, None], 1j * at_low[None])
-            good &= np.abs(1.0 / (1.0 + G_low * K_low))[:, 0] <= bounds.S_low
-            # ω_b: the last ω up to which room >= ω, room the least shape ω/(√2|S|) so far
-            room = np.minimum.accumulate((bounds.shape or np.inf) * v / (np.sqrt(2.0) * S), axis=1)
-            fine = (np.sqrt(0.5) >= S) & (room >= v)
-            last = np.where(fine.all(1), len(v) - 1, np.argmin(fine, axis=1) - 1)
-            value = np.where(good & (last >= 0), v[last], -np.inf)
-            k = int(np.argmax(value))
-            if value[k] > best:
-                best, centre = float(value[k]), part[k]
-        width *= 0.75 if level else 0.35
-    if not np.isfinite(best):
-        return np.nan
-    kappa = structure.in_units(centre, plant.omega_0, plant.force)
-    figures = judged(plant, state_space(structure, kappa), bounds, None, True)
-    worst = max(bounds.shares(figures).values())
-    assert worst < 1.0 + 2e-3, f"the grid's frequencies miss a peak: {worst}"
-    return figures.bandwidth / HZ
-
-
-def pid(seed: int) -> dict[str, dict[str, float]]:
-    """PID by the search against the grid."""
-    found = {}
-    for name, (plant, bounds) in pid_plants().items():
-        made = synthesise_sections([plant], Structure(True, 1, 0, 0), bounds, seed=seed)
-        grid = pid_grid(plant, bounds)
-        got = made.bandwidth / HZ
-        found[name] = {"search_hz": got, "grid_hz": grid, "difference": got / grid - 1.0}
-        print(f"PID, {name:32s} search {got:.3f} Hz, grid {grid:.3f} Hz, "
-              f"{got / grid - 1.0:+.3%}: {made.words}", flush=True)  # fmt: skip
     return found
 
 
@@ -316,7 +228,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    parts = {"case1": case1, "pid": pid, "derivatives": derivatives, "stage": stage}
+    parts = {"case1": case1, "derivatives": derivatives, "stage": stage}
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     for name, part in parts.items():
         if options.part in (name, "all"):

@@ -26,7 +26,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.plants.scaling import scale_plant, scale_state_space
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.synthesis.closed_loop import measure, responses
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.
@@ -91,12 +91,44 @@ def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
         assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slope[i], rel=2e-3)
 
 
+def rigid(mass: float) -> ScaledPlant:
+    """A body on its suspension."""
+    M, D, K, B, C = (np.array([[value]]) for value in (mass, 0.0, 0.0, 1.0, 1.0))
+    body = Mechanics(M, D, K, B, C, 0.01, (np.zeros((1, 1, 1)),) * 5)
+    return scale_plant(modal_plant(body, SUSPENSION), WEIGHTS.M_K)
+
+
+@pytest.mark.parametrize("gain", [0.994, 0.9995, 1.0005])
+def test_a_narrow_peak_at_3_db_is_seen_by_the_judge_and_by_the_search(gain: float) -> None:
+    """|S| touches -3 dB between two points of a grid, beside where the shape turns level.
+
+    Random problems found it: both looked at the grid there, and a loop was certified that passed
+    its shape by 0.04 %.
+    """
+    structure, sampling = Structure(biquads=1, roll_off=0), Sampling(3814.4)
+    kappa = np.log([71379.0, 2.3485, 5.8627, 175.47, 173.77, 0.12104, 601.8, 0.52486])
+    kappa[0] += np.log(gain * 0.92418)
+    bounds = Bounds(S_max=4.7, S_low=0.1, omega_low=2.6, shape=1.2286)
+    problem = problem_for([rigid(12.743)], structure, bounds, sampling)
+    scaled, own = in_problem_units(problem, kappa), problem.plants
+    omega = np.geomspace(20.0, 1100.0, 200_000)
+    v = own.variable(omega / own.omega_0)
+    G, _ = own.responses(np.zeros(len(v), int), v)
+    S = np.abs(1.0 / (1.0 + G * response(structure, scaled, 1j * v)))
+    judged = certify([rigid(12.743)], state_space(structure, kappa), bounds, sampling)
+    first = omega[np.argmax(np.sqrt(2.0) * S > 1.0)]
+    assert judged.plants[0].crossing == pytest.approx(first, rel=1e-3)
+    bandwidth = 192.05
+    shape = np.minimum(1.0, bounds.shape * omega / bandwidth)
+    worst = (np.sqrt(2.0) * S / shape)[omega < bandwidth].max()
+    peaks = assess(problem, scaled, float(np.log(bandwidth / own.omega_0))).peaks
+    found = peaks.value[peaks.curve == Curve.SHAPE].max() - problem.margin
+    assert found == pytest.approx(np.log(worst), abs=1e-6)
+
+
 def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
     """Its only pole is the suspension's; S, T and GS have their peaks a hundred times above it."""
-    still = (np.zeros((1, 1, 1)),) * 5
-    M, D, K, B, C = (np.array([[value]]) for value in (100.0, 0.0, 0.0, 1.0, 1.0))
-    mass = Mechanics(M, D, K, B, C, 0.01, still)
-    body = scale_plant(modal_plant(mass, SUSPENSION), WEIGHTS.M_K)
+    body = rigid(100.0)
     bounds = replace(EASY, weighted_level=None, weights=None)
     problem = problem_for([body], SMALL, bounds)
     rng = np.random.default_rng(0)

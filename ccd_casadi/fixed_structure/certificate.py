@@ -354,6 +354,15 @@ def _bandwidth(
     table: _Responses, grid: Array, S: Array, bounds: Bounds, integrator: bool
 ) -> tuple[float, float]:
     """The first ω with |S| = 1/√2, and the largest ω_b that keeps the shape below it."""
+    # A peak between two points of the grid may pass -3 dB where both stay below.
+    inner = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
+    inner = inner[(S[inner] <= HALF_POWER) & (S[inner] > 0.9 * HALF_POWER)]
+    if len(inner):
+        points, peaks, i = _zoomed(lambda x: table.at(x.ravel())["S"].reshape(x.shape),
+                                   grid[inner - 1], grid[inner + 1])  # fmt: skip
+        grid = np.concatenate([grid, points[np.arange(len(i)), i]])
+        grid, first = np.unique(grid, return_index=True)
+        S = np.concatenate([S, peaks])[first]
     above = np.flatnonzero(S > HALF_POWER)
     if S[0] > HALF_POWER or not len(above):
         return np.nan, 0.0
@@ -378,9 +387,9 @@ def _bandwidth(
     inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1
     dips = [(float(value[i]), float(omega[i])) for i in (0, len(omega) - 1)]
     if len(inner):
-        points, height, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
-                                    omega[inner - 1], omega[inner + 1])  # fmt: skip
-        dips += zip((-height).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
+        points, least, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
+                                   omega[inner - 1], omega[inner + 1])  # fmt: skip
+        dips += zip((-least).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
     bandwidth = low
     while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
         height, at = min(broken)

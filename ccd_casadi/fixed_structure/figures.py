@@ -37,6 +37,7 @@ from ccd_casadi.synthesis.weights import Weights
 
 PER_DECADE = 24
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
+AROUND_THE_KINK = np.array([0.97, 0.99, 0.997, 1.0, 1.003, 1.01, 1.03])
 RELEVANT = -1.0  # ln of the share of its bound under which a peak is none of ours
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 9  # of a peak's bracket by false position; the error is squared, so is its effect
@@ -190,7 +191,7 @@ def assess(
     good = stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
-    v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles)
+    v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles, tau)
     P, k = v.shape
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
     loops = evaluate(problem, kappa, tau, which, v, order=0)
@@ -365,15 +366,20 @@ def chain_of(problem: LoopProblem, v: Array) -> Array:
 
 
 def frequency_grid(
-    problem: LoopProblem, controller: tuple[np.ndarray, np.ndarray], poles: np.ndarray
+    problem: LoopProblem, controller: tuple[np.ndarray, np.ndarray], poles: np.ndarray, tau: float
 ) -> tuple[Array, np.ndarray]:
     """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
 
-    `controller`: the zeros and the poles of K.
+    `controller`: the zeros and the poles of K. Where the shape turns level its curve has a kink,
+    and may have a peak on either side of it.
     """
     own = np.concatenate(controller)
     own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
-    joint = np.concatenate([problem.fixed, _flanked(own), _flanked(poles)], axis=1)
+    parts = [problem.fixed, _flanked(own), _flanked(poles)]
+    if problem.bounds.shape is not None:
+        kink = np.exp(tau) / problem.bounds.shape * AROUND_THE_KINK
+        parts.append(np.tile(problem.plants.variable(kink), (len(poles), 1)))
+    joint = np.concatenate(parts, axis=1)
     bottom, top = problem.base[0], problem.base[-1]
     # Points that fall together would hide a peak between them: spares go below the base instead.
     spare = np.broadcast_to(bottom * np.linspace(0.5, 0.99, joint.shape[1]), joint.shape)

@@ -164,7 +164,7 @@ def _(
     good = stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
-    v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles)
+    v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles, tau)
     P, count = v.shape
     outputs = problem.plants.matrices.shape[2]
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])

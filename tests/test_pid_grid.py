@@ -1,0 +1,49 @@
+"""PID by the search against a grid that shares nothing with it: benchmarks/pid_grid.py, coarser."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccd_casadi.fixed_structure import synthesise_sections
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import build_plant, mechanics
+from ccd_casadi.plants.scaling import scale_plant
+
+
+@pytest.fixture(scope="module")
+def study():
+    """The benchmark, with fewer points, gains and samples."""
+    path = Path(__file__).parents[1] / "benchmarks" / "pid_grid.py"
+    spec = importlib.util.spec_from_file_location("pid_grid", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["pid_grid"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["pid_grid"]
+
+
+def test_no_point_of_a_grid_is_better_than_the_search(study, monkeypatch) -> None:
+    """Two masses, force and sensor apart: the search loses nothing to the grid, nor cheats it."""
+    small = {"COARSE": (4, 7, 6, 5), "GAINS": 24, "BASINS": 2, "SAMPLES": 100, "BEST": 12}
+    for name, value in small.items():
+        monkeypatch.setattr(study, name, value)
+    case = study.CASES["ACC benchmark"]
+    system = mechanics(build_plant(case.function, ("k",), {}), np.array([1.0]))
+    suspension = Suspension(case.suspended_hz)
+    plant = scale_plant(modal_plant(system, suspension), case.M_K)
+    made = synthesise_sections([plant], study.PID, case.bounds, starts=4)
+    assert made.certified
+    loop = study.loop_of(system, suspension, (0.0,), case.bounds, case.expected_hz * study.HZ,
+                         made.frequencies[0])  # fmt: skip
+    own, over = study.judged(loop, made.kappa)
+    assert over <= 1.0 + 1e-4
+    assert own == pytest.approx(made.bandwidth, rel=1e-3)
+    _, kappa, looked = study.refined(loop)
+    grid, over = study.judged(loop, kappa)
+    assert looked > 10_000
+    assert over < 1.01
+    assert grid > 0.9 * made.bandwidth  # a grid that finds nothing shows nothing
+    assert made.bandwidth >= grid * (1.0 - 5e-3 - (over - 1.0))
