@@ -246,7 +246,9 @@ def one(seed: int, index: int) -> dict:
         quiet = ["--quiet", "--workers", "1"]
         words = io.StringIO()
         with contextlib.redirect_stderr(words), contextlib.redirect_stdout(words):
-            code = solve([str(place / "case.toml"), "--formulation", "lifted", "--no-report", *quiet])
+            code = solve(
+                [str(place / "case.toml"), "--formulation", "lifted", "--no-report", *quiet]
+            )
         folder = place / "case"
         result = json.loads((folder / "result.json").read_text()) if code != 2 else {}
         row = {
