@@ -28,6 +28,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
+    from ccd_casadi.deployment.fmu import FILE as FMU_FILE
+    from ccd_casadi.deployment.fmu import write_fmu
     from ccd_casadi.deployment.move import Hardware
     from ccd_casadi.deployment.on_hardware import on_hardware
     from ccd_casadi.deployment.pipeline import deploy
@@ -72,15 +74,20 @@ def command(options: argparse.Namespace) -> ExitCode:
                 progress=lambda words: bar.advance(note=words),
             )  # fmt: skip
     # an earlier controller must not pass for this one
-    for name in (*DESIGN_FILES, *C_FILES, ST_FILE):
+    for name in (*DESIGN_FILES, *C_FILES, ST_FILE, FMU_FILE):
         (folder / name).unlink(missing_ok=True)
     write_files(folder, finished, found, options.seed, moved)
     if moved is not None:
         naming = {
             "title": options.run.resolve().name, "delay": found.delay, "verified": found.passed
         }  # fmt: skip
-        write_c(folder, found.realisation, **naming, forward=moved.forward)
+        texts = write_c(folder, found.realisation, **naming, forward=moved.forward)
         (folder / ST_FILE).write_text(structured_text(found.realisation, **naming), "utf-8")
+        if options.fmu and not write_fmu(
+            folder / FMU_FILE, found.realisation, texts, str(naming["title"])
+        ):
+            print("note: no C compiler here (cc, or CC): the FMU has its sources alone",
+                  file=sys.stderr)  # fmt: skip
     if not options.quiet:
         print(_summary(finished, found))
         if moved is not None:
@@ -196,6 +203,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--saturation", metavar="NEWTON", type=positive,
         help="limit every u to plus or minus this, with anti-windup (default: off)",
+    )  # fmt: skip
+    arguments.add_argument(
+        "--fmu", action="store_true",
+        help="also write controller.fmu (FMI 2.0, co-simulation), compiled by cc or what CC names",
     )  # fmt: skip
     for name, metavar, words in (
         ("sensor-step", "METRE", "of the simulated sensor"),

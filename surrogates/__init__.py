@@ -42,6 +42,7 @@ _PUBLIC = {
     "Roughness": "quality",
     "Samples": "samples",
     "Surrogate": "interface",
+    "SurrogateRegressor": "estimator",
     "SurrogateFileError": "serialise",
     "SurrogateFitError": "interface",
     "checked": "samples",

@@ -2,6 +2,7 @@
 from surrogates.casadi_export import to_casadi as to_casadi
 from surrogates.covariance import Hyperparameters as Hyperparameters
 from surrogates.covariance import Kernel as Kernel
+from surrogates.estimator import SurrogateRegressor as SurrogateRegressor
 from surrogates.extrapolation import Extrapolation as Extrapolation
 from surrogates.extrapolation import extrapolation as extrapolation
 from surrogates.fitting import Kind as Kind

@@ -248,13 +248,14 @@ int main(int count, char **words)
 def write_c(
     folder: Path, realisation: Realisation, *, title: str, delay: float, verified: bool,
     forward: Array | None = None,
-) -> None:  # fmt: skip
-    """controller.h, controller.c and controller_test.c in `folder`; delay in s."""
+) -> Mapping[str, str]:  # fmt: skip
+    """controller.h, controller.c and controller_test.c in `folder`, and their texts; delay in s."""
     files = c_files(
         realisation, title=title, delay=delay, verified=verified, forward=forward
     )  # fmt: skip
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
+    return files
 
 
 def c_files(

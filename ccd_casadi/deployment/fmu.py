@@ -1,0 +1,121 @@
+"""The deployed controller as an FMU (FMI 2.0 for co-simulation), around the generated C code.
+
+A zip of modelDescription.xml, the sources, and a binary for this machine where it has a compiler:
+`cc`, or what CC names. Without one the sources alone are inside, which FMI 2.0 provides for, and
+the importing tool compiles them.
+"""
+
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from xml.etree import ElementTree as ET
+
+from ccd_casadi.deployment.fmu_wrapper import WRAPPER
+from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.support.errors import UserError
+
+FILE = "controller.fmu"
+NAME = "controller"  # modelIdentifier
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
+_LIBRARY = {"linux": ("linux", ".so"), "darwin": ("darwin", ".dylib"), "win32": ("win", ".dll")}
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same controller is the same file
+
+
+def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], title: str) -> bool:
+    """Write the FMU of a controller whose C code is `c_files`; whether a binary is inside.
+
+    Variables: e1, … in m, feedforward f1, … in N (0 at the start), and u1, … in N. A step of the
+    co-simulation computes every sample that falls into it, at multiples of the controller's period
+    from the start: u of a sample at t is there at the end of the step that begins at t, so a step
+    as long as the delay gives the loop that was verified.
+
+    Raises UserError where there is a compiler and it fails.
+    """
+    sources = {name: c_files[name] for name in ("controller.h", "controller.c")}
+    guid = hashlib.sha256("".join([*sources.values(), WRAPPER]).encode()).hexdigest()[:32]
+    sources["fmu.c"] = WRAPPER.replace("@GUID@", guid)
+    K = realisation.system
+    description = _description(K.B.shape[1], len(K.C), K.period, guid, title)
+    library = compiled(sources)
+    content: dict[str, bytes] = {"modelDescription.xml": description}
+    content |= {f"sources/{name}": text.encode() for name, text in sources.items()}
+    if library is not None:
+        system, ending = _LIBRARY[sys.platform]
+        bits = "64" if sys.maxsize > 2**32 else "32"
+        content[f"binaries/{system}{bits}/{NAME}{ending}"] = library
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in content.items():
+            file.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+    return library is not None
+
+
+def compiled(sources: Mapping[str, str]) -> bytes | None:
+    """The shared library of the sources; None where this machine has no compiler for it."""
+    command = shlex.split(os.environ.get("CC", "cc"))
+    # FMI 2.0 has names for binaries of x86 alone
+    if sys.platform not in _LIBRARY or platform.machine().lower() not in ("x86_64", "amd64"):
+        return None
+    if not command or shutil.which(command[0]) is None:
+        return None
+    with TemporaryDirectory() as folder:
+        for name, text in sources.items():
+            (Path(folder) / name).write_text(text, encoding="utf-8")
+        units = [name for name in sources if name.endswith(".c")]
+        made = subprocess.run(
+            [*command, *FLAGS, "-o", "library", *units],
+            cwd=folder, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if made.returncode:
+            words = " ".join(made.stderr.split())[:200]
+            raise UserError(f"{command[0]}: does not compile the FMU: {words}; set CC to another")
+        return (Path(folder) / "library").read_bytes()
+
+
+def _description(errors: int, forces: int, period: float, guid: str, title: str) -> bytes:
+    """modelDescription.xml of FMI 2.0; value references count e, then f, then u."""
+    root = ET.Element("fmiModelDescription", {
+        "fmiVersion": "2.0", "modelName": NAME, "guid": guid, "generationTool": "ccd-casadi",
+        "description": f"Controller of {title}, sampled every {period:.17g} s",
+        "variableNamingConvention": "flat", "numberOfEventIndicators": "0",
+    })  # fmt: skip
+    kind = ET.SubElement(root, "CoSimulation", {
+        "modelIdentifier": NAME, "canHandleVariableCommunicationStepSize": "true",
+        "canNotUseMemoryManagementFunctions": "true",
+    })  # fmt: skip
+    files = ET.SubElement(kind, "SourceFiles")
+    for name in ("controller.c", "fmu.c"):
+        ET.SubElement(files, "File", {"name": name})
+    units = ET.SubElement(root, "UnitDefinitions")
+    for name, base in (("m", {"m": "1"}), ("N", {"kg": "1", "m": "1", "s": "-2"})):
+        ET.SubElement(ET.SubElement(units, "Unit", {"name": name}), "BaseUnit", base)
+    ET.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": f"{period:.17g}"})
+    variables = ET.SubElement(root, "ModelVariables")
+    groups = (
+        ("e", errors, "m", "input", "r - y"),
+        ("f", forces, "N", "input", "feedforward, added before the limit"),
+        ("u", forces, "N", "output", "force"),
+    )
+    reference, outputs = 0, []
+    for letter, count, unit, causality, words in groups:
+        for i in range(count):
+            about = {"name": f"{letter}{i + 1}", "valueReference": str(reference),
+                     "causality": causality, "description": words}  # fmt: skip
+            if causality == "output":
+                about |= {"variability": "discrete", "initial": "exact"}
+                outputs.append(reference + 1)
+            variable = ET.SubElement(variables, "ScalarVariable", about)
+            ET.SubElement(variable, "Real", {"unit": unit, "start": "0.0"})
+            reference += 1
+    structure = ET.SubElement(ET.SubElement(root, "ModelStructure"), "Outputs")
+    for index in outputs:
+        ET.SubElement(structure, "Unknown", {"index": str(index)})
+    ET.indent(root)
+    return ET.tostring(root, encoding="UTF-8", xml_declaration=True)
