@@ -267,7 +267,10 @@ def evaluate(
         K, K_slope = response_and_slope(problem.structure, kappa, s)
     else:
         K, to_kappa, K_slope = response_and_slopes(problem.structure, kappa, s)
-    G, dG = plants.responses(which, v)
+    if order == 0:
+        G, dG = plants.values(which, v), np.zeros(())
+    else:
+        G, dG = plants.responses(which, v)
     L = G * K
     S = 1.0 / (1.0 + L)
     omega = plants.frequency(v)
@@ -294,7 +297,10 @@ def evaluate(
             levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
             levels[Curve.T] = ln_L + ln_S + W[1] - ln_level
         if bounds.compliance_max is not None:
-            free, free_slope = plants.free_responses(which, v)
+            if order == 0:
+                free, free_slope = plants.values(which, v, free=True), np.zeros(())
+            else:
+                free, free_slope = plants.free_responses(which, v)
             ceiling = np.log(bounds.compliance_max * plants.force)
             levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
         if order:
