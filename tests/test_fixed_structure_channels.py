@@ -100,6 +100,36 @@ def test_derivatives_of_singular_values(
 
 
 @pytest.mark.parametrize("sampling", [None, FAST])
+def test_channels_that_share_parameters_are_the_same_loop_with_fewer(
+    sampling: Sampling | None,
+) -> None:
+    """Bounds of the loop with them written out, and derivatives by the chain rule."""
+    problem, kappa = loop(0, (0.0, 0.3), sampling)
+    whole_structure = problem.structure
+    tied = ChannelStructure(whole_structure.decoupling, whole_structure.structures, (0, 1, 1))
+    plants = [plant(), plant(off=0.3)]
+    shared = composite_problem(plants, tied, BOUNDS, sampling)
+    kappa, count = kappa[: len(tied.names)], len(STRUCTURE.names)
+    assert len(tied.names) == 2 * count
+    np.testing.assert_array_equal(tied.places[2 * count :], tied.places[count : 2 * count])
+    written_out = kappa[tied.places]
+    one, other = assess(shared, kappa, -1.5).peaks, assess(problem, written_out, -1.5).peaks
+    assert one is not None
+    assert other is not None
+    np.testing.assert_allclose(one.value, other.value, atol=1e-9)
+    chain = (np.arange(2 * count) == tied.places[:, None]).astype(float)
+    np.testing.assert_allclose(one.to_kappa, other.to_kappa @ chain, atol=1e-7)
+    wide = np.block([[chain, np.zeros((3 * count, 1))], [np.zeros((1, 2 * count)), np.eye(1)]])
+    exact = hessians(problem, written_out, -1.5, other)
+    np.testing.assert_allclose(
+        hessians(shared, kappa, -1.5, one), wide.T @ exact @ wide, rtol=1e-4, atol=1e-4
+    )
+    K, apart = tied.state_space(kappa), whole_structure.state_space(written_out)
+    for a, b in zip((K.A, K.B, K.C, K.D), (apart.A, apart.B, apart.C, apart.D), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
 def test_the_hessian_of_the_whole_is_the_difference_of_gradients(sampling: Sampling | None) -> None:
     """In random directions; peaks move with κ. Where σ is a simple one, clear of the next."""
     problem, kappa = loop(1, (0.3,), sampling)

@@ -246,3 +246,20 @@ def test_the_built_stage_has_its_channels_and_its_option_sets() -> None:
     assert [item["modes"] for item in options] == [20, 20]
     assert options[0]["mesh"] == "fine"
     assert "point_masses" in options[1]
+    assert structure.owners == (0, 1, 1, 3)
+    assert not any(name.startswith("tilt") for name in structure.names)
+
+
+@pytest.mark.parametrize(
+    ("added", "words"),
+    [
+        ('[controller.channel.1]\nlike = "2"', "name a channel with a table"),
+        ('[controller.channel.1]\nlike = "1"', "name a channel with a table"),
+        ('[controller.channel.1]\n[controller.channel.2]\nlike = "1"\nlead = 2', "given by like"),
+    ],
+)
+def test_a_channel_is_like_one_with_parameters_of_its_own(
+    tmp_path: Path, added: str, words: str
+) -> None:
+    with pytest.raises(CaseError, match=words):
+        two_axes(tmp_path, added)

@@ -93,6 +93,14 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
     for name, own in controller.channel:
         if own.inputs is not None and own.outputs is None:
             raise fail(f"controller.channel.{name}.inputs", "has no outputs beside it; add them")
+        if own.like is not None:
+            others = dict(controller.channel)
+            if own.like == name or own.like not in others or others[own.like].like is not None:
+                words = f"is {own.like!r}; name a channel with a table and parameters of its own"
+                raise fail(f"controller.channel.{name}.like", words)
+            for key in (item.name for item in fields(Structure)):
+                if getattr(own, key) is not None:
+                    raise fail(f"controller.channel.{name}.{key}", "is given by like; drop it")
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
 
@@ -224,10 +232,11 @@ def sections_problem(
 def _channels(controller: ControllerSection) -> tuple[ChannelProblem, ...]:
     """The channels that the case names, each with its structure."""
     keys = [item.name for item in fields(Structure)]
-    found = []
+    found, given = [], dict(controller.channel)
     for name, own in controller.channel:
-        values = {key: getattr(own, key) for key in keys if getattr(own, key) is not None}
+        whose = own if own.like is None else given[own.like]
+        values = {key: getattr(whose, key) for key in keys if getattr(whose, key) is not None}
         structure = Structure(**({key: getattr(controller, key) for key in keys} | values))
         inputs = own.outputs if own.inputs is None else own.inputs
-        found.append(ChannelProblem(name, structure, own.outputs, inputs))
+        found.append(ChannelProblem(name, structure, own.outputs, inputs, own.like))
     return tuple(found)

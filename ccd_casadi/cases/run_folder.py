@@ -191,14 +191,13 @@ def _with_directions(
     sections = problem.sections
     if sections is None or not isinstance(table, Mapping) or "channels" not in table:
         return problem
-    own = {channel.name: channel.structure for channel in sections.channels}
+    own = {channel.name: channel for channel in sections.channels}
     try:
         channels = tuple(
-            ChannelProblem(
-                str(item["name"]),
-                own.get(str(item["name"]), sections.structure),
-                tuple(map(float, item["outputs"])),
-                tuple(map(float, item["inputs"])),
+            replace(
+                own.get(str(item["name"]), ChannelProblem(str(item["name"]), sections.structure)),
+                outputs=tuple(map(float, item["outputs"])),
+                inputs=tuple(map(float, item["inputs"])),
             )
             for item in table["channels"]
         )

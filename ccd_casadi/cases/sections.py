@@ -27,6 +27,7 @@ from ccd_casadi.cases.checks import (
     steps,
     table,
     tables,
+    text,
 )
 from ccd_casadi.support.notebook import Shown
 
@@ -231,7 +232,8 @@ class ChannelSection:
 
     `outputs`: how the channel's measurement is made of the plant's, `inputs`: how its force acts on
     the plant's (default: as `outputs`). Either every channel gives them or none: then the channels
-    are those that are found, named "1", "2", ….
+    are those that are found, named "1", "2", …. `like` names a channel with the same parameters, as
+    tip and tilt of a square stage may have: then nothing else of the structure is given.
     """
 
     outputs: tuple[float, ...] | None = _key(
@@ -241,6 +243,9 @@ class ChannelSection:
         direction,
         None,
         says="how the channel's force acts on the plant's inputs; default: as outputs",
+    )
+    like: str | None = _key(
+        text, None, says="the channel whose parameters this one has: one controller for both"
     )
     integrator: bool | None = _key(flag, None, says="instead of [controller]'s")
     lead: int | None = _key(count(0), None, says="instead of [controller]'s")

@@ -16,7 +16,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import CompositeProblem, composite_problem
+from ccd_casadi.fixed_structure.composite import (
+    CompositeProblem,
+    answer_alike,
+    composite_problem,
+)
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import (
     MARGIN,
@@ -29,7 +33,7 @@ from ccd_casadi.fixed_structure.design import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.loop import Sampling
 from ccd_casadi.fixed_structure.race import (
     LocalOptimum,
     finished,
@@ -45,7 +49,6 @@ from ccd_casadi.support.process_pool import Pool
 
 TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
-ALIKE = 1e-9  # relative: responses of channels that are one problem
 
 
 def synthesise(
@@ -81,19 +84,30 @@ def synthesise(
     def channels(limits: Bounds, before: Sequence[SectionsDesign] = ()) -> list[SectionsDesign]:
         """A design for each channel, on its entry of every plant; one for all that are alike.
 
+        One for those that share their parameters too, on the entries of all of them.
+
         Climbs from `before`, the same with wider limits, if it is given.
         """
         found: list[SectionsDesign] = []
         own_plants: list[list[ScaledPlant]] = []
         for i, own in enumerate(structure.structures):
             members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
+            if structure.owner(i) != i:
+                own_plants.append(members)
+                found.append(found[structure.owner(i)])
+                continue
+            for j in range(i + 1, len(structure.structures)):
+                if structure.owner(j) == i:
+                    others = [channel_plant(plant, structure.decoupling, j) for plant in alike]
+                    members += [other for other, one in zip(others, members, strict=False)
+                                if not answer_alike([one], [other])]  # fmt: skip
             begins = [_of_channel(structure, item, i) for item in initial]
             again = bool(before) and bool(np.isfinite(before[i].kappa).all())
             if again:
                 begins = [before[i].kappa]
             own_plants.append(members)
             same = [j for j in range(i) if structure.structures[j] == own
-                    and _alike(members, own_plants[j])]  # fmt: skip
+                    and answer_alike(members, own_plants[j])]  # fmt: skip
             if same and (not begins or again):
                 found.append(found[same[0]])
                 continue
@@ -126,7 +140,7 @@ def synthesise(
         rng = np.random.default_rng(seed)
         field += actuator_starts(problem, structure, alike, sampling, starts, rng)
         evaluations += len(field)
-    elif not only_initial:
+    elif not field or not only_initial:
         before: list[SectionsDesign] = []
         for share in TIGHTENED:
             limits = replace(bounds, S_max=1.0 + share * (bounds.S_max - 1.0))
@@ -173,7 +187,7 @@ def _joined(
     begun: float,
 ) -> SectionsDesign:
     """The channels' designs as one, with the bandwidth of the slowest."""
-    kappa = np.concatenate([one.kappa for one in made])
+    kappa = np.concatenate([made[i].kappa for i in problem.structure.free])
     inside = in_problem_units(problem, kappa)
     slowest = min(one.bandwidth for one in made)
     tau = float(np.log(slowest / problem.plants.omega_0))
@@ -212,21 +226,9 @@ def _of_channel(
     return StateSpace(item.A, item.B @ into, out @ item.C, out @ item.D @ into)
 
 
-def _alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
-    """Whether two channels' plants answer alike; so many frequencies tell rational functions."""
-    first, second = plant_set(a), plant_set(b)
-    if first.poles.shape != second.poles.shape:
-        return False
-    v = np.geomspace(1e-2, 1e2, 4 * first.poles.shape[1] + 1)
-    which = np.repeat(np.arange(len(a)), len(v))
-    v = np.tile(v, len(a))
-    one, other = first.responses(which, v)[0], second.responses(which, v)[0]
-    return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
-
-
 def _stacked(problem: CompositeProblem, made: Sequence[SectionsDesign]) -> Array | None:
     """The channels' parameters in the units of the problem, None where one has found none."""
-    kappa = np.concatenate([one.kappa for one in made])
+    kappa = np.concatenate([made[i].kappa for i in problem.structure.free])
     if not np.isfinite(kappa).all():
         return None
     return np.clip(in_problem_units(problem, kappa), *problem.box)

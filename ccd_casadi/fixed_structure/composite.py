@@ -32,15 +32,23 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
 NOT_THERE = -1.0  # a pole that stands for none
+ALIKE = 1e-9  # relative: responses of channels that are one problem
 
 
 @dataclass(frozen=True)
 class Part:
-    """A problem on some of the parameters (`place` of κ) and some of the plants (`members`)."""
+    """A problem on some of the parameters (`place` of κ) and some of the plants (`members`).
+
+    Parameters that channels share stand in `place` as often as the problem has them.
+    """
 
     problem: LoopProblem
-    place: slice
+    place: np.ndarray
     members: np.ndarray
+
+    def spread(self, count: int) -> Array:
+        """(k, count): the problem's parameters from all."""
+        return np.asarray(np.arange(count) == self.place[:, None], float)
 
 
 @dataclass(frozen=True)
@@ -105,15 +113,19 @@ def composite_problem(
     parts = []
     if apart.any():
         members = np.flatnonzero(apart)
+        singles: list[list[ScaledPlant]] = []
         for i, own in enumerate(structure.structures):
-            place = structure.slices[i]
-            single = [channel_plant(alike[j], structure.decoupling, i) for j in members]
-            problem = Problem(plant_set(single, sampling), own, bounds, box[:, place], margin)
+            place = np.arange(len(box[0]))[structure.slices[i]]
+            singles.append([channel_plant(alike[j], structure.decoupling, i) for j in members])
+            if structure.owner(i) != i and answer_alike(singles[structure.owner(i)], singles[i]):
+                continue
+            problem = Problem(plant_set(singles[i], sampling), own, bounds, box[:, place], margin)
             parts.append(Part(problem, place, members))
     if len(together):
         matrices = matrix_plant_set([alike[j] for j in together], structure.decoupling, sampling)
-        whole = MatrixProblem(matrices, structure, bounds, box, margin)
-        parts.append(Part(whole, slice(0, len(box[0])), together))
+        place = structure.places
+        whole = MatrixProblem(matrices, structure.apart, bounds, box[:, place], margin)
+        parts.append(Part(whole, place, together))
     plant_units = parts[0].problem.plants
     return CompositeProblem(plant_units, structure, bounds, box, margin, tuple(parts), len(plants))
 
@@ -146,8 +158,7 @@ def _(
             own = getattr(one, side)
             if own is None:
                 continue
-            wide = np.zeros((len(own.v), len(kappa)))
-            wide[:, part.place] = own.to_kappa
+            wide = own.to_kappa @ part.spread(len(kappa))
             start = problem.rows_of(number)[0]
             rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
         sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
@@ -171,9 +182,22 @@ def _(problem: CompositeProblem, kappa: Array, tau: float, rows: Constraints) ->
     n = len(kappa)
     out = np.zeros((len(rows.v), n + 1, n + 1))
     for part, at, own in problem.split(rows):
-        place = np.append(np.arange(n)[part.place], n)
-        out[np.ix_(at, place, place)] = hessians(part.problem, kappa[part.place], tau, own)
+        spread = np.zeros((len(part.place) + 1, n + 1))
+        spread[:-1, :-1], spread[-1, -1] = part.spread(n), 1.0
+        out[at] = spread.T @ hessians(part.problem, kappa[part.place], tau, own) @ spread
     return out
+
+
+def answer_alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
+    """Whether two channels' plants answer alike; so many frequencies tell rational functions."""
+    first, second = plant_set(a), plant_set(b)
+    if first.poles.shape != second.poles.shape:
+        return False
+    v = np.geomspace(1e-2, 1e2, 4 * first.poles.shape[1] + 1)
+    which = np.repeat(np.arange(len(a)), len(v))
+    v = np.tile(v, len(a))
+    one, other = first.responses(which, v)[0], second.responses(which, v)[0]
+    return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
 
 
 def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:

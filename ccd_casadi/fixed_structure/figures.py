@@ -268,7 +268,10 @@ def evaluate(
         K, K_slope = response_and_slope(problem.structure, kappa, s)
     else:
         K, to_kappa, K_slope = response_and_slopes(problem.structure, kappa, s)
-    G, dG = plants.responses(which, v)
+    if order == 0:
+        G, dG = plants.values(which, v), np.zeros(())
+    else:
+        G, dG = plants.responses(which, v)
     L = G * K
     S = 1.0 / (1.0 + L)
     omega = plants.frequency(v)
@@ -283,7 +286,9 @@ def evaluate(
         if weighted:
             assert bounds.weights is not None
             W, dW = log_weights(bounds.weights, omega * plants.omega_0)
-        if compliant:
+        if compliant and order == 0:
+            free, free_slope = plants.values(which, v, free=True), np.zeros(())
+        elif compliant:
             free, free_slope = plants.free_responses(which, v)
         if order != 1:
             ln_S = np.log(np.abs(S))

@@ -118,27 +118,44 @@ class PlantSet:
         r = self.residues[which]
         return (r * value).sum(-1), (r * slope).sum(-1)
 
-    def modal_terms(
-        self, which: np.ndarray, v: Array, *, free: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """f(p; jv) (..., n), with which modes of unit residue answer, and ∂f/∂ln v.
+    def values(self, which: np.ndarray, v: Array, *, free: bool = False) -> np.ndarray:
+        """G of the plants `which` at jv alone; `free` of hold and delay."""
+        value = self.modal_values(which, v, free=free)
+        return np.asarray((self.residues[rows_alike(which)] * value).sum(-1))
 
-        `free` of hold and delay.
-        """
-        p, omega = self.poles[which], self.frequency(v)
-        s = 1j * omega[..., None]
-        T = self.period
-        if T is None or free:
-            warp = v if T is None else v / (1.0 + (0.5 * T * v) ** 2)
-            f = 1.0 / (s - p)
-            return f, -f * f * (1j * warp)[..., None]
-        d, late, early, grown = (part[which] for part in self.held)
-        d = d[..., None]
-        z = np.exp(s * T)
+    def modal_values(self, which: np.ndarray, v: Array, *, free: bool = False) -> np.ndarray:
+        """f(p; jv) (..., n), with which modes of unit residue answer; `free` of hold and delay."""
+        s, which = 1j * self.frequency(v)[..., None], rows_alike(which)
+        if self.period is None or free:
+            return np.asarray(1.0 / (s - self.poles[which]))
+        d, late, early, _ = (part[which] for part in self.held)
+        z, gap = self._gaps(which, s)
+        return np.asarray((late + early / z) / gap * np.exp(-s * self.period * d[..., None]))
+
+    def _gaps(self, which: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """z = e^{sT} and z - e^{pT}, without loss of digits where they are close."""
+        assert self.period is not None
+        p, grown = self.poles[which], self.held[3][which]
+        z = np.exp(s * self.period)
         gap = z - grown
         near = np.abs(gap) < CANCELLING
         at_s, at_p, own = (np.broadcast_to(part, gap.shape)[near] for part in (s, p, grown))
-        gap[near] = own * np.expm1((at_s - at_p) * T)
+        gap[near] = own * np.expm1((at_s - at_p) * self.period)
+        return z, gap
+
+    def modal_terms(
+        self, which: np.ndarray, v: Array, *, free: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same with ∂f/∂ln v."""
+        s = 1j * self.frequency(v)[..., None]
+        T = self.period
+        if T is None or free:
+            warp = v if T is None else v / (1.0 + (0.5 * T * v) ** 2)
+            f = 1.0 / (s - self.poles[which])
+            return f, -f * f * (1j * warp)[..., None]
+        d, late, early, _ = (part[which] for part in self.held)
+        d = d[..., None]
+        z, gap = self._gaps(which, s)
         value = (late + early / z) / gap
         slope = early / (z * gap) + value * z / gap + d * value
         shift = np.exp(-s * T * d)
@@ -186,6 +203,14 @@ class PlantSet:
         out += np.einsum("kp,tpi,ki,ki->kt", left, plant.dC, f, b, optimize=True)
         out += np.einsum("ki,ki,tim,km->kt", c, f, plant.dB, right, optimize=True)
         return np.asarray(out)
+
+
+def rows_alike(which: np.ndarray) -> np.ndarray:
+    """Numbers of plants (P, k) as (P, 1) where every row is one plant: nothing is copied k times.
+
+    That is how they come for a grid: broadcast, with a stride of 0.
+    """
+    return which[..., :1] if which.ndim > 1 and which.strides[-1] == 0 else which
 
 
 def plant_set(plants: Sequence[ScaledPlant], sampling: Sampling | None = None) -> PlantSet:

@@ -305,7 +305,7 @@ def _levels(
         elif curve is Curve.T:
             M = T
         elif curve is Curve.GS:
-            M = S @ plants.free_responses(which, v)[0]
+            M = S @ plants.values(which, v, free=True)
         else:
             M = S
         found[curve] = _log_gains(M, offset, least)
@@ -318,7 +318,7 @@ def loop_matrices(
     """S, KS and T (..., p, p) of the plants `which` at v, without weights."""
     k = np.stack([response(own, part, 1j * v) for own, part in problem.structure.split(kappa)], -1)
     K = problem.plants.into @ (k[..., None] * problem.plants.out)
-    G, _ = problem.plants.responses(which, v)
+    G = problem.plants.values(which, v)
     eye = np.eye(K.shape[-1])
     S = np.linalg.inv(eye + G @ K)
     return S, K @ S, eye - S

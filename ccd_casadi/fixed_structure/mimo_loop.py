@@ -20,6 +20,7 @@ from ccd_casadi.fixed_structure.loop import (
     loop_plants,
     padded_modes,
     padded_states,
+    rows_alike,
 )
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -39,13 +40,25 @@ class MatrixPlantSet(PlantSet):
 
     def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
         """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
-        return self._summed(which, *self.modal_terms(which, v))
+        value, slope = self._summed(which, *self.modal_terms(which, v))
+        return value, slope
 
     def free_responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
         """The same without hold and delay."""
-        return self._summed(which, *self.modal_terms(which, v, free=True))
+        value, slope = self._summed(which, *self.modal_terms(which, v, free=True))
+        return value, slope
 
-    def _summed(self, which: np.ndarray, *terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def values(self, which: np.ndarray, v: Array, *, free: bool = False) -> np.ndarray:
+        """G alone; `free` of hold and delay."""
+        term = self.modal_values(which, v, free=free)
+        rows = rows_alike(which)
+        n, p, m = self.matrices.shape[1:]
+        if rows.shape == which.shape:
+            return self._summed(which, term)[0]
+        found = term @ self.matrices[rows[..., 0]].reshape(*rows.shape[:-1], n, p * m)
+        return np.asarray(found.reshape(*which.shape, p, m))
+
+    def _summed(self, which: np.ndarray, *terms: np.ndarray) -> tuple[np.ndarray, ...]:
         n, p, m = self.matrices.shape[1:]
         flat = self.matrices.reshape(-1, n, p * m)
         found = []
@@ -55,7 +68,7 @@ class MatrixPlantSet(PlantSet):
                 at = which == i
                 out[at] = term[at] @ flat[i]
             found.append(out.reshape(*which.shape, p, m))
-        return found[0], found[1]
+        return tuple(found)
 
 
 def matrix_plant_set(

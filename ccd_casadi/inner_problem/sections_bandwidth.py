@@ -81,7 +81,8 @@ def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
         strict=True,
     )
     structures = tuple(channel.structure for channel in channels)
-    return ChannelStructure(given_decoupling(names, outputs, inputs), structures)
+    owners = tuple(names.index(channel.like or channel.name) for channel in channels)
+    return ChannelStructure(given_decoupling(names, outputs, inputs), structures, owners)
 
 
 def with_channels(problem: CoDesignProblem) -> CoDesignProblem:

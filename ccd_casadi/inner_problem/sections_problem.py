@@ -34,12 +34,14 @@ class Uncertainty:
 @dataclass(frozen=True)
 class ChannelProblem:
     """One channel of a plant with several: its structure, and its directions of outputs and inputs
-    (None: not given; those that are found at the start hold then for every θ)."""
+    (None: not given; those that are found at the start hold then for every θ). `like` names the
+    channel whose parameters it has."""
 
     name: str
     structure: Structure
     outputs: tuple[float, ...] | None = None
     inputs: tuple[float, ...] | None = None
+    like: str | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,13 @@ class SectionsProblem:
         }
         if self.channels:
             found["channels"] = [
-                vars(channel) | {"structure": vars(channel.structure)} for channel in self.channels
+                {
+                    key: value
+                    for key, value in vars(channel).items()
+                    if (key, value) != ("like", None)
+                }
+                | {"structure": vars(channel.structure)}
+                for channel in self.channels
             ]
         if self.of_error:
             found["least_error"] = [self.bandwidth_least, self.error_anchors]

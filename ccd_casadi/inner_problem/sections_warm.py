@@ -5,11 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Structure
+from ccd_casadi.fixed_structure.decoupling import channel_plant
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+
+ALMOST = 0.99  # of the lowest flexible frequency of all: below it the suspension is
 
 
 def warm_starts(
@@ -21,32 +24,51 @@ def warm_starts(
     """Each anchor as it is or moved with the plant from the start θ, whichever is nearer; κ in SI.
 
     Moved: frequencies with the first flexible mode, the gain as 1/|G| at the frequency that the
-    crossover moves with; a notch stays on its resonance.
+    crossover moves with; a notch stays on its resonance. Of several channels each is moved on its
+    own, with the first mode that it sees.
     """
     sections = problem.sections
     if sections is None or not sections.anchors:
         return []
     first = scaled_plant(problem, problem.start)
-    here = plants[0]
-    frequency = _first_mode(here) / _first_mode(first)
-    found = problem_for(plants, structure, bounds, sections.sampling, sections.frequencies)
-    warm = []
-    for kappa in map(np.array, sections.anchors):
-        crossover = 0.1 * first.omega_0
-        gain = _size(first, crossover) / _size(here, frequency * crossover)
-        moved = structure.in_units(kappa, frequency, gain)
-        both = [kappa, moved]
+    anchors = [np.array(kappa) for kappa in sections.anchors]
+
+    def nearer(
+        own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array
+    ) -> Array:
+        found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
+        both = [kappa, _moved(own, before, set_of[0], kappa)]
         merits = [
             started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
             for one in both
         ]
-        warm.append(both[int(np.argmax(merits))])
+        return both[int(np.argmax(merits))]
+
+    if isinstance(structure, Structure):
+        return [nearer(structure, first, list(plants), kappa) for kappa in anchors]
+    warm = [kappa.copy() for kappa in anchors]
+    for i in structure.free:
+        own, place = structure.structures[i], structure.slices[i]
+        before = channel_plant(first, structure.decoupling, i)
+        set_of = [channel_plant(plant, structure.decoupling, i) for plant in plants]
+        for kappa in warm:
+            kappa[place] = nearer(own, before, set_of, kappa[place])
     return warm
 
 
+def _moved(structure: Structure, first: ScaledPlant, here: ScaledPlant, kappa: Array) -> Array:
+    """κ in SI of a SISO plant for another one like it."""
+    frequency = _first_mode(here) / _first_mode(first)
+    crossover = 0.1 * first.omega_0
+    gain = _size(first, crossover) / _size(here, frequency * crossover)
+    return structure.in_units(kappa, frequency, gain)
+
+
 def _first_mode(plant: ScaledPlant) -> float:
-    """The lowest flexible frequency in rad/s; ω₀ where there is none."""
-    light = plant.natural[plant.natural > 0.0]
+    """The lowest flexible frequency that the plant's states have, in rad/s; ω₀ if there is none."""
+    flexible = plant.natural[plant.natural > 0.0]
+    own = np.abs(np.linalg.eigvals(plant.A)) * plant.omega_0
+    light = own[own > ALMOST * flexible.min()] if len(flexible) else flexible
     return float(light.min()) if len(light) else plant.omega_0
 
 
