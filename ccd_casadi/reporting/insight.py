@@ -128,7 +128,7 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
                 theta or ("does not move" if found.determined or swept else "–"),
             )
         )
-    moving = "d(θ, ln ω)/dp" if swept else "dθ/dp"
+    moving = "how θ, ln ω_S and ln ω_T move per unit" if swept else "how θ moves per unit"
     head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
     return Table(head, tuple(rows))
 

@@ -8,6 +8,7 @@ from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import write_index
 from ccd_casadi.reporting.insight import (
     caption_front,
     figure_front,
@@ -38,6 +39,7 @@ def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostO
     """Write insight.html, atomically."""
     path = folder / "insight.html"
     write_whole(path, insight_html(run, front, responses))
+    write_index(folder)
     return path
 
 
@@ -69,7 +71,8 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
             figure_html(drawn, caption_front(front), table_front(problem, front)),
         ),
         Section(
-            "What the optimum answers to", words + table_html(table_responses(problem, responses))
+            "What each parameter of the case would change",
+            words + table_html(table_responses(problem, responses)),
         ),
         Section("What limits the bandwidth", _limits(run, rule)),
     ]

@@ -100,7 +100,7 @@ def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
 
 def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) -> str:
     """A zigzag between neighbours, an arc between others, a zigzag to the left to the ground."""
-    words = f"{number(stiffness, 3)} N/m"
+    words = f"{number(1e-6 * stiffness, 3)} N/µm"
     look = f'fill="none" stroke="{GREEN}" stroke-width="1.6"'
     if j > i + 1:
         x0, x1, top = at[i], at[j], MIDDLE - SIDE / 2 - 4
@@ -115,7 +115,7 @@ def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) 
     heights = low + np.array([0, 0, *([7, -7] * 4), 0, 0])
     d = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(turns, heights, strict=True))
     wall = f'<path d="M{x0:.1f} {low - 14}v28" {look}/>' if j < 0 else ""
-    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, low + 38, words)
+    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, MIDDLE + SIDE / 2 + 15, words)
 
 
 def _arrow(x0: float, x1: float, y: float, colour: str) -> str:
