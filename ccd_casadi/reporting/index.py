@@ -25,6 +25,11 @@ FILES = {
 }  # fmt: skip
 
 
+def index_of(folder: Path) -> str:
+    """What a page in this folder links as the page of all pages; empty where it holds no run."""
+    return INDEX if (folder / "result.json").exists() else ""
+
+
 def write_index(folder: Path) -> None:
     """Write index.html anew after a page was added; nothing where the folder holds no run.
 

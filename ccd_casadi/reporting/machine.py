@@ -13,14 +13,19 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rib_stage.pictures import mode_shape
 from ccd_casadi.plants.rib_stage.plant import stage_of
+from ccd_casadi.reporting import svg
 from ccd_casadi.reporting.page import escape, number
 from ccd_casadi.reporting.stage_drawing import draw_stages
 from ccd_casadi.reporting.stage_pictures import surface_of
-from ccd_casadi.reporting.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.reporting.turntable import Picture, still
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
+# in a page's own theme, where it has one
+BLUE, GREEN, ORANGE = (
+    f"var(--{name}, {colour})"
+    for name, colour in (("blue", svg.BLUE), ("green", svg.GREEN), ("orange", svg.ORANGE))
+)
 SMALL = 1e-9  # share of the largest entry below which there is no spring
 MOST_NODES = 12
 SHOWN_MODES = 3

@@ -7,7 +7,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.index import write_index
+from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -32,13 +32,13 @@ LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without bei
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
     """Write robustness.html, atomically."""
     path = folder / "robustness.html"
-    write_whole(path, robustness_html(run, found, seed))
+    write_whole(path, robustness_html(run, found, seed, index_of(folder)))
     write_index(folder)
     return path
 
 
-def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
-    """The page's text."""
+def robustness_html(run: FinishedRun, found: Study, seed: int, index: str = "") -> str:
+    """The page's text; `index`: the page that it links as that of the whole run."""
     title = f"Robustness: {run.case.path.parent.name}"
     lead, *others = conclusion(run, found)
     head = header(
@@ -59,7 +59,7 @@ def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
         *_structured(found),
         *([_move(found)] if found.moves else []),
     ]
-    return page(title, sections, head)
+    return page(title, sections, head, index)
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
