@@ -34,6 +34,8 @@ for profile, repeat in (("same", True), ("study", False)):
     )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
 
 def pytest_collection_finish() -> None:
     """What is collected lasts: without this the garbage collector walks it a thousand times."""
@@ -116,3 +118,16 @@ def nannies(tmp_path: Path) -> Iterator[Any]:
         yield processes
     finally:
         processes.kill()
+
+
+@pytest.fixture  # of one test: while Playwright is open its event loop runs in this thread
+def browser() -> Iterator[Any]:
+    """Headless Chromium, where there is one."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    place = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if place is None:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is installed: the page is not driven")
+    with api.sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=place, args=["--no-sandbox"])
+        yield made
+        made.close()

@@ -1,7 +1,6 @@
 """The explorer in a real browser: dragged, refused with a bad token, its server killed."""
 
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from ccd_casadi.explorer.session import Session
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support import optional_packages
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE = 240e3  # ms: the machine may be busy
 READY = "Bokeh?.documents[0]?.get_model_by_name('answer')?.data.serial[0] > 0"
 
@@ -32,19 +30,6 @@ def server(tmp_path):
     yield started, found[0]
     started.kill()
     started.communicate()
-
-
-@pytest.fixture  # of one test: while Playwright is open its event loop runs in this thread
-def browser():
-    """Headless Chromium, where there is one."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    place = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if place is None:
-        pytest.skip(f"none of {', '.join(BROWSERS)} is installed: the page is not driven")
-    with api.sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=place, args=["--no-sandbox"])
-        yield made
-        made.close()
 
 
 def opened(browser, url, width=1300, scheme="light"):

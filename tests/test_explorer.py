@@ -15,11 +15,11 @@ from ccd_casadi.explorer.curves import curves_of, sampled_of
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.landscape import field_of
-from ccd_casadi.explorer.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import end_words
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.reporting.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome

@@ -16,6 +16,7 @@ from typing import Any
 
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
+from ccd_casadi.support.units import metres
 
 KKT_LEVEL = 1e-4  # scaled residual of the true optimality conditions; the polish reaches 1e-6
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
@@ -236,7 +237,7 @@ def survives(
     if rest.differentiates:
         said.append(
             f"almost a differentiator: |K(0)| is {100 * rest.share:.2g} % of its value at the "
-            f"bandwidth, 1 N at rest moves the stage {rest.compliance:.2g} m"
+            f"bandwidth, 1 N at rest moves the stage {metres(rest.compliance, 2)}"
         )
     figures = {
         "stable_shift": list(found.stable_shift),
@@ -265,7 +266,7 @@ def deployable(found: Survival | None) -> Line:
     rate = DELAY_PERIODS / found.delay
     words = (
         f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
-        f"and one period of delay alone use it up below {rate:.3g} Hz"
+        f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
     )
     figures = {
         "delay_margin": found.delay,

@@ -3,20 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ccd_casadi.explorer.designs import Look, Standing
-from ccd_casadi.explorer.signals import Moved, in_discrete_time, signals_of
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.reporting.nyquist import around_resonances, loci_of
+from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 180  # of the frequency grid, besides those around resonances
-LIGHT = 0.3  # damping ratio below which a pole is a resonance
-FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
-FAR = 30.0  # |L| beyond which a locus leaves the drawing
 
 
 @dataclass(frozen=True)
@@ -113,25 +110,10 @@ def grid_of(look: Look) -> Array:
     natural = plant.natural[plant.natural > 0.0] / HZ
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     high = max(30.0 * bandwidth, 3.0 * float(natural.max(initial=0.0)))
-    poles = np.linalg.eigvals(plant.A) * plant.omega_0 / HZ
-    if look.controller is not None:
-        poles = np.concatenate([poles, np.linalg.eigvals(look.controller.A) / HZ])
-    light = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))]
-    # even steps of the phase around a resonance, so that its circle in the Nyquist plot is round
-    around = (np.abs(light.imag)[:, None] + np.abs(light.real)[:, None] * FLANKS).ravel()
+    around = around_resonances(plant, look.controller)
     special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
     grid = np.concatenate([np.geomspace(low, high, POINTS), around, special])
     return np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
-
-
-def loci_of(L: np.ndarray) -> np.ndarray:
-    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > FAR."""
-    values = np.linalg.eigvals(L)
-    if values.shape[1] > 1:
-        for i in range(1, len(values)):
-            away = np.abs(values[i - 1][:, None] - values[i][None, :])
-            values[i] = values[i][linear_sum_assignment(away)[1]]
-    return np.where(np.abs(values) <= FAR, values, np.nan)
 
 
 def sampled_of(look: Look) -> AsSampled | None:

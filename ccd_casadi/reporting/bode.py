@@ -1,61 +1,85 @@
-"""Bode plots of plant and controller, resonances and anti-resonances marked."""
+"""Bode plots of plant, controller and loop, resonances and anti-resonances marked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.loops import shown_rows
 from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLACK, BLUE, ORANGE
+from ccd_casadi.reporting.svg import BLACK, CYCLE
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.loop_responses import Loop
 
+ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
 
 
-def figure_bode(loop: Loop, *, key: str = "bode") -> str:
-    """Plant and controller: magnitude and phase, or all singular values where there are several."""
-    scalar = loop.plant.shape[1:] == (1, 1)
+def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bode") -> str:
+    """Plant, controller and L = GK: magnitude and phase, of every one of several scalar channels.
+
+    All singular values, and no phase, of a loop that does not fall apart into such channels.
+    """
+    parts = scalar_parts(loop, channels)
     G, K = _singular_values(loop.plant), _singular_values(loop.controller)
     x_range = (float(loop.hz[0]), float(loop.hz[-1]))
-    top = [
-        Panel(
-            "frequency (Hz)",
-            f"plant {'|G|' if scalar else 'σ(G)'} (m/N)",
-            tuple(Curve(loop.hz, G[:, i]) for i in range(G.shape[1])),
-            marks=tuple(_marks(loop, G)),
-            log_x=True,
-            log_y=True,
-            x_range=x_range,
-            y_range=(float(G.min()) / 10.0, float(G.max()) * 10.0),  # room for the marks' words
-        ),
-        Panel(
-            "frequency (Hz)",
-            f"controller {'|K|' if scalar else 'σ(K)'} (N/m)",
-            tuple(Curve(loop.hz, K[:, i], colour=ORANGE) for i in range(K.shape[1])),
-            levels=(Level(loop.bandwidth_hz, f"ω_b {number(loop.bandwidth_hz, 4)} Hz", True),),
-            log_x=True,
-            log_y=True,
-            x_range=x_range,
-        ),
-    ]
-    title = "Bode plot of the plant and the controller"
-    if not scalar:
-        return figure_lines([top], key=key, title=title, heights=(3.4,))
-    phases = [
-        Panel(
-            "frequency (Hz)",
-            f"phase of {name} (deg)",
-            (Curve(loop.hz, _phase(part), colour=colour),),
-            log_x=True,
-            x_range=x_range,
-            y_step=90.0,
+    at = (Level(loop.bandwidth_hz, f"ω_b {number(loop.bandwidth_hz, 4)} Hz", True),)
+
+    def panel(label: str, values: Mapping[str, Array], **more: Any) -> Panel:
+        drawn = tuple(
+            Curve(loop.hz, v, name if len(values) > 1 else "", CYCLE[i % len(CYCLE)])
+            for i, (name, v) in enumerate(values.items())
         )
-        for name, part, colour in (("G", loop.plant, BLUE), ("K", loop.controller, ORANGE))
-    ]
-    return figure_lines([top, phases], key=key, title=title, heights=(3.0, 2.1))
+        return Panel("frequency (Hz)", label, drawn, log_x=True, x_range=x_range, **more)
+
+    gap = (float(G.min()) / 10.0, float(G.max()) * 10.0)  # room for the marks' words
+    title = "Bode plot of the plant, the controller and the loop"
+    if not parts:
+        sigma = [{f"σ{i + 1}": s[:, i] for i in range(s.shape[1])} for s in (G, K)]
+        marks = tuple(_marks(loop, G))
+        top = [
+            panel("plant σ(G) (m/N)", sigma[0], log_y=True, marks=marks, y_range=gap),
+            panel("controller σ(K) (N/m)", sigma[1], log_y=True, levels=at),
+        ]
+        return figure_lines([top], key=key, title=title, heights=(3.4,))
+    several = len(parts) > 1  # whose resonances are not marked: the words would meet
+    marks = () if several else tuple(_marks(loop, G))
+    sizes, phases = [], []
+    for k, (name, unit) in enumerate((("G", "m/N"), ("K", "N/m"), ("L", "–"))):
+        values = {channel: part[k] for channel, part in parts.items()}
+        more: dict[str, Any] = {"levels": at} if k == 1 else {}
+        if k == 0:
+            more = {"marks": marks} | ({} if several else {"y_range": gap})
+        if k == 2:
+            more = {"levels": (Level(1.0, "1"),)}
+        size = {channel: np.abs(v) for channel, v in values.items()}
+        sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **more))
+        angle = {channel: _phase(v) for channel, v in values.items()}
+        phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0))
+    return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
+
+
+def scalar_parts(loop: Loop, channels: Sequence[Channel]) -> dict[str, tuple[np.ndarray, ...]]:
+    """g, k and their product of every scalar channel, by a name that says which outputs it moves.
+
+    Empty where the loop is no scalar one and does not fall apart into such channels.
+    """
+    if loop.plant.shape[1:] == (1, 1):
+        g, k = loop.plant[:, 0, 0], loop.controller[:, 0, 0]
+        return {"": (g, k, g * k)}
+    if len(channels) < 2:
+        return {}
+    found: dict[str, tuple[np.ndarray, ...]] = {}
+    for channel in channels:
+        u, v = channel.outputs[:, 0], channel.inputs[:, 0]
+        g, k = u @ loop.plant @ v, v @ loop.controller @ u
+        u = u * np.sign(u[np.abs(u).argmax()])
+        signs = "".join("0" if abs(x) < ZERO else "+" if x > 0.0 else "−" for x in u)
+        found[f"channel {channel.name}, outputs {signs}"] = (g, k, g * k)
+    return found
 
 
 def _marks(loop: Loop, gains: Array) -> list[Mark]:
@@ -101,7 +125,8 @@ def table_bode(loop: Loop) -> Table:
     if loop.plant.shape[1:] == (1, 1):
         head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
         G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])
-        columns = [loop.hz, G, _phase(loop.plant), K, _phase(loop.controller)]
+        phases = (_phase(part[:, 0, 0]) for part in (loop.plant, loop.controller))
+        columns = [loop.hz, *(c for pair in zip((G, K), phases, strict=True) for c in pair)]
     else:
         G, K = _singular_values(loop.plant), _singular_values(loop.controller)
         head = (
@@ -118,7 +143,7 @@ def _singular_values(response: NDArray[np.complex128]) -> Array:
 
 
 def _phase(response: NDArray[np.complex128]) -> Array:
-    phase = np.degrees(np.unwrap(np.angle(response[:, 0, 0])))
+    phase = np.degrees(np.unwrap(np.angle(response)))
     return phase - 360.0 * np.round(phase[0] / 360.0)
 
 

@@ -100,8 +100,8 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         lines = verdict_html(method.figures)
         if lines:
             sections.insert(0, Section(f"Verdict: {LABELS[method.name]}", lines))
-    path = folder / "report.html"
-    text = with_turntables(page(f"Comparison: {comparison.case.path.name}", sections, head))
+    path, title = folder / "report.html", f"Comparison: {comparison.case.path.name}"
+    text = with_turntables(page(title, sections, head, index=""))
     write_whole(path, text)
     return path
 

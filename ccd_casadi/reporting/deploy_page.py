@@ -18,6 +18,7 @@ from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import write_index
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import (
     Section,
@@ -66,7 +67,10 @@ def write_report(
         title, found.passed, status, reason, meta, _conclusion(run, found),
         warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
     )  # fmt: skip
-    path.write_text(page(title, sections, head), encoding="utf-8")
+    inside = path.resolve().parent.parent == run.folder.resolve()
+    made = page(title, sections, head, "../index.html" if inside else "")
+    path.write_text(made, encoding="utf-8")
+    write_index(run.folder)
 
 
 def _conclusion(run: FinishedRun, found: Deployment) -> str:

@@ -183,8 +183,8 @@ def _optimality(r: Mapping[str, Any]) -> list[Fact]:
         )
     gap = r.get("inner_gap")
     if gap is not None:
-        words = "relative excess of the global inner optimum at θ over the design's ω_b"
-        facts.append(("Inner problem's gap", number(gap, 2), words))
+        words = "by how much the best controller that was found at this θ is faster, relative"
+        facts.append(("Gap of the controller search", number(gap, 2), words))
     return facts
 
 

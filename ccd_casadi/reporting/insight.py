@@ -37,7 +37,7 @@ def figure_front(
     ]
     if failed.any():
         curves.append(Curve(cost[failed], hz[failed], "not verified", CYCLE[1], "", "x"))
-    mark = Mark(design[0], design[1], design[2], "s", offset=(58.0, -3.0))
+    mark = Mark(design[0], design[1], design[2], "s", offset=(8.0, 3.0))
     top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width
@@ -128,7 +128,7 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
                 theta or ("does not move" if found.determined or swept else "–"),
             )
         )
-    moving = "d(θ, ln ω)/dp" if swept else "dθ/dp"
+    moving = "how θ, ln ω_S and ln ω_T move per unit" if swept else "how θ moves per unit"
     head = ("parameter", "value", "dJ*/dp", "dω_b/dp (Hz)", "df/dp", moving)
     return Table(head, tuple(rows))
 

@@ -8,6 +8,7 @@ from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.insight import (
     caption_front,
     figure_front,
@@ -37,12 +38,13 @@ from surrogates.files import write_whole
 def write_insight(folder: Path, run: FinishedRun, front: Front, responses: PostOptimal) -> Path:
     """Write insight.html, atomically."""
     path = folder / "insight.html"
-    write_whole(path, insight_html(run, front, responses))
+    write_whole(path, insight_html(run, front, responses, index_of(folder)))
+    write_index(folder)
     return path
 
 
-def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
-    """The page's text."""
+def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> str:
+    """The page's text; `index`: the page that it links as that of the whole run."""
     problem = run.problem
     bandwidth_hz = bandwidth_of(run) / HZ
     cost = float(run.result["hardware_cost"])
@@ -69,11 +71,12 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal) -> str:
             figure_html(drawn, caption_front(front), table_front(problem, front)),
         ),
         Section(
-            "What the optimum answers to", words + table_html(table_responses(problem, responses))
+            "What each parameter of the case would change",
+            words + table_html(table_responses(problem, responses)),
         ),
         Section("What limits the bandwidth", _limits(run, rule)),
     ]
-    return page(title, sections, head)
+    return page(title, sections, head, index)
 
 
 def _limits(run: FinishedRun, rule: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.synthesis.loop_responses import Loop
 
-PARTS = ("error W_S S", "control effort W_KS KS", "response W_T T")
+PARTS = ("|S|", "|KS|", "|T|")
 
 
 def shares(loop: Loop, hz: float) -> np.ndarray:
@@ -32,16 +32,19 @@ def table_limits(loop: Loop) -> Table:
     for name, hz in sorted(places, key=lambda place: place[1]):
         found = shares(loop, hz)
         rows.append((name, hz, *(float(v) for v in found), PARTS[int(found.argmax())]))
-    return Table(("where", "Hz", "W_S S / γ", "W_KS KS / γ", "W_T T / γ", "largest"), tuple(rows))
+    return Table(
+        ("where", "Hz", "|S| / bound", "|KS| / bound", "|T| / bound", "closest"), tuple(rows)
+    )
 
 
 def limit_sentences(loop: Loop) -> list[str]:
     """What holds ω_b, and what stands where S is largest."""
     found = shares(loop, loop.bandwidth_hz)
     order = np.argsort(found)[::-1]
+    first, second = (f"{PARTS[i]} is at {100 * found[i]:.0f} %" for i in order[:2])
     words = [
-        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz the {PARTS[order[0]]} takes "
-        f"{100 * found[order[0]]:.0f} % of γ, the {PARTS[order[1]]} {100 * found[order[1]]:.0f} %."
+        f"At ω_b = {number(loop.bandwidth_hz, 4)} Hz {first} of its bound γ/|W|, and holds the "
+        f"loop; {second} of its own."
     ]
     tops = [peak for peak in loop.peaks if peak[1] > 1.05]
     if tops:

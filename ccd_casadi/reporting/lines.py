@@ -1,11 +1,13 @@
 """Line figures from plain data: panels of curves with bands, reference lines and marked points."""
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from ccd_casadi.reporting.labels import Labels, inside
 from ccd_casadi.reporting.svg import (
     BLACK,
     BLUE,
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
 
-_BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+LEAST_POINTS = 8  # of a curve that values are read off
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
 
 
@@ -92,29 +94,63 @@ class Panel:
     y_step: float | None = None
     legend: Corner = "best"
     title: str = ""
+    forbidden: tuple[tuple[np.ndarray, str], ...] = ()  # corners x + iy of an area, its colour
 
 
 def figure_lines(
-    rows: Sequence[Sequence[Panel | None]],
+    rows: Sequence[Sequence[Panel | str | None]],
     *,
     key: str,
     title: str,
     heights: Sequence[float] | None = None,
 ) -> str:
-    """Rows of panels as SVG, each row as wide as the figure, None an empty place; inches."""
+    """Rows of panels as HTML, a picture each; heights in inches.
+
+    HTML stands as it is in a panel's place, None is an empty one. As pictures of their own the
+    panels of a row stand below each other where a page is narrow.
+    """
     tall = list(heights) if heights is not None else [2.9] * len(rows)
+    parts = []
     with style():
-        figure = new_figure(sum(tall))
-        bottom = sum(tall)
-        for row, height in zip(rows, tall, strict=True):
-            bottom -= height
-            width = WIDTH / len(row)
-            for j, panel in enumerate(row):
-                if panel is not None:
-                    left = j * width + LEFT
-                    inside = (width - LEFT - RIGHT, height - BOTTOM - TOP)
-                    _draw(place(figure, left, bottom + BOTTOM, *inside), panel)
-        return to_svg(figure, key, title)
+        for i, (row, height) in enumerate(zip(rows, tall, strict=True)):
+            drawn = [
+                f"<div>{panel}</div>" if isinstance(panel, str)
+                else _picture(panel, WIDTH / len(row), height, f"{key}-{i}{j}", title)
+                for j, panel in enumerate(row)
+                if panel is not None
+            ]  # fmt: skip
+            parts.append(f'<div class="panels n{len(row)}">{"".join(drawn)}</div>')
+    return "\n".join(parts)
+
+
+def _picture(panel: Panel, width: float, height: float, key: str, title: str) -> str:
+    figure = new_figure(height, width)
+    axes = place(figure, LEFT, BOTTOM, width - LEFT - RIGHT, height - BOTTOM - TOP)
+    title = f"{title}: {panel.title or panel.y_label}"
+    _draw(axes, panel)
+    return to_svg(figure, key, title, _for_cursor(axes, panel, height), 100.0)
+
+
+def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
+    """What the page's script needs to read values off the drawn curves; empty: none has y of x."""
+    names = {
+        i: curve.label
+        for i, curve in enumerate(panel.curves)
+        if curve.line and len(curve.x) >= LEAST_POINTS and (np.diff(curve.x) >= 0.0).all()
+    }
+    if not names:
+        return ""
+    box, tall = inside(axes), 72.0 * height
+    ends = (
+        (axes.get_xlim(), panel.log_x, box[0], box[2]),
+        (axes.get_ylim(), panel.log_y, tall - box[1], tall - box[3]),
+    )
+    scales = [[*map(float, limits), int(log), round(a, 3), round(b, 3)]
+              for limits, log, a, b in ends]  # fmt: skip
+    return json.dumps(
+        {"x": panel.x_label, "y": panel.y_label, "scales": scales, "names": names},
+        separators=(",", ":"), ensure_ascii=False,
+    )  # fmt: skip
 
 
 def _draw(axes: "Axes", panel: Panel) -> None:
@@ -123,11 +159,14 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             band.x, band.low, band.high, color=band.colour, alpha=0.18, linewidth=0.0,
             label=band.label or None,
         )  # fmt: skip
-    for curve in panel.curves:
+    for corners, colour in panel.forbidden:
+        axes.fill(corners.real, corners.imag, color=colour, alpha=0.2, linewidth=0.0)
+    for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
             markerfacecolor="white" if curve.line else curve.colour, clip_on=not curve.marker,
+            gid=f"curve{i}",
         )  # fmt: skip
     axes.set_xlabel(panel.x_label)
     axes.set_ylabel(panel.y_label)
@@ -135,17 +174,19 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         axes.set_title(panel.title, loc="left")
     _ranges(axes, panel)
     for level in panel.levels:
-        _level(axes, level)
+        line = axes.axvline if level.vertical else axes.axhline
+        line(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)))
     for mark in panel.marks:
         axes.plot(
             [mark.x], [mark.y], mark.marker, color=mark.colour, markersize=5.0, zorder=5,
         )  # fmt: skip
-        side = "center" if mark.offset[0] == 0 else ("left" if mark.offset[0] > 0 else "right")
-        axes.annotate(
-            mark.text, (mark.x, mark.y), xytext=mark.offset, textcoords="offset points",
-            ha=side, va="bottom" if mark.offset[1] >= 0 else "top", fontsize=9,
-            annotation_clip=True, zorder=6, bbox=_BEHIND,
-        )  # fmt: skip
+    labels = Labels(axes)
+    for mark in panel.marks:
+        labels.avoid(mark.x, mark.y)
+    for mark in panel.marks:
+        labels.beside(mark.x, mark.y, mark.text, mark.offset)
+    for level in panel.levels:
+        labels.along(level.value, level.text, level.vertical)
     if any(curve.label for curve in panel.curves) or any(band.label for band in panel.bands):
         axes.legend(loc=panel.legend)
 
@@ -167,22 +208,6 @@ def _ranges(axes: "Axes", panel: Panel) -> None:
         axes.yaxis.set_major_locator(MultipleLocator(panel.y_step))
     if not panel.log_y:
         axes.ticklabel_format(axis="y", useOffset=False)
-
-
-def _level(axes: "Axes", level: Level) -> None:
-    if level.vertical:
-        axes.axvline(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)))
-        transform = axes.get_xaxis_transform()
-        axes.annotate(
-            level.text, (level.value, 0.02), xycoords=transform, xytext=(3, 0),
-            textcoords="offset points", fontsize=9, rotation=90, va="bottom", ha="left",
-        )  # fmt: skip
-        return
-    axes.axhline(level.value, color=level.colour, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.annotate(
-        level.text, (0.006, level.value), xycoords=axes.get_yaxis_transform(), xytext=(0, 2),
-        textcoords="offset points", fontsize=9, va="bottom", ha="left",
-    )  # fmt: skip
 
 
 def positive_range(arrays: Iterable[Any]) -> tuple[float, float]:

@@ -5,14 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import CYCLE, GREY
+from ccd_casadi.reporting.svg import CYCLE, GREY, ORANGE
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 from ccd_casadi.synthesis.synthesis import synthesise
 
+Areas = tuple[tuple[np.ndarray, str], ...]  # corners x + iy, colours
 SHOWN = 45  # rows of a data table
 
 
@@ -80,6 +82,22 @@ def figure_gains(
         )
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
     return figure_lines([panels[:1], panels[1:]], key=key, title=title, heights=(3.3, 2.7))
+
+
+def forbidden(
+    inner: InnerProblem, low: float, high: float, top: float
+) -> tuple[tuple[np.ndarray, str], ...]:
+    """Where |S| may not be, over Hz: above S_max, and above S_low up to ω_low."""
+    ends = (inner.omega_low / HZ, inner.S_low)
+    return (
+        (_box(low, high, inner.S_max, top), ORANGE),
+        (_box(low, ends[0], ends[1], min(inner.S_max, top)), ORANGE),
+    )
+
+
+def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
+    return np.array([complex(x, y) for x, y in (
+        (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
 
 
 def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:

@@ -1,53 +1,101 @@
-"""One self-contained HTML page: text, tables and inline figures; no script, nothing external.
+"""One self-contained HTML page: text, tables and inline figures; nothing external.
 
-By hand, not by templates: six shapes of plain text, each escaped in the one function that makes it.
+Figures take the colours of the page, which follow the reader's theme and are light in print. By
+hand, not by templates: six shapes of plain text, each escaped in the one function that makes it.
 """
 
+import base64
+import hashlib
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape as _escape
 from typing import Any
 
+from ccd_casadi.reporting.cursor import SCRIPT
+from ccd_casadi.reporting.svg import THEME
+
+POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
+INDEX = "index.html"  # of a run's folder
+MANY = 8  # columns of a table that is set smaller in print
+
+
+def theme(which: int) -> str:
+    """The colours of figures as variables of CSS: 0 light, 1 dark."""
+    return "; ".join(f"--{name}: {colours[which]}" for name, colours in THEME.items())
+
+
 CSS = """
-:root { color-scheme: light; --ink: #1a1a1a; --soft: #5a5a5a; --line: #dcdcdc; }
+:root { color-scheme: light dark; --soft: #5a5a5a; --line: #dcdcdc; --link: #005a8c; --box: #f6f6f6;
+  --good: #00543d; --good-ground: #e3f4ee; --bad: #8a3300; --bad-ground: #fdeee2;
+  --warn: #6b5200; --warn-ground: #fdf6d8; LIGHT }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --soft: #a9b0b5; --line: #39424a; --link: #6fb8ea; --box: #1f252a;
+  --good: #8fe0c2; --good-ground: #10372c; --bad: #ffb58a; --bad-ground: #45210c;
+  --warn: #f0d67a; --warn-ground: #3b320f; DARK }
+}
 * { box-sizing: border-box; }
-html { background: #fff; }
+html { background: var(--paper); }
 body { max-width: 1000px; margin: 0 auto; padding: 28px 24px 64px; color: var(--ink);
   font: 15px/1.5 "Segoe UI", "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif; }
 h1 { font-size: 26px; line-height: 1.25; margin: 0 0 8px; overflow-wrap: anywhere; }
 h2 { font-size: 19px; margin: 40px 0 10px; padding-top: 12px; border-top: 1px solid var(--line); }
 h3 { font-size: 15px; margin: 22px 0 6px; }
-p { margin: 8px 0; }
+p { margin: 8px 0; overflow-wrap: break-word; }
+a, summary { color: var(--link); }
+nav { font-size: 13px; margin: 0 0 14px; color: var(--soft); }
+nav a { white-space: nowrap; }
+nav.contents { margin: 14px 0 0; }
 .meta { color: var(--soft); font-size: 13px; margin: 0 0 12px; overflow-wrap: anywhere; }
 .badge { display: inline-block; padding: 1px 10px; border-radius: 11px; font-size: 14px;
   font-weight: 600; border: 1px solid; }
-.good { color: #00543d; background: #e3f4ee; border-color: #7cc5ad; }
-.bad { color: #8a3300; background: #fdeee2; border-color: #e0a178; }
-.warn { color: #6b5200; background: #fdf6d8; border-color: #d9c15c; }
-.open { color: #444; background: #f3f3f3; border-color: #bbb; }
+.good { color: var(--good); background: var(--good-ground); }
+.bad { color: var(--bad); background: var(--bad-ground); }
+.warn { color: var(--warn); background: var(--warn-ground); }
+.open { color: var(--soft); background: var(--shade); }
 .verdict { margin-top: 14px; } .verdict .badge { font-size: 12.5px; white-space: nowrap; }
 .wide.verdict th:first-child { width: 11%; } .wide.verdict td:nth-child(2) { width: 12%; }
 .lead { font-size: 17px; line-height: 1.5; margin: 12px 0 0; }
 figure { margin: 14px 0 22px; }
-svg { display: block; height: auto; }
+svg { display: block; height: auto; max-width: 100%; }
 svg * { stroke-linejoin: round; stroke-linecap: butt; }
 svg text { font-family: "Segoe UI", "Helvetica Neue", Helvetica, Arial, "DejaVu Sans", sans-serif
   !important; fill: var(--ink); }
-figcaption { margin-top: 8px; font-size: 14px; color: #333; max-width: 860px; }
+svg .readout { font-size: 9px; paint-order: stroke; stroke: var(--paper); stroke-width: 3px; }
+svg .cursor { stroke: var(--grey); stroke-width: .8; stroke-dasharray: 2 2; pointer-events: none; }
+.panels { display: grid; gap: 0 6px; }
+.n2 { grid-template-columns: repeat(2, minmax(0, 1fr)); }
+.n3 { grid-template-columns: repeat(3, minmax(0, 1fr)); }
+.n4 { grid-template-columns: repeat(4, minmax(0, 1fr)); }
+.drawing { overflow-x: auto; }
+figcaption { margin-top: 8px; font-size: 14px; max-width: 860px; }
 table { border-collapse: collapse; font-size: 13.5px; margin: 6px 0; }
-th, td { text-align: left; padding: 3px 18px 3px 0; border-bottom: 1px solid #ececec;
-  vertical-align: top; overflow-wrap: anywhere; }
+th, td { text-align: left; padding: 3px 18px 3px 0; border-bottom: 1px solid var(--line);
+  vertical-align: top; overflow-wrap: break-word; }
 th { font-weight: 600; }
-thead th { color: var(--soft); border-bottom: 1px solid #bbb; }
-td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+thead th { color: var(--soft); border-bottom: 1px solid var(--grey); }
+td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
+td.n { white-space: nowrap; }
 .wide { width: 100%; }
 .wide th:first-child { width: 23%; } .wide td:nth-child(2) { width: 22%; }
-.scroll { overflow-x: auto; max-height: 460px; overflow-y: auto; }
+.table, .scroll { overflow-x: auto; }
+.scroll { max-height: 460px; overflow-y: auto; }
 details { margin: 6px 0 0; font-size: 13.5px; }
-summary { cursor: pointer; color: #005a8c; }
-pre { background: #f6f6f6; padding: 12px 14px; overflow-x: auto; font: 12.5px/1.45 ui-monospace,
-  Menlo, Consolas, "DejaVu Sans Mono", monospace; white-space: pre-wrap; overflow-wrap: anywhere; }
+summary { cursor: pointer; }
+pre { background: var(--box); padding: 12px 14px; overflow-x: auto; white-space: pre-wrap;
+  font: 12.5px/1.45 ui-monospace, Menlo, Consolas, "DejaVu Sans Mono", monospace;
+  overflow-wrap: anywhere; }
+@media screen and (max-width: 640px) {
+  body { padding: 18px 14px 48px; }
+  .panels { grid-template-columns: minmax(0, 1fr); }
+  .drawing > svg, .drawing > .n1 > svg { min-width: 640px; }
+  .wide, .wide tbody, .wide tr, .wide th, .wide td { display: block; }
+  .wide tr { padding: 5px 0; border-bottom: 1px solid var(--line); }
+  .wide th, .wide td { display: inline; border: 0; padding: 0 10px 0 0; }
+  .wide td:nth-child(3) { display: block; color: var(--soft); }
+  .table td, .table th { padding-right: 12px; min-width: 3em; }
+}
 @page { size: A4; margin: 15mm; }
 @media print {
   body { max-width: none; padding: 0; font-size: 10.5pt; }
@@ -58,13 +106,14 @@ pre { background: #f6f6f6; padding: 12px 14px; overflow-x: auto; font: 12.5px/1.
   figure, tr, li { break-inside: avoid; }
   section.own-page { break-before: page; }
   figcaption { font-size: 9pt; } table { font-size: 8.5pt; }
-  th, td { padding-top: 2px; padding-bottom: 2px; }
+  th, td { padding: 2px 10px 2px 0; }
   ul { margin: 4pt 0; } pre { font-size: 7.5pt; columns: 2; }
-  .scroll { max-height: none; overflow: visible; }
-  details:not([open]) { display: none; }
+  .scroll, .table, .drawing { max-height: none; overflow: visible; }
+  .many { font-size: 7pt; } .many th, .many td { padding-right: 6px; }
+  nav, details:not([open]) { display: none; }
   .badge { -webkit-print-color-adjust: exact; print-color-adjust: exact; }
 }
-"""
+""".replace("LIGHT", theme(0)).replace("DARK", theme(1))
 
 
 @dataclass(frozen=True)
@@ -88,6 +137,17 @@ def escape(text: object) -> str:
     """Text for HTML, quotes included; control characters show as a replacement sign."""
     kept = "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in str(text))
     return _escape(kept)
+
+
+def typeset(text: str) -> str:
+    """Words that a terminal shows in ASCII, with the signs that are meant.
+
+    >>> typeset("less than +-2 %, norm <= 3, 41 um")
+    'less than ±2 %, norm ≤ 3, 41 µm'
+    """
+    for plain, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
+        text = text.replace(plain, sign)
+    return re.sub(r"(?<=\d) u(?=[ms]\b)", " µ", text)
 
 
 def number(value: Any, digits: int = 5) -> str:
@@ -124,14 +184,17 @@ def table_html(table: Table, css: str = "") -> str:
         "<tr>" + "".join(cell(v, "td", numeric[i]) for i, v in enumerate(row)) + "</tr>"
         for row in table.rows
     )
+    css = f"{css} many".strip() if len(table.head) > MANY else css
     kind = f' class="{css}"' if css else ""
-    return f"<table{kind}><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
+    made = f"<table{kind}><thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody></table>"
+    return f'<div class="table">{made}</div>'
 
 
 def facts_html(rows: Iterable[tuple[str, str, str]]) -> str:
     """Quantity, value and remark in three columns; plain texts in."""
     body = "\n".join(
-        f'<tr><th scope="row">{escape(a)}</th><td>{escape(b)}</td><td>{escape(c)}</td></tr>'
+        f'<tr><th scope="row">{escape(a)}</th><td>{escape(typeset(b))}</td>'
+        f"<td>{escape(typeset(c))}</td></tr>"
         for a, b, c in rows
     )
     return f'<table class="wide"><tbody>{body}</tbody></table>'
@@ -141,7 +204,7 @@ def figure_html(svg: str, caption: str, table: Table, *more: Table) -> str:
     """A figure with its caption (plain text) and the numbers behind it, folded away."""
     tables = "\n".join(table_html(item) for item in (table, *more))
     return (
-        f"<figure>\n{svg}\n<figcaption>{escape(caption)}</figcaption>\n"
+        f'<figure>\n<div class="drawing">{svg}</div>\n<figcaption>{escape(caption)}</figcaption>\n'
         f'<details><summary>Data of this figure</summary><div class="scroll">\n{tables}\n'
         "</div></details>\n</figure>"
     )
@@ -149,7 +212,7 @@ def figure_html(svg: str, caption: str, table: Table, *more: Table) -> str:
 
 def paragraph(text: str) -> str:
     """A paragraph of plain text."""
-    return f"<p>{escape(text)}</p>"
+    return f"<p>{escape(typeset(text))}</p>"
 
 
 def preformatted(text: str) -> str:
@@ -177,23 +240,47 @@ def header(
         kind, sign = "warn", "!"
     badge = f'<span class="badge {kind}">{sign} {escape(status)}</span>'
     return (
-        f"<h1>{escape(title)}</h1>\n<p>{badge} {escape(reason)}</p>\n"
-        f'<p class="meta">{escape(meta)}</p>\n<p class="lead">{escape(lead)}</p>\n{verdict}'
+        f"<h1>{escape(title)}</h1>\n<p>{badge} {escape(typeset(reason))}</p>\n"
+        f'<p class="meta">{escape(meta)}</p>\n<p class="lead">{escape(typeset(lead))}</p>\n'
+        f"{verdict}"
     )
 
 
-def page(title: str, sections: Sequence[Section], head: str = "") -> str:
-    """The whole document; `head` is HTML above the sections. The policy forbids any request."""
+def page(title: str, sections: Sequence[Section], head: str = "", index: str = INDEX) -> str:
+    """The whole document; `head` is HTML above the sections. The policy forbids any request.
+
+    `index`: the page that links all of the run; empty on that one itself.
+    """
     body = "\n".join(
-        ('<section class="own-page">' if section.own_page else "<section>")
-        + f"\n<h2>{escape(section.heading)}</h2>\n{section.body}\n</section>"
-        for section in sections
+        f'<section id="section-{i}"{" class=own-page" if section.own_page else ""}>'
+        f"\n<h2>{escape(section.heading)}</h2>\n{section.body}\n</section>"
+        for i, section in enumerate(sections, 1)
     )
-    policy = "default-src 'none'; style-src 'unsafe-inline'"
-    return (
+    contents = " · ".join(
+        f'<a href="#section-{i}">{escape(section.heading)}</a>'
+        for i, section in enumerate(sections, 1)
+    )
+    up = f'<nav><a href="{escape(index)}">All pages of this run</a></nav>\n' if index else ""
+    made = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
-        f"<header>{head}</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
+        f'{up}<header>{head}\n<nav class="contents">{contents}</nav></header>\n'
+        f"<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
+    return with_script(made, SCRIPT) if " data-axes=" in body else made
+
+
+def with_script(document: str, script: str, css: str = "") -> str:
+    """A finished page with a script and its style, the script allowed by its hash alone."""
+    if POLICY not in document:
+        raise ValueError("the page's policy is not the one that the script is added to")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    if f"{POLICY}; script-src" not in document:
+        document = document.replace(POLICY, f"{POLICY}; script-src", 1)
+    document = document.replace("; script-src", f"; script-src 'sha256-{digest}'", 1)
+    if css:
+        document = document.replace("</head>", f"<style>{css}</style>\n</head>", 1)
+    end = document.rindex("</body>")
+    return f"{document[:end]}<script>{script}</script>\n{document[end:]}"

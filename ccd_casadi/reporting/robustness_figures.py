@@ -23,13 +23,14 @@ def gains(found: Study) -> str:
 
     def panel(label: str, *curves: tuple[int, str]) -> Panel:
         drawn = tuple(
-            Curve(found.hz, found.gains[i], name, CYCLE[k]) for k, (i, name) in enumerate(curves)
+            Curve(found.hz, (1e6 if i == 2 else 1.0) * found.gains[i], name, CYCLE[k])
+            for k, (i, name) in enumerate(curves)
         )
         return Panel("frequency (Hz)", label, drawn, log_x=True, log_y=True, x_range=ends)
 
     rows = [
         [panel("σ_max (–)", (0, "S"), (1, "T"))],
-        [panel("σ_max(GS) (m/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))],
+        [panel("σ_max(GS) (µm/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))],
     ]
     return figure_lines(rows, key="responses", title="S, T, GS and KS over frequency")
 
@@ -39,8 +40,14 @@ def gains_table(found: Study) -> Table:
     hz = found.hz
     wanted = np.concatenate([np.geomspace(hz[0], hz[-1], SHOWN), hz[found.gains.argmax(axis=1)]])
     rows = sorted({int(np.abs(hz - value).argmin()) for value in wanted})
-    head = ("Hz", "S", "T", "GS m/N", "KS N/m")
-    return Table(head, tuple((float(hz[i]), *map(float, found.gains[:, i])) for i in rows))
+    head = ("Hz", "S", "T", "GS µm/N", "KS N/m")
+    return Table(
+        head,
+        tuple(
+            (float(hz[i]), *map(float, np.array([1.0, 1.0, 1e6, 1.0]) * found.gains[:, i]))
+            for i in rows
+        ),
+    )
 
 
 def perturbed(run: FinishedRun, found: Study) -> str:
@@ -123,7 +130,7 @@ def structured(bound: StructuredBound) -> str:
     panel = Panel(
         "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
         levels=(
-            Level(1.0 / bound.stiffness, f"real errors, decided at {bound.worst_hz:.4g} Hz"),
+            Level(1.0 / bound.stiffness, f"bound for real errors (from {bound.worst_hz:.4g} Hz)"),
         ),
         log_x=True, log_y=True,
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
@@ -169,10 +176,11 @@ def move(found: Move, key: str) -> str:
 def move_table(found: Move) -> Table:
     """Some instants."""
     wanted = np.linspace(0, np.flatnonzero(found.time <= 2.0 * found.duration)[-1], SHOWN)
-    head = ("s", "position m", "acceleration m/s²", "error m", *_names(found.force))
+    unit, scale = _unit(found.peak_error)
+    head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *_names(found.force))
     rows = tuple(
-        (float(found.time[i]), float(found.position[i]), float(found.acceleration[i]),
-         float(found.error[i]), *map(float, found.force[i])) for i in wanted.astype(int)
+        (1e3 * float(found.time[i]), 1e3 * float(found.position[i]), float(found.acceleration[i]),
+         scale * float(found.error[i]), *map(float, found.force[i])) for i in wanted.astype(int)
     )  # fmt: skip
     return Table(head, rows)
 

@@ -7,6 +7,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -22,7 +23,7 @@ from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, metres
 from surrogates.files import write_whole
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
@@ -31,12 +32,13 @@ LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without bei
 def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
     """Write robustness.html, atomically."""
     path = folder / "robustness.html"
-    write_whole(path, robustness_html(run, found, seed))
+    write_whole(path, robustness_html(run, found, seed, index_of(folder)))
+    write_index(folder)
     return path
 
 
-def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
-    """The page's text."""
+def robustness_html(run: FinishedRun, found: Study, seed: int, index: str = "") -> str:
+    """The page's text; `index`: the page that it links as that of the whole run."""
     title = f"Robustness: {run.case.path.parent.name}"
     lead, *others = conclusion(run, found)
     head = header(
@@ -57,7 +59,7 @@ def robustness_html(run: FinishedRun, found: Study, seed: int) -> str:
         *_structured(found),
         *([_move(found)] if found.moves else []),
     ]
-    return page(title, sections, head)
+    return page(title, sections, head, index)
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
@@ -133,9 +135,9 @@ def _moved(found: Study, i: int) -> str:
         else "does not settle while it is watched"
     )
     return (
-        f"Move of {found.demands.limits.stroke:g} m in {1e3 * move.duration:.4g} ms {way}: "
-        f"{settled} (±{move.window:g} m), RMS error {move.rms_error:.3g} m, "
-        f"peak {move.peak_error:.3g} m, peak force {max(move.peak_force):.4g} N."
+        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms {way}: "
+        f"{settled} (±{metres(move.window)}), RMS error {metres(move.rms_error)}, "
+        f"peak {metres(move.peak_error)}, peak force {max(move.peak_force):.4g} N."
     )
 
 
@@ -187,22 +189,29 @@ def _margins(found: Study) -> Section:
 
 
 def _gains(run: FinishedRun, found: Study) -> Section:
-    names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) m/N", "σ_max(KS) N/m")
+    names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
     tops = [
-        (name, number(float(row.max())), f"at {number(float(found.hz[row.argmax()]), 4)} Hz")
-        for name, row in zip(names, found.gains, strict=True)
+        (
+            name,
+            number(factor * float(row.max())),
+            f"at {number(float(found.hz[row.argmax()]), 4)} Hz",
+        )
+        for name, row, factor in zip(names, found.gains, (1.0, 1.0, 1e6, 1.0), strict=True)
     ]
     n, d = found.noise, found.demands
+    # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
+    share = 1e-9 if d.sensor == 1.0 else 1.0
+    sensor = f"{1e9 * share * d.sensor:.4g} nm/√Hz"
     rms = (
         []
         if n is None
         else [
-            ("position by sensor noise", n.position_by_noise, f"m RMS for {d.sensor:g} m/√Hz"),
-            ("force by sensor noise", n.force_by_noise, f"N RMS for {d.sensor:g} m/√Hz"),
+            ("position by sensor noise", 1e9 * share * n.position_by_noise, f"nm RMS for {sensor}"),
+            ("force by sensor noise", share * n.force_by_noise, f"N RMS for {sensor}"),
             (
                 "position by force noise",
-                n.position_by_disturbance,
-                f"m RMS for {d.disturbance:g} N/√Hz",
+                1e6 * n.position_by_disturbance,
+                f"µm RMS for {d.disturbance:g} N/√Hz",
             ),
             ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
         ]
@@ -244,12 +253,10 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
         f"±{100 * hard.tolerance:g} % of its value: the share of them below a peak of S, and below "
         "a bandwidth. A curve that ends below 1 leaves out what is unstable."
     )
-    theta = ", ".join(
-        f"{name} = {number(value, 6)} {unit}".strip()
-        for name, value, unit in zip(
-            run.problem.names, hard.worst.place, run.problem.units, strict=True
-        )
-    )
+    theta = theta_words({
+        "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
+        "units": dict(zip(run.problem.names, run.problem.units, strict=True)),
+    })  # fmt: skip
     words = (
         f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
     )

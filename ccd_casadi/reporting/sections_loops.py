@@ -1,7 +1,7 @@
 """Figures of the loops that a controller of fixed structure closes on every plant of its set."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +14,9 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.reporting.force_step import force_step
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.loops import forbidden
 from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import BLUE, CYCLE, GREEN, GREY, ORANGE
+from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -101,14 +102,10 @@ def compared_html(
     return figure_html(svg, f"The largest on the plants of the set. {'; '.join(words)}.", *tables)
 
 
-def gains_html(
-    problem: CoDesignProblem,
-    verified: "VerifiedSections",
-    loops: Loops,
-    *,
-    key: str = "sections-loop",
-) -> str:
-    """S, KS and T of the model in a band of all plants; `key` is unique in the page."""
+def gain_panels(
+    problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops
+) -> tuple[Panel, Panel, Panel]:
+    """S with what is forbidden to it, KS and T, each as the model's and a band of all plants."""
     inner, bandwidth = problem.inner, verified.design.bandwidth / HZ
     x = (float(loops.hz[0]), float(loops.hz[-1]))
 
@@ -127,6 +124,26 @@ def gains_html(
     S = panel(f"{gain('S')} (–)", loops.S, (asked, Level(2**-0.5, "-3 dB", colour=GREY), at))
     KS = panel(f"{gain('KS')} (N/m)", loops.KS, (at,))
     T = panel(f"{gain('T')} (–)", loops.T, (at,))
+    top = 2.5 * max(inner.S_max, float(np.abs(loops.S).max()))
+    S = replace(S, forbidden=forbidden(inner, x[0], x[1], top),
+                y_range=(0.5 * float(np.abs(loops.S[0]).min()), top))  # fmt: skip
+    return S, KS, T
+
+
+def gains_html(
+    problem: CoDesignProblem,
+    verified: "VerifiedSections",
+    loops: Loops,
+    *,
+    key: str = "sections-loop",
+) -> str:
+    """S, KS and T of the model in a band of all plants; `key` is unique in the page."""
+    S, KS, T = gain_panels(problem, verified, loops)
+    x = (float(loops.hz[0]), float(loops.hz[-1]))
+
+    def gain(of: str) -> str:
+        return f"|{of}|" if len(loops.L) else f"σ_max({of})"
+
     svg = figure_lines([[S], [KS, T]], key=key, heights=(3.4, 2.6),
                        title="S, KS and T of every plant of the set over frequency")  # fmt: skip
     rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
@@ -143,15 +160,8 @@ def gains_html(
     return figure_html(svg, f"The band spans {len(loops.S)} plants of the set.", table)
 
 
-def nyquist_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops) -> str:
-    S_max = problem.inner.S_max
-    angle = np.linspace(0.0, 2.0 * np.pi, 200)
-    disk = -1.0 + np.exp(1j * angle) / S_max
-    curves = [Curve(line.real, line.imag, colour=GREEN if i else BLUE, width=1.0 if i else 1.5)
-              for i, line in reversed(list(enumerate(loops.L)))]  # fmt: skip
-    curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
-    nyquist = Panel("Re L", "Im L", tuple(curves), x_range=(-3.0, 1.0), y_range=(-1.75, 1.75),
-                    legend="upper right")  # fmt: skip
+def force_step_html(verified: "VerifiedSections") -> str:
+    """The position of every plant after a step of force at the actuator."""
     certificate = verified.design.certificate
     assert certificate is not None
     assert verified.design.controller is not None
@@ -167,11 +177,11 @@ def nyquist_html(problem: CoDesignProblem, verified: "VerifiedSections", loops: 
     step = Panel("time (ms)", "y after a step of 1 N (µm)", (Curve(1e3 * t, y[0], "the model"),),
                  (Band(1e3 * t, y.min(axis=0), y.max(axis=0), "all plants"),), log_x=True,
                  legend="upper left")  # fmt: skip
-    svg = figure_lines([[nyquist, step]], key="sections-nyquist", heights=(3.9,),
-                       title="Nyquist plot of every plant, and a step of force")  # fmt: skip
+    svg = figure_lines([[step]], key="sections-force", heights=(3.2,),
+                       title="A step of force on every plant")  # fmt: skip
     rows = np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
     table = Table(("ms", "µm model", "µm least", "µm largest"), tuple(
         (1e3 * float(t[i]), float(y[0, i]), float(y[:, i].min()), float(y[:, i].max()))
         for i in rows))  # fmt: skip
-    words = "L = GK of every plant stays outside the disk of S_max around -1. "
-    return figure_html(svg, words + "The step of force acts at the actuator.", table)
+    words = f"A force of 1 N at the actuator moves {len(y)} plants of the set, until they rest."
+    return figure_html(svg, words, table)

@@ -32,8 +32,8 @@ POINTS = 600
 ROWS = 40
 
 
-def move_html(verified: "VerifiedSections") -> str:
-    """Error of the default move of `robustness`, without and with mass feedforward."""
+def move_panels(verified: "VerifiedSections") -> tuple[list[Panel], str, Table]:
+    """Error of the default move of `robustness`, without and with mass feedforward; words, data."""
     problem, made = verified.problem, verified.design
     assert made.controller is not None
     sampling = sections_of_problem(problem).sampling
@@ -74,6 +74,11 @@ def move_html(verified: "VerifiedSections") -> str:
     )
     rows = np.unique(np.linspace(0, POINTS - 1, ROWS).astype(int))
     table = Table(tuple(heads), tuple(tuple(float(c[i]) for c in columns) for i in rows))
+    return panels, caption, table
+
+
+def move_html(panels: list[Panel], caption: str, table: Table) -> str:
+    """What `move_panels` found, as a figure."""
     svg = figure_lines([panels], key="sections-move", heights=(3.2,),
                        title="Error of a move on every plant of the set")  # fmt: skip
     return figure_html(svg, caption, table)

@@ -7,6 +7,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import Fact, binding, theta_table, theta_words
+from ccd_casadi.reporting.glance import glance_of_sections
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -16,8 +17,8 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
-from ccd_casadi.reporting.sections_loops import gains_html, loops_of, nyquist_html
-from ccd_casadi.reporting.sections_move import move_html
+from ccd_casadi.reporting.sections_loops import force_step_html, gains_html, loops_of
+from ccd_casadi.reporting.sections_move import move_html, move_panels
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
@@ -43,16 +44,17 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
     assert verified is not None
     assert verified.design.controller is not None
     loops = loops_of(verified.problem, verified.theta, verified.design)
+    moves = move_panels(verified) if len(loops.L) else None  # of one channel
     found = [
+        Section("At a glance", glance_of_sections(problem, verified, loops, moves)),
         _design(problem, solution.result),
         Section("The controller", controller_html(solution.result)),
         Section("Full order beside it", _beside(problem, solution.result)),
         Section("Closed loop on every plant", gains_html(problem, verified, loops)),
     ]
-    if len(loops.L):  # of one channel
-        body = nyquist_html(problem, verified, loops)
-        found.append(Section("Nyquist plot and a step of force", body))
-        found.append(Section("A move", move_html(verified)))
+    if moves is not None:
+        found.append(Section("A move", move_html(*moves)))
+        found.append(Section("A step of force", force_step_html(verified)))
     return [*found, *budget_section(verified.problem, verified.theta, verified.design.controller)]
 
 

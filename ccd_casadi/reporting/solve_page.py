@@ -11,17 +11,20 @@ from ccd_casadi.cases.case import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
+from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import (
     caption_history,
     figure_history,
     history_data,
     table_history,
 )
+from ccd_casadi.reporting.index import write_index
 from ccd_casadi.reporting.inner_sweep import caption_sweep, sweep_data, table_sweep
 from ccd_casadi.reporting.landscape import (
     caption_disagreement,
@@ -82,6 +85,7 @@ def write_report(
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
     write_whole(path, report_html(folder, case, problem, solution, quiet=quiet))
+    write_index(folder)
     return path
 
 
@@ -117,6 +121,7 @@ def report_html(
         verified, truths = solution.verified, read_truths(folder / "samples.sqlite", problem)
         stages = {"start": problem.start, "optimum": verified.theta}
         parts = [
+            lambda: [glance(problem, verified, float(result["bandwidth_hz"]))],
             lambda: [_design(problem, solution)],
             lambda: [_theta(problem, solution, verified, truths)],
             lambda: stage_sections(problem, stages),
@@ -211,7 +216,8 @@ def _loop(
         figure_gains([loop], S_max=S_max), caption_gains(loop, S_max=S_max), table_gains(loop)
     )
     limits = "\n".join(paragraph(words) for words in limit_sentences(loop))
-    bode = figure_html(figure_bode(loop), caption_bode(loop), table_bode(loop))
+    channels = split(scaled_plant(problem, verified.theta), verified.design.controller)
+    bode = figure_html(figure_bode(loop, channels), caption_bode(loop), table_bode(loop))
     return [
         Section("Closed loop: S, KS and T against their bounds", gains),
         Section("What limits the bandwidth", limits + table_html(table_limits(loop))),

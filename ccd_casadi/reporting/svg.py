@@ -63,7 +63,7 @@ _STYLE: Any = {
     "hatch.linewidth": 0.5,
     "legend.frameon": True,
     "legend.framealpha": 0.9,
-    "legend.edgecolor": "#dddddd",
+    "legend.edgecolor": "#e6e6e6",
     "legend.fancybox": False,
     "axes.titley": 1.0,  # where it is by itself, but not measured to be placed
     "figure.facecolor": "none",

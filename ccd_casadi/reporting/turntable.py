@@ -4,8 +4,6 @@ Both draw alike: orthographic projection, back faces left out, far quads first, 
 Camera coordinates are right, up and towards the viewer.
 """
 
-import base64
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.reporting.page import escape
+from ccd_casadi.reporting.page import escape, with_script
 from ccd_casadi.reporting.svg import COLOUR_MAP
 from ccd_casadi.reporting.turntable_script import CSS, LIGHT, SCRIPT, SHADE
 from ccd_casadi.support.arrays import Array
@@ -25,7 +23,6 @@ REACH = 0.08  # the largest displacement is drawn as this share of the object's 
 UNIT = 1e-4  # m; coordinates are written as whole multiples of it
 SHARES = 999  # displacements are written as so many parts of the largest
 STOPS = 17  # of the colour map, linear in between
-POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # as the page has it
 
 # corners of a cell's six faces, counter-clockwise from outside, by (axis, side)
 FACES = {
@@ -218,16 +215,5 @@ def legend(words: str) -> str:
 
 
 def with_turntables(document: str) -> str:
-    """A finished page with the script and its style, the script allowed by its hash alone.
-
-    A page without turntables stays as it is.
-    """
-    if 'class="turntable"' not in document:
-        return document
-    if POLICY not in document:
-        raise ValueError("the page's policy is not the one that the script is added to")
-    digest = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
-    document = document.replace(POLICY, f"{POLICY}; script-src 'sha256-{digest}'", 1)
-    document = document.replace("</head>", f"<style>{CSS}</style>\n</head>", 1)
-    end = document.rindex("</body>")
-    return f"{document[:end]}<script>{SCRIPT}</script>\n{document[end:]}"
+    """A finished page with the script and its style; one without turntables stays as it is."""
+    return with_script(document, SCRIPT, CSS) if 'class="turntable"' in document else document

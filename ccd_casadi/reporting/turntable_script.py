@@ -20,9 +20,10 @@ CSS = """
 .turntable .controls label { display: flex; align-items: center; gap: 6px; }
 .turntable .controls input { width: 120px; accent-color: #005a8c; }
 .turntable .controls output { width: 3.2em; font-variant-numeric: tabular-nums; }
-.turntable .controls button { font: inherit; color: #005a8c; background: #fff; cursor: pointer;
-  border: 1px solid #b8c4cc; border-radius: 4px; padding: 2px 12px; min-width: 5em; }
-@media screen { .turntable.live .drawn svg { visibility: hidden; } }
+.turntable .controls button { font: inherit; color: var(--link); cursor: pointer;
+  background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: 2px 12px;
+  min-width: 5em; }
+@media screen { .turntable .drawn.painted svg { visibility: hidden; } }
 @media print { .turntable canvas, .turntable .controls { display: none; }
   .turntable .views { row-gap: 4px; } .turntable .view p { font-size: 9pt; line-height: 1.2; }
   .turntable .drawn { margin: -2px 0; } }
@@ -74,6 +75,7 @@ SCRIPT = """
       const w = Math.round(box.width * ratio), h = Math.round(box.height * ratio);
       if (view.canvas.width !== w || view.canvas.height !== h)
         Object.assign(view.canvas, { width: w, height: h });
+      view.canvas.parentElement.classList.add("painted");
       const g = view.canvas.getContext("2d"), f = view.field, p = d.points;
       const a = state.turn * Math.PI / 180, e = state.tilt * Math.PI / 180;
       const ca = Math.cos(a), sa = Math.sin(a), ce = Math.cos(e), se = Math.sin(e);

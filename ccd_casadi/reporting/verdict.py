@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.reporting.page import escape
+from ccd_casadi.reporting.page import escape, typeset
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}
@@ -73,8 +73,8 @@ def verdict_html(result: Mapping[str, Any]) -> str:
     """The five lines as a table; nothing where there is no verdict."""
     rows = "\n".join(
         f'<tr><th scope="row">{escape(line.name)}</th><td><span class="badge {BADGES[line.state]}">'
-        f"{SIGNS[line.state]} {escape(line.state.value)}</span></td><td>{escape(line.words)}</td>"
-        "</tr>"
+        f"{SIGNS[line.state]} {escape(line.state.value)}</span></td>"
+        f"<td>{escape(typeset(line.words))}</td></tr>"
         for line in lines_of(result)
     )
     return f'<table class="wide verdict"><tbody>{rows}</tbody></table>' if rows else ""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, metres
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -45,7 +45,7 @@ class Statics:
     @property
     def words(self) -> str:
         """One or two sentences."""
-        low = f"at {self.low_hz:.3g} Hz {self.low:.3g} m (GS there)"
+        low = f"at {self.low_hz:.3g} Hz {metres(self.low)} (GS there)"
         if self.integrates:
             return (
                 "The controller integrates: at rest a constant force moves the stage by nothing; "
@@ -53,7 +53,7 @@ class Statics:
             )
         found = (
             f"Static stiffness K(0) = {self.stiffness:.3g} N/m: a constant force of 1 N moves the "
-            f"stage {self.compliance:.3g} m (GS at 0 Hz), {low}."
+            f"stage {metres(self.compliance)} (GS at 0 Hz), {low}."
         )
         if self.differentiates:
             found += (

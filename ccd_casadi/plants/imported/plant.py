@@ -17,6 +17,8 @@ from surrogates import to_casadi
 
 NEAREST = "the nearest sample as it stands"
 
+SAME = 1e-6  # of the range: no distance to a sample
+
 
 def modal_table(names: Sequence[str], table: str = "", rigid_below_hz: float = 0.1) -> Plant:
     """The plant interpolated between the modal models of a CSV file (see `modal_table`)."""
@@ -87,12 +89,14 @@ def _notes(
     )
     frequency, response = 100 * modes.left_out.frequency, 100 * modes.left_out.response
     count = len(modes.table.theta)
+    here = f"is {100 * distance:.2g} % of the sampled range away from the nearest sample"
+    if distance < SAME:
+        here = "is one of the samples"
     return (
         f"designs are verified on the model interpolated between the {count} samples of {source}, "
         f"as no other is known between them ({modes.frame.name}); a sample left out is predicted "
         f"to {frequency:.2g} % in frequency and {response:.2g} % in response at worst",
-        f"this theta lies {100 * distance:.2g} % of the samples' range from the nearest sample, "
-        f"{place}; analyse its own finite-element model before it is built",
+        f"this theta {here}, {place}; analyse its own finite-element model before it is built",
     )
 
 

@@ -13,14 +13,19 @@ from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.rib_stage.pictures import mode_shape
 from ccd_casadi.plants.rib_stage.plant import stage_of
+from ccd_casadi.reporting import svg
 from ccd_casadi.reporting.page import escape, number
 from ccd_casadi.reporting.stage_drawing import draw_stages
 from ccd_casadi.reporting.stage_pictures import surface_of
-from ccd_casadi.reporting.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.reporting.turntable import Picture, still
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
+# in a page's own theme, where it has one
+BLUE, GREEN, ORANGE = (
+    f"var(--{name}, {colour})"
+    for name, colour in (("blue", svg.BLUE), ("green", svg.GREEN), ("orange", svg.ORANGE))
+)
 SMALL = 1e-9  # share of the largest entry below which there is no spring
 MOST_NODES = 12
 SHOWN_MODES = 3
@@ -100,7 +105,7 @@ def lumped_svg(found: Lumped, modal: ModalPlant, reference: float) -> str:
 
 def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) -> str:
     """A zigzag between neighbours, an arc between others, a zigzag to the left to the ground."""
-    words = f"{number(stiffness, 3)} N/m"
+    words = f"{number(1e-6 * stiffness, 3)} N/µm"
     look = f'fill="none" stroke="{GREEN}" stroke-width="1.6"'
     if j > i + 1:
         x0, x1, top = at[i], at[j], MIDDLE - SIDE / 2 - 4
@@ -115,7 +120,7 @@ def _spring(at: Sequence[float], side: Array, i: int, j: int, stiffness: float) 
     heights = low + np.array([0, 0, *([7, -7] * 4), 0, 0])
     d = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(turns, heights, strict=True))
     wall = f'<path d="M{x0:.1f} {low - 14}v28" {look}/>' if j < 0 else ""
-    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, low + 38, words)
+    return f'<path d="{d}" {look}/>{wall}' + _text((x0 + x1) / 2, MIDDLE + SIDE / 2 + 15, words)
 
 
 def _arrow(x0: float, x1: float, y: float, colour: str) -> str:

@@ -1,0 +1,169 @@
+"""What an engineer looks at first: the machine, S with what is forbidden to it, Nyquist, a move."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.reporting.loops import forbidden, shown_rows
+from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, stage_modes_html
+from ccd_casadi.reporting.nyquist import around_resonances, loci_of, nyquist_panel
+from ccd_casadi.reporting.page import Section, Table, figure_html, number
+from ccd_casadi.reporting.sections_loops import Loops, gain_panels
+from ccd_casadi.reporting.signals import Moved, signals_of
+from ccd_casadi.reporting.svg import GREEN, GREY
+from ccd_casadi.robust.demands import Demands
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import classical_margins
+from ccd_casadi.synthesis.closed_loop import responses
+from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.sections_run import VerifiedSections
+    from ccd_casadi.codesign.verify import VerifiedDesign
+
+HEIGHT = 3.0  # inches of a row
+ROWS = 40  # of the move's table
+
+
+def glance(problem: CoDesignProblem, verified: "VerifiedDesign", bandwidth_hz: float) -> Section:
+    """Of a full-order design on its model."""
+    design, inner = verified.design, problem.inner
+    K, plant = design.controller, scaled_plant(problem, verified.theta)
+    loop = loop_data(
+        plant, K, design.weights, gamma=design.figures.gamma, bandwidth_hz=bandwidth_hz,
+        omega_low=inner.omega_low,
+    )  # fmt: skip
+    system = mechanics(plant_of(problem), verified.theta)
+    move = signals_of(problem, system, plant, K, None, bandwidth_hz).move
+    fine = np.unique(np.concatenate([loop.hz, around_resonances(plant, K)]))
+    fine = fine[(fine >= loop.hz[0]) & (fine <= loop.hz[-1])]
+    G, k, _ = responses(plant, K, HZ * fine)
+    L = G @ k
+    rows: list[list[Panel | str | None]] = [
+        [machine(problem, verified.theta), _sensitivity(problem, loop)],
+        [nyquist_panel(list(loci_of(L).T), inner.S_max, HEIGHT), _move(move)],
+    ]
+    peak = design.figures.sensitivity_peak
+    words = (
+        f"The machine at this design. S stays out of the shaded area: its peak, {number(peak, 4)}, "
+        f"is {100.0 * peak / inner.S_max:.4g} % of S_max, so that "
+        f"{'L' if L.shape[1] == 1 else 'every return difference'} keeps at least "
+        f"{number(1.0 / peak, 3)} from -1."
+    )
+    if L.shape[1:] == (1, 1):
+
+        def open_loop(omega: np.ndarray) -> np.ndarray:
+            G, k, _ = responses(plant, K, omega)
+            return np.asarray((G @ k)[:, 0, 0])
+
+        m = classical_margins(open_loop, HZ * fine)
+        words += (
+            f" The gain may fall to {number(m.gain_down, 3)} or rise to {number(m.gain_up, 3)} "
+            f"times; the phase margin is {number(m.phase_deg, 3)}° and the delay margin "
+            f"{number(1e6 * m.delay, 3)} µs."
+        )
+    words += _move_words(move)
+    svg = figure_lines(rows, key="glance", title="At a glance", heights=(HEIGHT, HEIGHT))
+    return Section("At a glance", figure_html(svg, words, _table(loop), _move_table(move)))
+
+
+def glance_of_sections(
+    problem: CoDesignProblem,
+    verified: "VerifiedSections",
+    loops: Loops,
+    moves: tuple[list[Panel], str, Table] | None,
+) -> str:
+    """Of a fixed structure on every plant of its set; of several channels the machine and S."""
+    S = gain_panels(problem, verified, loops)[0]
+    rows: list[list[Panel | str | None]] = [[machine(problem, verified.theta), S]]
+    certificate = verified.design.certificate
+    assert certificate is not None
+    count, S_max = len(loops.S), problem.inner.S_max
+    words = (
+        f"The machine at this design, and its loop on {count} plants of the set (blue: the model; "
+        f"band, green: the others). S stays below S_max = {S_max:g}"
+    )
+    tables = [Table(("Hz", "largest |S|"), tuple(
+        (float(loops.hz[i]), float(np.abs(loops.S[:, i]).max()))
+        for i in shown_rows(loops.hz, [])))]  # fmt: skip
+    if moves is not None:
+        panels, told, table = moves
+        rows.append([nyquist_panel(list(loops.L), S_max, HEIGHT), panels[-1]])
+        words += f", that is, L = GK keeps at least {number(1.0 / S_max, 3)} from -1. {told}"
+        tables.append(table)
+    else:
+        words += "."
+    svg = figure_lines(rows, key="glance", title="At a glance", heights=[HEIGHT] * len(rows))
+    return figure_html(svg, words, *tables)
+
+
+def machine(problem: CoDesignProblem, theta: Sequence[float]) -> str:
+    """Masses and springs with their modes, the first modes of a rib stage, or a table of modes."""
+    stage = stage_modes_html(problem, theta)
+    if stage:
+        return stage
+    system = mechanics(plant_of(problem), theta)
+    modal, found = modal_plant(system, problem.suspension), lumped(system)
+    if found is None:
+        return modes_html(modal)
+    return lumped_svg(found, modal, float(np.abs(found.masses).max()))
+
+
+def _sensitivity(problem: CoDesignProblem, loop: Loop) -> Panel:
+    inner, S = problem.inner, loop.gains[0]
+    ends = float(loop.hz[0]), float(loop.hz[-1])
+    top = 3.5 * max(inner.S_max, float(S.max()))  # room for the words at its peak
+    tops = sorted((p for p in loop.peaks if p[1] > 1.05), key=lambda p: -p[1])[:1]
+    name = "|S|" if loop.plant.shape[1:] == (1, 1) else "σ_max(S)"
+    return Panel(
+        "frequency (Hz)", f"{name} (–)", (Curve(loop.hz, S, width=1.8),),
+        marks=tuple(Mark(hz, gain, f"{gain:.3g} at {number(hz, 4)} Hz")
+                    for hz, gain in tops),
+        levels=(
+            Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
+            Level(2**-0.5, "-3 dB", colour=GREY),
+            Level(loop.bandwidth_hz, f"ω_b {number(loop.bandwidth_hz, 4)} Hz", True, GREEN),
+        ),
+        log_x=True, log_y=True, x_range=ends, y_range=(0.5 * float(S.min()), top),
+        forbidden=forbidden(inner, *ends, top),
+    )  # fmt: skip
+
+
+def _move(move: Moved) -> Panel:
+    at = np.unique(np.linspace(0, len(move.time) - 1, 700).astype(int))
+    end = (Level(1e3 * move.end, "end of the move", True, GREY),)
+    curve = Curve(1e3 * move.time[at], 1e6 * move.error[at], width=1.6)
+    return Panel("time (ms)", "error of a move (µm)", (curve,), levels=end)
+
+
+def _move_words(move: Moved) -> str:
+    limits = Demands().limits
+    ahead = "with mass feedforward" if move.feedforward else "without feedforward"
+    where = "" if move.free else ", on the suspended plant,"
+    return (
+        f" A move of {number(1e3 * limits.stroke)} mm in {number(1e3 * move.end, 4)} ms {ahead}"
+        f"{where} errs by at most {number(1e6 * float(np.abs(move.error).max()), 3)} µm on the "
+        "model (other moves: robustness)."
+    )
+
+
+def _table(loop: Loop) -> Table:
+    L = loop.plant @ loop.controller
+    rows = shown_rows(loop.hz, [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)])
+    if L.shape[1:] != (1, 1):
+        return Table(("Hz", "σ_max(S)"), tuple(
+            (float(loop.hz[i]), float(loop.gains[0, i])) for i in rows))  # fmt: skip
+    return Table(("Hz", "|S|", "Re L", "Im L"), tuple(
+        (float(loop.hz[i]), float(loop.gains[0, i]), float(L[i, 0, 0].real), float(L[i, 0, 0].imag))
+        for i in rows))  # fmt: skip
+
+
+def _move_table(move: Moved) -> Table:
+    rows = np.unique(np.linspace(0, len(move.time) - 1, ROWS).astype(int))
+    return Table(("ms", "error µm"), tuple(
+        (1e3 * float(move.time[i]), 1e6 * float(move.error[i])) for i in rows))  # fmt: skip

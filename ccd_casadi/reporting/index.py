@@ -1,0 +1,66 @@
+"""index.html of a run's folder: its verdict, its pages, and what its files are."""
+
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+from ccd_casadi.reporting.facts import conclusion
+from ccd_casadi.reporting.page import INDEX, Section, Table, escape, header, page, table_html
+from ccd_casadi.reporting.sections_page import sections_conclusion
+from ccd_casadi.reporting.verdict import verdict_html, worst
+from surrogates.files import write_whole
+
+PAGES = {
+    "report.html": "the design: its machine, its loop, what binds, how it was found",
+    "insight.html": "the front of cost against bandwidth, and what loosening each bound would gain",
+    "robustness.html": "margins, plants off the model, hardware tolerances, a move",
+    "*/report.html": "a deployment: order, rate, code, the move on the machine",
+}
+FILES = {
+    "result.json": "every figure of the run", "controller.json": "the controller, SI",
+    "case.toml": "the case as it was solved", "samples.sqlite": "every synthesis and design",
+    "surrogate.json": "the surrogate", "insight.json": "the figures of insight.html",
+    "robustness.json": "the figures of robustness.html", "plant.py": "the plant's own code",
+}  # fmt: skip
+
+
+def index_of(folder: Path) -> str:
+    """What a page in this folder links as the page of all pages; empty where it holds no run."""
+    return INDEX if (folder / "result.json").exists() else ""
+
+
+def write_index(folder: Path) -> None:
+    """Write index.html anew after a page was added; nothing where the folder holds no run.
+
+    Links are to what the folder holds now.
+    """
+    try:
+        result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        status = str(result["status"])
+    except (OSError, ValueError, KeyError):
+        return
+    items = "\n".join(
+        f'<li><a href="{escape(place.relative_to(folder).as_posix())}">{escape(_title(place))}</a>'
+        f": {escape(words)}</li>"
+        for name, words in PAGES.items()
+        for place in sorted(folder.glob(name))
+    )
+    files = tuple((n, words) for n, words in FILES.items() if (folder / n).exists())
+    name = folder.resolve().name
+    lead = sections_conclusion(result) if "race" in result else conclusion(result)
+    head = header(
+        f"Run: {name}", status == "verified", status.replace("_", " "),
+        str(result.get("reason") or ""), f"{result.get('formulation', '')} formulation", lead,
+        warned=worst(result) is not worst({}), verdict=verdict_html(result),
+    )  # fmt: skip
+    sections = [
+        Section("Pages", f"<ul>{items}</ul>"),
+        Section("Files", table_html(Table(("file", "what it is"), files))),
+    ]
+    write_whole(folder / INDEX, page(f"Run: {name}", sections, head, index=""))
+
+
+def _title(place: Path) -> str:
+    found = re.search(r"<title>(.*?)</title>", place.read_text(encoding="utf-8"))
+    return unescape(found[1]) if found else place.name

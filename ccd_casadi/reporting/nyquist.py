@@ -1,0 +1,58 @@
+"""The Nyquist plot of L = GK with the disk that S_max keeps it out of: |1 + L| >= 1/S_max."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.reporting.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
+from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+SHOWN = (-3.2, 1.6)  # of the real axis
+LIGHT = 0.3  # damping ratio below which a pole is a resonance
+FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
+FAR = 30.0  # |L| beyond which a locus leaves the drawing
+
+
+def nyquist_panel(loci: Sequence[np.ndarray], S_max: float, height: float) -> Panel:
+    """Loci (k,) complex, the first the model's; beside one other panel of this height in inches."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    circle = np.exp(1j * angle)
+    curves = [
+        Curve(line.real, line.imag, colour=GREEN if i else BLUE, width=1.0 if i else 1.6)
+        for i, line in reversed(list(enumerate(loci)))
+    ]
+    disk = -1.0 + circle / S_max
+    curves.append(Curve(disk.real, disk.imag, f"|S| = S_max = {S_max:g}", ORANGE))
+    curves.append(Curve(circle.real, circle.imag, "|L| = 1", GREY, ":", width=0.9))
+    wide, tall = 0.5 * WIDTH - LEFT - RIGHT, height - BOTTOM - TOP
+    half = 0.5 * (SHOWN[1] - SHOWN[0]) * tall / wide  # a circle is round
+    return Panel(
+        "Re L (–)", "Im L (–)", tuple(curves), marks=(Mark(-1.0, 0.0, marker="+"),),
+        x_range=SHOWN, y_range=(-half, half), legend="lower right", forbidden=((disk, ORANGE),),
+    )  # fmt: skip
+
+
+def loci_of(L: np.ndarray) -> np.ndarray:
+    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > FAR."""
+    values = np.linalg.eigvals(L)
+    if values.shape[1] > 1:
+        for i in range(1, len(values)):
+            away = np.abs(values[i - 1][:, None] - values[i][None, :])
+            values[i] = values[i][linear_sum_assignment(away)[1]]
+    return np.where(np.abs(values) <= FAR, values, np.nan)
+
+
+def around_resonances(plant: ScaledPlant, controller: StateSpace | None) -> Array:
+    """Frequencies in Hz around the light poles of plant and controller (SI).
+
+    In even steps of the phase, so that the circle of a resonance in the Nyquist plot is round.
+    """
+    poles = np.linalg.eigvals(plant.A) * plant.omega_0
+    if controller is not None:
+        poles = np.concatenate([poles, np.linalg.eigvals(controller.A)])
+    light = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))] / HZ
+    return np.asarray((light.imag[:, None] + np.abs(light.real)[:, None] * FLANKS).ravel())
