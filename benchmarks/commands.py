@@ -38,7 +38,9 @@ ASKED = {  # seconds
 def timed(words: Sequence[str], folder: Path, path: Path) -> tuple[float, float]:
     """Real and processor seconds of `python words`, its children included."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    environment = os.environ | {"PYTHONPATH": str(path)}
+    # as for a person, whose Python keeps the bytecode of what it has compiled once
+    kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment = kept | {"PYTHONPATH": str(path)}
     subprocess.run(
         [sys.executable, *words], cwd=folder, env=environment, check=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,

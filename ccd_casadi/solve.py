@@ -3,12 +3,13 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
-from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.process_pool import PATIENCE, Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -187,27 +188,34 @@ def command(options: argparse.Namespace) -> ExitCode:
     folder = run_folder(options.case, options.out)
     if not options.quiet:
         show_findings(case, problem)
-    given = None
-    if options.surrogate is not None:
-        given = named_surrogate(folder, options.surrogate, options.formulation, problem)
-    store = folder / "samples.sqlite"
-    with (
-        pool(options.scheduler, options.workers, PATIENCE) as workers,
-        SampleStore(store) as samples,
-    ):
-        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-        formulation = formulation_of(case, options.formulation)
-        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
-        write_run(folder, case, solution)
-    code = _CODES[solution.result["status"]]
-    if not options.quiet:
-        print(summary(solution))
-        print(f"run folder    {folder}")
-    if not options.no_report:
-        from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+    with ExitStack() as stack:
+        helper = None
+        if not options.no_report and options.workers > 1 and not options.quiet:
+            # Where somebody waits, a process gets ready to draw half of the report meanwhile.
+            from ccd_casadi.reporting.solve_page import ready
 
-        plant_case, solved = resolved(case, solution), solution.problem or problem
-        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
+            helper = stack.enter_context(Ahead(ready))
+        given = None
+        if options.surrogate is not None:
+            given = named_surrogate(folder, options.surrogate, options.formulation, problem)
+        store = folder / "samples.sqlite"
+        with (
+            pool(options.scheduler, options.workers, PATIENCE) as workers,
+            SampleStore(store) as samples,
+        ):
+            sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+            formulation = formulation_of(case, options.formulation)
+            solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+            write_run(folder, case, solution)
+        code = _CODES[solution.result["status"]]
+        if not options.quiet:
+            print(summary(solution))
+            print(f"run folder    {folder}")
+        if not options.no_report:
+            from ccd_casadi.reporting.solve_page import write_report
+
+            plant_case, solved = resolved(case, solution), solution.problem or problem
+            write_report(folder, plant_case, solved, solution, quiet=options.quiet, helper=helper)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code

@@ -171,15 +171,7 @@ def quality_of(
     Raises:
         ValueError: the point does not have the process's inputs.
     """
-    samples = _samples(process)
-    residuals, deviations = loo_errors(process)
-    n = len(process.X)
-    folded = held_out(
-        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
-        samples,
-        min(FOLDS, n),
-        seed,
-    )
+    samples, residuals, deviations, folded = _left_out(process, seed)
     standardised = residuals / (process.band * deviations)
     predicted = samples.Y - residuals
     unit_x = (np.asarray(x, float) - process.lower) / (process.upper - process.lower)
@@ -203,6 +195,19 @@ def quality_of(
 
 
 @lru_cache(maxsize=8)  # a process is judged before it is relied on, and again in the report
+def _left_out(process: GaussianProcess, seed: int) -> tuple[Samples, Array, Array, Array]:
+    """The samples, residuals and deviations one by one, residuals fold by fold: nothing of x."""
+    samples = _samples(process)
+    folded = held_out(
+        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
+        samples,
+        min(FOLDS, len(process.X)),
+        seed,
+    )
+    return (samples, *loo_errors(process), folded)
+
+
+@lru_cache(maxsize=8)
 def _roughness_of(process: GaussianProcess, seed: int) -> Roughness:
     n = len(process.X)
     if n < LEAST_FOR_ROUGHNESS:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogates.interface import Array, box
+from surrogates.sobol_sequence import scrambled_sobol
 
 
 class DesignKind(StrEnum):
@@ -60,12 +61,9 @@ def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
 
     Source: Owen, "Scrambling Sobol' and Niederreiter-Xing points", J. Complexity 1998.
     """
-    from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
-
     low, high = box(lower, upper)
     _positive(n)
-    sequence = qmc.Sobol(low.size, scramble=True, rng=np.random.default_rng(seed))
-    return _spread(sequence.random_base2((n - 1).bit_length())[:n], low, high)
+    return _spread(scrambled_sobol(low.size, (n - 1).bit_length(), seed)[:n], low, high)
 
 
 def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
@@ -76,7 +74,7 @@ def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Ar
 
     Source: McKay, Beckman and Conover, Technometrics 1979.
     """
-    from scipy.stats import qmc
+    from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
 
     low, high = box(lower, upper)
     _positive(n)

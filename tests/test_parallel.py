@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
-from ccd_casadi.support.process_pool import _THREADS, WorkerLost, Workers, usable_cores
+from ccd_casadi.support.process_pool import _THREADS, Ahead, WorkerLost, Workers, usable_cores
 
 HERE = Path(__file__).parent
 
@@ -149,6 +149,18 @@ def test_a_task_that_kills_twice_is_told() -> None:
         list(workers.map_unordered(dies, range(8)))
     assert len(str(caught.value)) < 400
     assert workers._workers == []
+
+
+def test_a_process_ahead_gives_its_result_or_what_went_wrong() -> None:
+    with Ahead(usable_cores) as helper:
+        helper.begin(square, 3)
+        assert helper.result() == 9
+        helper.begin(failing, 3)
+        with pytest.raises(TaskFailure, match="at three"):
+            helper.result()
+        helper.begin(os._exit, 3)
+        with pytest.raises(WorkerLost, match="exit code 3"):
+            helper.result()
 
 
 def test_an_abandoned_map_leaves_no_process() -> None:

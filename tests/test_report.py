@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import os
 import re
 from dataclasses import replace
 from functools import cache
@@ -25,7 +26,7 @@ from ccd_casadi.reporting.page import Section, Table, number, page, table_html
 from ccd_casadi.reporting.solve_page import report_html, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.process_pool import Ahead, Workers
 from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
@@ -273,6 +274,17 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
     text = report_html(tmp_path, case, problem, Solution(result, nothing, None))
     Document(text)
     assert "S_max cannot be met by &lt;0.1&gt;" in text
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_helper_draws_the_same_report_and_may_die(lost: bool) -> None:
+    folder, case, problem, solution, alone = run("one")
+    with Ahead(int) as helper:
+        if lost:
+            helper.begin(os._exit, 1)
+        helped = report_html(folder, case, problem, solution, helper=helper)
+    minute = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d")
+    assert minute.sub("", helped) == minute.sub("", alone)
 
 
 def test_mimo_shows_singular_values_without_phase() -> None:

@@ -28,6 +28,7 @@ from ccd_casadi.plants.rib_stage.model import discretisation, modes_at, orthonor
 from ccd_casadi.plants.rib_stage.modes import SQUARE_GROUPS, WHOLE, functionals, spectrum
 from ccd_casadi.plants.rib_stage.reference import line_nodes
 from ccd_casadi.plants.rib_stage.rigid import rigid_fields, rigid_values
+from ccd_casadi.support.threads import threads_permitted
 
 Array = np.ndarray
 A = tuple(1e-3 * np.array([1.0, 3.0, 8.0, 8.0, 16.806, 67.5]))
@@ -352,6 +353,22 @@ def test_evaluations_are_cached_and_cannot_be_spoilt() -> None:
     with pytest.raises(ValueError, match="read-only"):
         first.B[0, 0] = 0.0
     assert modes_at(stage, B) is not None
+
+
+def test_threads_change_no_digit() -> None:
+    """Symmetries solved side by side are those solved in turn, at a θ that no cache knows."""
+    stage, other = RibStage(order=COARSE), RibStage(order=COARSE, damping_ratio=0.02)
+    theta = tuple(1.01 * np.array(B))
+    alone = stage.mechanics(theta)
+    modes_at(stage, B), modes_at(stage, A)  # two others push θ out of the cache of spectra
+    with threads_permitted(2):
+        together = other.mechanics(theta)
+    for one, two in zip(
+        (alone.K, alone.B, alone.C, *alone.derivatives),
+        (together.K, together.B, together.C, *together.derivatives),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, two)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
-from ccd_casadi.codesign.lifted import fit_quantities
+from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
@@ -125,3 +125,18 @@ def test_lifted_fits_the_kernel_that_the_case_names(two_mass_run: Path) -> None:
     auto = fit_quantities(problem, samples, 0, kind="auto")
     for one, two, best in zip(named, plain, auto, strict=True):
         assert best.loo.rms == min(one.loo.rms, two.loo.rms)
+
+
+def test_rounds_interpolate_where_a_fit_saw_noise(two_mass_run: Path) -> None:
+    """The truth is exact: a sample added to the surrogates is what they then predict there."""
+    problem = problem_of(load_case(two_mass_run / "case.toml"))
+    with SampleStore(two_mass_run / "samples.sqlite") as store:
+        rows = stored_designs(store, problem)[:20]
+    samples = [quantity_sample(tuple(x), row, problem.inner) for x, row in rows]
+    fitted = [
+        replace(p, hyperparameters=replace(p.hyperparameters, noise_variance=1e-2))
+        for p in fit_quantities(problem, samples[:-1], 0)
+    ]
+    for k, process in enumerate(update_quantities(problem, samples, tuple(fitted))):
+        value, span = samples[-1].values[k], float(np.ptp([s.values[k] for s in samples]))
+        assert process.predict([samples[-1].x])[0] == pytest.approx(value, abs=1e-6 * span)

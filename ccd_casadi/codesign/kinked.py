@@ -28,6 +28,7 @@ FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
 SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
 FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
+ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
 BASIN = 1e-2  # of the box: this close to an end that is known, and no lower, is its basin
 SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
@@ -85,6 +86,11 @@ def descend(
         d, mu, model = _step(here, H, radius, rho, bend)
         while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
             radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
+            d, mu, model = _step(here, H, radius, rho, bend)
+        if model <= settled * abs(here.J) and LEAST < ZOOM * np.abs(d).max() < radius:
+            # The quadratic program is solved to a share of the radius, and the merit counts what
+            # it leaves of a violation: next to an optimum that is more than is left to gain.
+            radius = ZOOM * float(np.abs(d).max())
             d, mu, model = _step(here, H, radius, rho, bend)
         rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
         if radius < LEAST or model <= settled * abs(here.J):

@@ -5,7 +5,7 @@ their exact gradients determine them; the same samples answer any S_max, S_low, 
 and λ with no new synthesis.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -148,12 +148,16 @@ def update_quantities(
     samples: list[QuantitySample],
     processes: tuple[GaussianProcess, ...],
 ) -> tuple[GaussianProcess, ...]:
-    """The same processes conditioned on more samples, hyperparameters kept."""
+    """The same processes conditioned on more samples, hyperparameters kept but for their noise.
+
+    The truth has none: what a fit to the whole box takes for noise is what its kernel cannot
+    follow there, and would be averaged away sample by sample where the rounds gather.
+    """
     lower, upper = lifted_bounds(problem)
     X = np.array([sample.x for sample in samples])
     return tuple(
         condition(
-            process.hyperparameters,
+            replace(process.hyperparameters, noise_variance=0.0, gradient_noise_variance=0.0),
             X,
             np.array([sample.values[i] for sample in samples]),
             lower=lower,

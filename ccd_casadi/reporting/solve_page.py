@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,6 +60,7 @@ from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
+from ccd_casadi.support.process_pool import Ahead, WorkerLost
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
@@ -67,6 +69,7 @@ if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.solution import Solution
     from ccd_casadi.codesign.verify import VerifiedDesign
 
+ELSEWHERE = ("theta", "trust")  # neither asks the plant: a process of its own solves none anew
 STATUS = {
     "verified": "verified",
     "not_verified": "not verified",
@@ -81,10 +84,11 @@ def write_report(
     solution: "Solution",
     *,
     quiet: bool = True,
+    helper: Ahead | None = None,
 ) -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
-    write_whole(path, report_html(folder, case, problem, solution, quiet=quiet))
+    write_whole(path, report_html(folder, case, problem, solution, quiet=quiet, helper=helper))
     write_index(folder)
     return path
 
@@ -96,8 +100,9 @@ def report_html(
     solution: "Solution",
     *,
     quiet: bool = True,
+    helper: Ahead | None = None,
 ) -> str:
-    """The report's text; the bar counts its sections."""
+    """The report's text; the bar counts its sections. A `helper` draws about half of them."""
     result = solution.result
     status = result["status"]
     # what `ccd new` makes is named by its folder
@@ -114,29 +119,60 @@ def report_html(
         warned=worst(result) is State.WARNED,
         verdict=verdict_html(result),
     )
-    parts: list[Callable[[], list[Section]]] = []
-    if solution.sections is not None:
-        parts = [lambda: sections_sections(problem, solution)]
-    if solution.verified is not None:
-        verified, truths = solution.verified, read_truths(folder / "samples.sqlite", problem)
-        stages = {"start": problem.start, "optimum": verified.theta}
-        parts = [
-            lambda: [glance(problem, verified, float(result["bandwidth_hz"]))],
-            lambda: [_design(problem, solution)],
-            lambda: [_theta(problem, solution, verified, truths)],
-            lambda: stage_sections(problem, stages),
-            lambda: _loop(problem, solution, verified),
-            lambda: budget_section(problem, verified.theta, verified.design.controller),
-            lambda: [_history(case, problem, solution, verified)],
-            lambda: _trust(solution),
-            lambda: [_sweep(problem, solution, verified, truths)],
-        ]
-    sections: list[Section] = []
+    work = (folder, case, problem, solution)
+    parts = _parts(*work)
+    drawn: dict[str, list[Section]] = {}
     with Progress(len(parts), "drawing the report", quiet) as bar:
-        for part in parts:
-            sections += part()
-            bar.advance()
+        if helper is not None:
+            helper.begin(drawn_elsewhere, work)
+        for name, part in parts.items():
+            if helper is None or name not in ELSEWHERE:
+                drawn[name] = part()
+                bar.advance()
+        if helper is not None:
+            try:
+                drawn |= helper.result()
+            except WorkerLost:  # then here
+                drawn |= drawn_elsewhere(work)
+            bar.advance(sum(name in parts for name in ELSEWHERE))
+    sections = [section for name in parts for section in drawn[name]]
     return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
+
+
+def ready() -> None:
+    """Import what drawing takes, before there is anything to draw."""
+    for module in ("matplotlib.figure", "matplotlib.backends.backend_svg"):
+        import_module(module)
+
+
+def drawn_elsewhere(
+    work: tuple[Path, Case, CoDesignProblem, "Solution"],
+) -> dict[str, list[Section]]:
+    """The sections `ELSEWHERE`, which take about half of the time."""
+    return {name: part() for name, part in _parts(*work).items() if name in ELSEWHERE}
+
+
+def _parts(
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution"
+) -> dict[str, Callable[[], list[Section]]]:
+    """What draws the sections, in their order."""
+    if solution.sections is not None:
+        return {"sections": lambda: sections_sections(problem, solution)}
+    if solution.verified is None:
+        return {}
+    verified, truths = solution.verified, read_truths(folder / "samples.sqlite", problem)
+    stages = {"start": problem.start, "optimum": verified.theta}
+    return {
+        "glance": lambda: [glance(problem, verified, float(solution.result["bandwidth_hz"]))],
+        "design": lambda: [_design(problem, solution)],
+        "theta": lambda: [_theta(problem, solution, verified, truths)],
+        "stage": lambda: stage_sections(problem, stages),
+        "loop": lambda: _loop(problem, solution, verified),
+        "budget": lambda: budget_section(problem, verified.theta, verified.design.controller),
+        "history": lambda: [_history(case, problem, solution, verified)],
+        "trust": lambda: _trust(solution),
+        "sweep": lambda: [_sweep(problem, solution, verified, truths)],
+    }
 
 
 def _reason(solution: "Solution") -> str:

@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError, one_line
 from ccd_casadi.support.process_pool import WorkerLost, usable_cores
+from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode as ExitCode
@@ -114,6 +115,7 @@ def run(
         # One BLAS thread: the matrices are small, and results must not depend on the cores.
         with (
             threadpool_limits(limits=1),
+            threads_permitted(getattr(options, "workers", 1)),
             permit_user_code(not options.no_user_code),
             ctrl_c_noticed(),
         ):

@@ -194,6 +194,52 @@ class Workers:
                 self._workers.remove(worker)
 
 
+class Ahead:
+    """A process that gets ready while this one is at work, for a task at the end of it.
+
+    It begins with `ready()`, imports as a rule. A context manager; leaving it ends the process.
+    """
+
+    def __init__(self, ready: Callable[[], object]) -> None:
+        resource_tracker.ensure_running()
+        with _interrupts_held():
+            self._worker = _Worker()
+        self._worker.send(pickle.dumps((_called, ready)))
+        self._waiting = 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with _interrupts_held():
+            self._worker.process.kill()
+            self._worker.process.join()
+            self._worker.process.close()
+            self._worker.pipe.close()
+
+    def begin(self, function: Callable[[T], object], task: T) -> None:
+        """Let it go on with this task."""
+        self._worker.send(pickle.dumps((function, task)))
+        self._waiting += 1
+
+    def result(self) -> Any:
+        """What the last task came to. Raises WorkerLost if it died, and what the task raised."""
+        value = None
+        while self._waiting:
+            answer = self._worker.answer()
+            if answer is None:
+                raise WorkerLost(f"a worker process died (exit code {self._worker.exit_code()})")
+            self._waiting -= 1
+            done, value = pickle.loads(answer)  # our own child wrote it, into its pipe
+            if not done:
+                raise value
+        return value
+
+
+def _called(function: Callable[[], object]) -> None:
+    function()
+
+
 class _Worker:
     """One spawned process and the parent's end of its pipe."""
 

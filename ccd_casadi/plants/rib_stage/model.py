@@ -17,6 +17,7 @@ from ccd_casadi.plants.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_v
 from ccd_casadi.plants.rib_stage.solver import StageError
 from ccd_casadi.plants.rib_stage.truncation import Mode, ModeCount, ModeSet, solve_modes
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.threads import side_by_side
 
 OUTPUTS = ("corners", "rigid", "modal4")
 
@@ -205,10 +206,10 @@ def _displacements(
     dK = np.zeros((count, n, n))
     u[:3], slope = rigid_values(_rigid_function(stage.geometry, points), theta)
     du[:, :3] = slope[:count]
-    for index, item in enumerate(found.spectra):
-        keep = found.kept(index)
-        if not keep:
-            continue
+
+    def fill(index: int) -> None:
+        """The rows of one group: no two write the same."""
+        item, keep = found.spectra[index], found.kept(index)
         made = [functionals(disc, image, theta, points) for image in item.group.images]
         F = np.hstack([values[:, 2] for values, _ in made])
         own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
@@ -216,7 +217,7 @@ def _displacements(
         for row, mode in own:
             u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
         if not derivatives:
-            continue
+            return
         dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
         change = slopes(disc, stage.geometry, item, keep, F, dF)
         for row, mode in own:
@@ -224,4 +225,7 @@ def _displacements(
             for column, other in own:
                 if other.image == mode.image:
                     dK[:, row, column] = change.dK[:, mode.place, other.place]
+
+    kept = [index for index in range(len(found.spectra)) if found.kept(index)]
+    side_by_side(fill, kept[::-1])  # the last one, of the tilts, takes longest
     return u, du, dK

@@ -103,11 +103,18 @@ def functionals(
 
 
 def spectrum(
-    disc: Discretisation, geometry: Geometry, theta: Array, group: Group, count: int
+    disc: Discretisation,
+    geometry: Geometry,
+    theta: Array,
+    group: Group,
+    count: int,
+    boxes: tuple[Array, Array] | None = None,
 ) -> Spectrum:
-    """The `count` lowest flexible modes of a group, signed by `sign_functional`."""
-    assembler = disc.assembler
-    stiff, body = assembler.box_matrices(theta, SHIFT)
+    """The `count` lowest flexible modes of a group, signed by `sign_functional`.
+
+    `boxes`: `Assembler.box_matrices` at θ and SHIFT, which all groups share, where they are known.
+    """
+    stiff, body = disc.assembler.box_matrices(theta, SHIFT) if boxes is None else boxes
     names = [SA.name if s is AS else s.name for s in group.solved]
     made = {
         name: (disc.sectors[name].stiffness.fill(stiff), disc.sectors[name].mass.fill(body))

@@ -7,6 +7,7 @@ import numpy as np
 from ccd_casadi.plants.rib_stage.geometry import Geometry, has_square_symmetry
 from ccd_casadi.plants.rib_stage.modes import (
     EXTRA,
+    SHIFT,
     SQUARE_GROUPS,
     WHOLE,
     Discretisation,
@@ -15,6 +16,7 @@ from ccd_casadi.plants.rib_stage.modes import (
     spectrum,
 )
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.threads import side_by_side
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,14 @@ def solve_modes(
             number = max(count.total // 2, 1)  # no symmetry has more than half of the lowest
         if number:
             wanted[group] = number
-    spectra = tuple(
-        spectrum(disc, geometry, theta, group, number + EXTRA) for group, number in wanted.items()
-    )
+    boxes = disc.assembler.box_matrices(theta, SHIFT)
+
+    def solved(group: Group) -> Spectrum:
+        return spectrum(disc, geometry, theta, group, wanted[group] + EXTRA, boxes)
+
+    largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
+    found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
+    spectra = tuple(found[group] for group in wanted)
     flexible = [
         _mode(item, index, place, image)
         for index, (item, number) in enumerate(zip(spectra, wanted.values(), strict=True))
