@@ -31,21 +31,29 @@ def resonances(problem: Problem) -> Array:
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
-    Notches come narrow and wide, and shifted to either side.
+    Notches come narrow and wide, and shifted to either side; of several biquads the last one is a
+    filter at the crossover too.
     """
-    tops = resonances(problem)
+    tops, count = resonances(problem), problem.structure.biquads
+    shapes = [(0.5, 1.0, 0.0), (1.0, 1.0, 0.0), (0.5, 0.8, 0.0), (0.5, 1.25, 0.0)]
+    if count > 1:
+        shapes += [(1.0, 1.0, 0.7), (1.0, 1.0, 1.0)]
     found = []
     for crossover in crossovers:
-        for width, below in ((0.5, 1.0), (1.0, 1.0), (0.5, 0.8), (0.5, 1.25)):
+        for width, below, filtered in shapes:
             values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)
-            for i in range(problem.structure.biquads):
+            for i in range(count):
                 notch = tops[i % len(tops)] if len(tops) else 4.0 * crossover
                 values[f"biquad {i + 1} zeros"] = notch * below ** (1 + i // max(len(tops), 1))
                 values[f"biquad {i + 1} zeros damping"] = 0.1
                 values[f"biquad {i + 1} poles"] = notch * below
                 values[f"biquad {i + 1} poles damping"] = width
+            if filtered:  # the last one lifts |L| just below the crossover, where S rises
+                values[f"biquad {count} zeros"] = 1.02 * filtered * crossover
+                values[f"biquad {count} poles"] = filtered * crossover
+                values[f"biquad {count} poles damping"] = 0.07
             found.append(_kappa(problem, values))
-    return with_crossover(problem, np.array(found), np.repeat(crossovers, 4))
+    return with_crossover(problem, np.array(found), np.repeat(crossovers, len(shapes)))
 
 
 def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:

@@ -1,0 +1,41 @@
+"""Some random problems of benchmarks/random_sections.py, those that found faults among them."""
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def study():
+    path = Path(__file__).parents[1] / "benchmarks" / "random_sections.py"
+    spec = importlib.util.spec_from_file_location("random_sections", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["random_sections"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["random_sections"]
+
+
+# 36 and 103 had levels proven that were passed, 1447 a design certified that was refuted
+@pytest.mark.parametrize("seed", [3, 21, 36, 103, 1447])
+def test_what_is_certified_and_proven_holds_for_another_judge(study, seed: int) -> None:
+    row = study.solved(seed)
+    assert "wrong" not in row
+    assert row["certified"]
+    assert row["proof"] in ("PROVEN", "LOOSER", "OPEN")
+
+
+def test_the_judge_refutes_what_does_not_hold(study) -> None:
+    """A tighter bound, a bandwidth twice as high, and a state space that is not κ's."""
+    asked, design = study.climbed(study.case(21), 21)
+    nominal = asked.uncertain.nominal
+    assert max(study.figures(asked, nominal, design).values()) <= 1.0 + 2e-5
+    tighter = replace(asked, bounds=replace(asked.bounds, S_max=1.0 + 1e-3))
+    assert max(study.figures(tighter, nominal, design).values()) > 1.0
+    faster = replace(design, bandwidth=2.0 * design.bandwidth)
+    assert study.figures(asked, nominal, faster)["SHAPE"] > 1.0
+    other = replace(design, kappa=design.kappa + 0.1)
+    assert "STATE_SPACE" in study.figures(asked, nominal, other)
