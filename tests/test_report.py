@@ -18,7 +18,10 @@ from ccd_casadi.cases.case import Case, load_case, problem_of
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.run import co_design, formulation_of
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+from ccd_casadi.deployment.channels import split
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.bode import figure_bode
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
 from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
@@ -27,6 +30,7 @@ from ccd_casadi.reporting.solve_page import report_html, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Ahead, Workers
+from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
@@ -287,10 +291,17 @@ def test_a_helper_draws_the_same_report_and_may_die(lost: bool) -> None:
     assert minute.sub("", helped) == minute.sub("", alone)
 
 
-def test_mimo_shows_singular_values_without_phase() -> None:
-    text = run("mimo")[4]
-    assert "plant σ(G) (m/N)" in text
-    assert "phase of G" not in text
+def test_mimo_shows_its_channels_or_all_singular_values() -> None:
+    problem = run("mimo")[2]
+    K = StateSpace(-100.0 * np.eye(2), np.eye(2), 1e5 * np.eye(2), np.zeros((2, 2)))
+    for theta, apart in (((0.5, 0.5), True), ((0.9, 1.3), False)):  # masses 10, 4, 10 kg or not
+        plant = scaled_plant(problem, theta)
+        weights = problem.weights.at(HZ * 50.0, HZ * 100.0)
+        loop = loop_data(plant, K, weights, gamma=1.0, bandwidth_hz=50.0, omega_low=HZ)
+        text = figure_bode(loop, split(plant, K))
+        assert ("channel 1, outputs +" in text) == apart
+        assert ("phase of G" in text) == apart
+        assert ("plant σ(G) (m/N)" in text) != apart
 
 
 def test_paper_frequencies_are_marked() -> None:

@@ -325,7 +325,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
 
     The case in it names the design plant that was found best, so that what works on the run does.
     """
-    for name in ("result.json", "controller.json", "surrogate.json", "report.html"):
+    for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)
     text = case_to_toml(resolved(case, solution))
     write_whole(folder / "case.toml", text)  # a kill must not leave half a case to resume from
