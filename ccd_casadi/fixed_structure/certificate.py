@@ -361,8 +361,8 @@ def _bandwidth(
         points, peaks, i = _zoomed(lambda x: table.at(x.ravel())["S"].reshape(x.shape),
                                    grid[inner - 1], grid[inner + 1])  # fmt: skip
         grid = np.concatenate([grid, points[np.arange(len(i)), i]])
-        grid, first = np.unique(grid, return_index=True)
-        S = np.concatenate([S, peaks])[first]
+        grid, order = np.unique(grid, return_index=True)
+        S = np.concatenate([S, peaks])[order]
     above = np.flatnonzero(S > HALF_POWER)
     if S[0] > HALF_POWER or not len(above):
         return np.nan, 0.0
