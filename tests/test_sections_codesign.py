@@ -99,20 +99,6 @@ def test_three_formulations_agree_and_a_resumed_run_is_the_same(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_three_formulations_agree_beyond_a_pid(tmp_path: Path) -> None:
-    """With a notch on three plants, sampled, to the verdict's tolerance."""
-    sections = replace(PID, structure=Structure(biquads=1, least_damping=0.05),
-                       sampling=Sampling(10000.0, 100.0))  # fmt: skip
-    case = replace(quick(sections), lower=(58.0, 58.0), upper=(62.0, 62.0))
-    kinds = (Lifted(points=4), Nested(plan="sobol", points=6), Direct(starts=1))
-    found = [solve(case, kind, store=tmp_path / "samples.sqlite").result for kind in kinds]
-    for result in found:
-        assert result["status"] == "verified", result["reason"]
-        assert result["objective"] == pytest.approx(found[0]["objective"], rel=1e-3)
-        assert result["proof"]["outcome"] == "proven"
-
-
-@pytest.mark.slow
 def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) -> None:
     """The judge on two hundred plants between and beside those that were designed for."""
     theta = anchored.start
