@@ -192,10 +192,15 @@ def test_sections_multiply_to_the_controller(
             found.append(-HZ * 10.0 ** rng.uniform(-1, 3) * rng.choice([1.0, 1.0, -1.0]))
         return found
 
-    K = system(roots(pole_pairs, pole_reals), roots(zero_pairs, zero_reals), 1e3)
+    poles, zeros = roots(pole_pairs, pole_reals), roots(zero_pairs, zero_reals)
+    K = system(poles, zeros, 1e3)
     found = sections_of(K, HZ * 50.0)
     omega = HZ * np.geomspace(0.1, 5e3, 80)
-    np.testing.assert_allclose(found.response(omega), response(K, omega), rtol=1e-5)
+    s = 1j * omega
+    exact = 1e3 * np.prod([s - z for z in zeros], axis=0) / np.prod([s - p for p in poles], axis=0)
+    # poles decades above the zeros: the matrices themselves may hold K to 3e-4 only
+    lost = float(np.abs(response(K, omega) / exact - 1.0).max())
+    np.testing.assert_allclose(found.response(omega), exact, rtol=1e-5 + 5.0 * lost)
     kept = sum((s.zero is not None) * (1 + (s.zero.damping is not None)) for s in found.sections
                if s.zero)  # fmt: skip
     assert kept == 2 * zero_pairs + zero_reals

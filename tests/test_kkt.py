@@ -1,20 +1,15 @@
 """The KKT certificate of the true problem: small at the optimum, large elsewhere."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.direct import STATIONARY
-from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
 from ccd_casadi.codesign.outer_problem import (
     OuterSolution,
     active_bounds,
-    lifted_bounds,
     lifted_program,
     solve_program,
 )
@@ -91,21 +86,6 @@ def test_optimum_inside_the_box_has_a_positive_reduced_hessian(
     assert set(certificate.active) == active
     assert certificate.second_order is not None
     assert 0.0 < certificate.second_order < np.inf
-
-
-def test_beside_an_optimum_a_descent_takes_few_designs(tmp_path: Path) -> None:
-    """Steps that are left there are below what the quadratic program resolves of its radius."""
-    file = tmp_path / "plant.py"
-    file.write_text(MODEL)
-    case = problem(source=PlantSource(None, str(file), "model", (("least", 100.0),)), w1=10.0)
-    solution, _ = solved(case, point(61.0, 63.0, 1700.0, 60.0))
-    lower, upper = lifted_bounds(case)
-    optimum = descend(case, TrueQuantities(case), solution.best.x, steps=80, settled=1e-13)
-    beside = optimum + 1e-6 * (upper - lower) * np.array([1.0, 1.0, -1.0, 0.0])
-    quantities = TrueQuantities(case)
-    end = descend(case, quantities, beside, steps=80, settled=1e-13)
-    assert len(quantities.designs) <= 12
-    assert kkt_certificate(case, end, quantities.at(end)).stationarity <= STATIONARY
 
 
 @few(max_examples=8)

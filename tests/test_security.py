@@ -8,6 +8,7 @@ import json
 import os
 import pickle
 import py_compile
+import re
 import shutil
 import subprocess
 import sys
@@ -40,6 +41,7 @@ LIVE = {
 PROCESSES = {
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
     ("ccd_casadi/explorer/background.py", "subprocess.Popen"),
+    ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
 }
 BY_NAME = {
     "ccd_casadi/support/optional_packages.py",
@@ -343,7 +345,9 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         for key, value in attrs:
-            if key.startswith("on") or (key in ("src", "href") and not str(value).startswith("#")):
+            beside = tag == "a" and re.fullmatch(r"(\.\./)?[\w/]+\.html", str(value))
+            inside = str(value).startswith("#") or beside
+            if key.startswith("on") or (key in ("src", "href") and not inside):
                 self.active.append(f"{tag} {key}={value}")
         if tag in ("script", "img", "iframe", "object", "link", "embed", "form", "base"):
             self.active.append(tag)

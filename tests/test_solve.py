@@ -165,7 +165,7 @@ def test_a_run_without_a_report_has_everything_else(
     before = {path.name for path in folder.iterdir()}
     assert "report.html" in before
     assert run(folder, "--no-report") == 0
-    assert {path.name for path in folder.iterdir()} == before - {"report.html"}
+    assert {path.name for path in folder.iterdir()} == before - {"report.html", "index.html"}
 
 
 def test_a_second_run_reuses_every_sample(

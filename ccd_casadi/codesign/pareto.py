@@ -184,7 +184,10 @@ def _solve_again(
     result: dict[int, FrontPoint],
     tolerance: float,
 ) -> None:
-    """Point k from a lighter and faster one: kept where the truth is faster than before."""
+    """Point k from a lighter and faster one: kept where the truth is faster than before.
+
+    A design that was not predicted takes no verified one's place for less than the `tolerance`.
+    """
     problem = sampler.problem
     start = np.array([*faster.theta, np.log(faster.omega_S), np.log(faster.omega_T)])
     try:
@@ -194,7 +197,10 @@ def _solve_again(
     sample = sampler.bandwidths(x[:-2], "from a lighter point")[0]
     if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
         promised = float(processes[0].predict(x[None, :])[0])
-        result[k] = front_point(problem, sample, promised, tolerance)
+        new, old = front_point(problem, sample, promised, tolerance), result[k]
+        gained = not new.bandwidth <= (1.0 + tolerance) * old.bandwidth
+        if new.verified or gained or not old.verified:
+            result[k] = new
 
 
 def _program(problem: CoDesignProblem, processes: tuple[GaussianProcess, ...]) -> NonlinearProgram:
