@@ -10,4 +10,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """The page with its formulas; an error of LaTeX ends the build."""
     from latex2mathml.converter import convert  # of the site alone
 
-    return BLOCK.sub(lambda m: f"<div>{convert(m[1].strip(), display='block')}</div>", markdown)
+    def block(found: re.Match[str]) -> str:
+        return f'<div style="margin: 1em 0">{convert(found[1].strip(), display="block")}</div>'
+
+    return BLOCK.sub(block, markdown)

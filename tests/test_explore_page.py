@@ -72,6 +72,8 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     page.get_by_text("certified, keeps its bounds").wait_for()
     page.get_by_role("button", name="Save as case").click()
     page.get_by_text("explored_1.toml").wait_for()
+    page.reload()  # a second document of the same session
+    page.wait_for_function(f"window.{READY}")
     assert not heard
     started.send_signal(signal.SIGKILL)
     page.get_by_role("alert").wait_for(state="visible")

@@ -25,10 +25,8 @@ PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
 DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.REFUSED: [6]}
 PADDING = 0.1  # of the data, that an axis reaches beyond them
 # After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
-FOLLOW = CustomJS(
-    code="""for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
+FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
   range.have_updated_interactively = false"""
-)
 
 Change = tuple[Any, dict[str, Any]]  # a model, and new values of its properties
 
@@ -87,7 +85,7 @@ class Figures:
             min_border_left=58, tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above",
             **options,
         )  # fmt: skip
-        made.js_on_event(Reset, FOLLOW)
+        made.js_on_event(Reset, CustomJS(code=FOLLOW))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:

@@ -47,7 +47,8 @@ def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bod
         return figure_lines([top], key=key, title=title, heights=(3.4,))
     several = len(parts) > 1  # whose resonances are not marked: the words would meet
     marks = () if several else tuple(_marks(loop, G))
-    sizes, phases = [], []
+    sizes: list[Panel] = []
+    phases: list[Panel] = []
     for k, (name, unit) in enumerate((("G", "m/N"), ("K", "N/m"), ("L", "–"))):
         values = {channel: part[k] for channel, part in parts.items()}
         more: dict[str, Any] = {"levels": at} if k == 1 else {}
@@ -55,10 +56,12 @@ def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bod
             more = {"marks": marks} | ({} if several else {"y_range": gap})
         if k == 2:
             more = {"levels": (Level(1.0, "1"),)}
+        if sizes:
+            more["legend"] = None  # the colours are those of G
         size = {channel: np.abs(v) for channel, v in values.items()}
         sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **more))
         angle = {channel: _phase(v) for channel, v in values.items()}
-        phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0))
+        phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0, legend=None))
     return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
 
 
@@ -99,12 +102,17 @@ def _marks(loop: Loop, gains: Array) -> list[Mark]:
     return found
 
 
-def caption_bode(loop: Loop) -> str:
+def caption_bode(loop: Loop, channels: Sequence[Channel] = ()) -> str:
     """What to see in the Bode plot of one design."""
     scalar = loop.plant.shape[1:] == (1, 1)
-    what = "" if scalar else "All singular values of plant and controller. "
+    what = "" if scalar else (
+        "Every channel by itself; the signs are those of the outputs that it moves together. "
+        if len(channels) > 1
+        else "All singular values of plant and controller. "
+    )  # fmt: skip
     poles, zeros = (_list(p) for p in (loop.resonances_hz, loop.antiresonances_hz))
-    words = f"{what}Resonances (▲) of the plant: {poles}; anti-resonances (▼): {zeros}."
+    up, down = (" (▲)", " (▼)") if len(channels) < 2 else ("", "")
+    words = f"{what}Resonances{up} of the plant: {poles}; anti-resonances{down}: {zeros}."
     gain = float(np.linalg.norm(loop.controller[0], 2))
     K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
     i = int(K.argmax())

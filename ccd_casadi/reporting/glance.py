@@ -52,8 +52,8 @@ def glance(problem: CoDesignProblem, verified: "VerifiedDesign", bandwidth_hz: f
     words = (
         f"The machine at this design. S stays out of the shaded area: its peak, {number(peak, 4)}, "
         f"is {100.0 * peak / inner.S_max:.4g} % of S_max, so that "
-        f"{'L = GK' if L.shape[1] == 1 else 'every return difference'} keeps at least "
-        f"{number(1.0 / peak, 3)} from -1 (Nyquist plot)."
+        f"{'L' if L.shape[1] == 1 else 'every eigenvalue of L'} keeps at least "
+        f"{number(1.0 / peak, 3)} from -1."
     )
     if L.shape[1:] == (1, 1):
 
@@ -94,10 +94,8 @@ def glance_of_sections(
     if moves is not None:
         panels, told, table = moves
         rows.append([nyquist_panel(list(loops.L), S_max, HEIGHT), panels[-1]])
-        words += (
-            f", that is, L = GK keeps at least {number(1.0 / S_max, 3)} from -1 (Nyquist plot). "
-            f"{told}"
-        )
+        far = number(1.0 / S_max, 3)
+        words += f": in the Nyquist plot L = GK keeps at least {far} from -1. {told}"
         tables.append(table)
     else:
         words += "."

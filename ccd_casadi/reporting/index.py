@@ -4,6 +4,7 @@ import json
 import re
 from html import unescape
 from pathlib import Path
+from urllib.parse import quote
 
 from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.page import INDEX, Section, Table, escape, header, page, table_html
@@ -41,7 +42,7 @@ def write_index(folder: Path) -> None:
     except (OSError, ValueError, KeyError):
         return
     items = "\n".join(
-        f'<li><a href="{escape(place.relative_to(folder).as_posix())}">{escape(_title(place))}</a>'
+        f'<li><a href="{quote(place.relative_to(folder).as_posix())}">{escape(_title(place))}</a>'
         f": {escape(words)}</li>"
         for name, words in PAGES.items()
         for place in sorted(folder.glob(name))

@@ -92,7 +92,7 @@ class Panel:
     y_range: tuple[float, float] | None = None
     whole_x: bool = False
     y_step: float | None = None
-    legend: Corner = "best"
+    legend: Corner | None = "best"
     title: str = ""
     forbidden: tuple[tuple[np.ndarray, str], ...] = ()  # corners x + iy of an area, its colour
 
@@ -187,7 +187,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    if any(curve.label for curve in panel.curves) or any(band.label for band in panel.bands):
+    labelled = any([*(c.label for c in panel.curves), *(b.label for b in panel.bands)])
+    if labelled and panel.legend is not None:
         axes.legend(loc=panel.legend)
 
 

@@ -204,7 +204,8 @@ def figure_html(svg: str, caption: str, table: Table, *more: Table) -> str:
     """A figure with its caption (plain text) and the numbers behind it, folded away."""
     tables = "\n".join(table_html(item) for item in (table, *more))
     return (
-        f'<figure>\n<div class="drawing">{svg}</div>\n<figcaption>{escape(caption)}</figcaption>\n'
+        f'<figure>\n<div class="drawing">{svg}</div>\n'
+        f"<figcaption>{escape(typeset(caption))}</figcaption>\n"
         f'<details><summary>Data of this figure</summary><div class="scroll">\n{tables}\n'
         "</div></details>\n</figure>"
     )

@@ -253,7 +253,7 @@ def _loop(
     )
     limits = "\n".join(paragraph(words) for words in limit_sentences(loop))
     channels = split(scaled_plant(problem, verified.theta), verified.design.controller)
-    bode = figure_html(figure_bode(loop, channels), caption_bode(loop), table_bode(loop))
+    bode = figure_html(figure_bode(loop, channels), caption_bode(loop, channels), table_bode(loop))
     return [
         Section("Closed loop: S, KS and T against their bounds", gains),
         Section("What limits the bandwidth", limits + table_html(table_limits(loop))),

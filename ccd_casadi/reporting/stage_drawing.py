@@ -10,6 +10,7 @@ from ccd_casadi.reporting.svg import BLACK, LONGEST_LABEL
 
 WIDTH = 960.0  # of the drawing; a page column shows a unit as about a pixel
 TALLER = 3.0  # heights in the cut against lengths
+INK = f"var(--ink, {BLACK})"  # of the page's theme, where it has one
 RIB, PLATE, CUT, EDGE = "#86a5b8", "#eff3f6", "#4d7189", "#3c4a54"
 TEXT = 12.5
 LEFT, RIGHT, ABOVE = 24.0, 120.0, 84.0  # room around a plan
@@ -88,7 +89,7 @@ class _Drawing:
         for point in self.geometry.point_masses:
             where = f'cx="{self.x(1e3 * point.x):.2f}" cy="{self.y(1e3 * point.y):.2f}"'
             parts.append(
-                f'<circle {where} r="6" fill="none" stroke="{BLACK}" stroke-dasharray="3 2"/>'
+                f'<circle {where} r="6" fill="none" stroke="{INK}" stroke-dasharray="3 2"/>'
             )
         # in two rows, t_i in the lower: neither words nor lines of neighbours meet in the box of θ
         parts.append(self._width("t_o", -a, -a + t_o, self.top - 34.0, "start"))
@@ -163,7 +164,7 @@ class _Drawing:
     def _line(self, x0: float, y0: float, x1: float, y1: float, dashed: bool = False) -> str:
         dashes = ' stroke-dasharray="7 3 2 3"' if dashed else ""
         return (
-            f'<path d="M{x0:.2f} {y0:.2f}L{x1:.2f} {y1:.2f}" stroke="{BLACK}" '
+            f'<path d="M{x0:.2f} {y0:.2f}L{x1:.2f} {y1:.2f}" stroke="{INK}" '
             f'stroke-width=".7" fill="none"{dashes}/>'
         )
 
@@ -172,5 +173,5 @@ class _Drawing:
         bx, by, wide = x - ARROW * dx, y - ARROW * dy, 0.32 * ARROW
         return (
             f'<path d="M{x:.2f} {y:.2f}L{bx - wide * dy:.2f} {by + wide * dx:.2f}'
-            f'L{bx + wide * dy:.2f} {by - wide * dx:.2f}Z" fill="{BLACK}"/>'
+            f'L{bx + wide * dy:.2f} {by - wide * dx:.2f}Z" fill="{INK}"/>'
         )
