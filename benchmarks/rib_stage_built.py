@@ -1,9 +1,10 @@
 """The rib stage's controller on random plants inside its set, sampled with hold and delay.
 
-    python benchmarks/rib_stage_built.py FOLDER [--plants N] [--seed N] [--write]
+    python benchmarks/rib_stage_built.py [FOLDER] [--plants N] [--seed N] [--write]
 
 FOLDER holds controller.json of runs/rib_stage_built.toml (`solve`, or `inner --out`), and
-result.json or inner.json (what `inner` printed) for θ. Each group of 25 plants is one
+result.json or inner.json (what `inner` printed) for θ; by default the design of docs/rib_stage.md,
+which lies in benchmarks/rib_stage_design. Each group of 25 plants is one
 finite-element model: a payload of up to 50 g on one of the centre ribs, up to 30 mm off centre to
 any side, ten or twenty modes, the shipped mesh (every fourth group: no payload, the finer mesh);
 within it every flexible mode is shifted on its own within ±2 % and the damping factor lies between
@@ -36,6 +37,7 @@ from ccd_casadi.plants.rib_stage.plant import NAMES, rib_stage
 from ccd_casadi.plants.scaling import StateSpace
 
 RESULTS = Path(__file__).with_suffix(".json")
+DESIGN = Path(__file__).parent / "rib_stage_design"
 HZ = 2.0 * np.pi
 RATE, DELAY = 12500.0, 80e-6
 S_MAX, M_K = 1.5636, 4.5e4
@@ -77,7 +79,7 @@ def plants(
     for _ in range(GROUP):
         point = box.box[0] + rng.random(len(box.names)) * (box.box[1] - box.box[0])
         point[-1] = 2.0 ** rng.uniform(-1.0, 1.0)
-        found.append((box.plant(point).plant_si(), options | {"point": point.tolist()}))
+        found.append((box.plant(point).plant_si(), options))
     return found
 
 
@@ -97,7 +99,7 @@ def judged(
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    arguments.add_argument("folder", type=Path)
+    arguments.add_argument("folder", type=Path, nargs="?", default=DESIGN)
     arguments.add_argument("--plants", type=int, default=500)
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--anywhere", action="store_true")
@@ -130,7 +132,7 @@ def main() -> None:
                 "anywhere": options.anywhere,
                 "rows": rows,
             }
-            RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
+            RESULTS.write_text(json.dumps(kept) + "\n")
     if measured is not None:
         print(f"worst of those run now, sample by sample: peak {measured.sensitivity_peak:.4f}")
 

@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -51,6 +52,8 @@ def command(options: argparse.Namespace) -> ExitCode:
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": cost,
     }
+    if problem.sections is None and options.begin_at is not None:
+        raise CaseError(f'{case.path}: --begin-at is for structure = "sections"; leave it out')
     if problem.sections is not None:
         from ccd_casadi.support.process_pool import Workers
 
@@ -161,6 +164,7 @@ def _sections(
     """A full race of a fixed structure at θ, worst plants added, judge and proof over the box."""
     import numpy as np
 
+    from ccd_casadi.cases.run_folder import sections_kappa
     from ccd_casadi.codesign.budget_result import budget_entry
     from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_result import (
@@ -174,6 +178,7 @@ def _sections(
         prepared,
         proof_of,
         sections_of_problem,
+        structure_of,
         too_slow,
         with_range,
         worst_members,
@@ -183,7 +188,10 @@ def _sections(
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)
     tell = None if options.quiet else lambda words: print(words, file=sys.stderr, flush=True)
-    asked, made = prepared(asked, tell, workers)
+    if options.begin_at is not None:
+        anchors = (sections_kappa(options.begin_at, structure_of(asked)),)
+        asked = replace(asked, sections=replace(sections_of_problem(asked), anchors=anchors))
+    asked, made = prepared(asked, tell, workers, options.begin_at is not None)
     if not made.certified:
         answer = head | {"status": "infeasible", "reason": made.words, "syntheses": 1}
         _print(answer, (), options, began)
@@ -307,6 +315,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     arguments.add_argument(
         "--theta", metavar="m1=60,m2=60", help="the hardware; a measured plant has none"
+    )
+    arguments.add_argument(
+        "--begin-at",
+        metavar="FOLDER",
+        type=Path,
+        help="sections: search from the controller.json of a run alone, not from a race",
     )
     for name in ("S", "T"):
         arguments.add_argument(

@@ -15,6 +15,7 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.sections import Case
+from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import judged_corners, structure_of, with_range
@@ -182,6 +183,17 @@ def with_function(
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
     found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=of_error)
     return with_range(replace(problem, sections=found))
+
+
+def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
+    """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
+    path = folder / "controller.json"
+    found = read_json(path).get("sections")
+    kappa = found.get("kappa") if isinstance(found, Mapping) else None
+    if not isinstance(kappa, list) or len(kappa) != len(structure.names):
+        words = f"sections.kappa: has no {len(structure.names)} parameters, which the case has"
+        raise UserError(f"{path}: {words}; name a run of this case")
+    return tuple(map(float, kappa))
 
 
 def _with_directions(

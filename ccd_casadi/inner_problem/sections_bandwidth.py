@@ -239,13 +239,14 @@ def race(
     theta: Sequence[float],
     progress: Progress | None = None,
     workers: Pool | None = None,
+    only_anchors: bool = False,
 ) -> SectionsDesign:
-    """A full race at θ: the problem's starts, and its anchors beside them."""
+    """A full race at θ: the problem's starts, and its anchors beside them or alone."""
     sections = sections_of_problem(problem)
     return synthesise(
         plants_of(problem, theta), structure_of(problem), bounds_of(problem),
         sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
-        initial=[np.array(kappa) for kappa in sections.anchors],
+        initial=[np.array(kappa) for kappa in sections.anchors], only_initial=only_anchors,
         frequencies=sections.frequencies, progress=progress, workers=workers,
     )  # fmt: skip
 
@@ -274,24 +275,27 @@ def prepared(
     problem: CoDesignProblem,
     progress: Progress | None = None,
     workers: Pool | None = None,
+    only_anchors: bool = False,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     """The problem with anchors and members: a full race at its start θ, worst plants added.
 
-    The design is the race's last; where it is not certified the problem has no anchors, and each
-    θ is raced on its own. All of it is of the largest bandwidth, whatever the problem minimises.
+    With `only_anchors` the anchors that it has alone are where searches start. The design is the
+    race's last; where it is not certified the problem has no anchors, and each θ is raced on its
+    own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
     asked = sections_of_problem(problem).minimise
-    found, made = _prepared(with_range(_with(problem, minimise="bandwidth")), progress, workers)
+    asked_for = with_range(_with(problem, minimise="bandwidth"))
+    found, made = _prepared(asked_for, progress, workers, only_anchors)
     return _with(found, minimise=asked), made
 
 
 def _prepared(
-    problem: CoDesignProblem, progress: Progress | None, workers: Pool | None
+    problem: CoDesignProblem, progress: Progress | None, workers: Pool | None, only_anchors: bool
 ) -> tuple[CoDesignProblem, SectionsDesign]:
     uncertain = uncertain_plant(problem, problem.start)
     members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
     problem = _with(problem, members=members)
-    made = race(problem, problem.start, progress, workers)
+    made = race(problem, problem.start, progress, workers, only_anchors)
     if not made.certified:
         return problem, made
     anchors = _anchors(made)

@@ -37,7 +37,7 @@ def warm_starts(
         own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array
     ) -> Array:
         found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
-        both = [kappa, _moved(own, before, set_of[0], kappa)]
+        both = [kappa, moved(own, before, set_of[0], kappa)]
         merits = [
             started(found, np.clip(in_problem_units(found, one), *found.box)).merit()
             for one in both
@@ -56,7 +56,7 @@ def warm_starts(
     return warm
 
 
-def _moved(structure: Structure, first: ScaledPlant, here: ScaledPlant, kappa: Array) -> Array:
+def moved(structure: Structure, first: ScaledPlant, here: ScaledPlant, kappa: Array) -> Array:
     """κ in SI of a SISO plant for another one like it."""
     frequency = _first_mode(here) / _first_mode(first)
     crossover = 0.1 * first.omega_0
