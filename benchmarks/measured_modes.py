@@ -47,11 +47,12 @@ def measured(seed: int, noise: float = 0.01) -> MeasuredResponse:
     return MeasuredResponse(LINES, G * (1.0 + noise * (parts[0] + 1j * parts[1])))
 
 
-def designed(response: MeasuredResponse, initial: list[np.ndarray], starts: int) -> tuple:
-    """A design on a few of the set and on those that broke a bound, and the judge's word on all."""
+def designed(
+    response: MeasuredResponse, initial: list[np.ndarray], starts: int, members: list[int]
+) -> tuple:
+    """A design on `members` of the set, and the judge's word on all; those that break a bound join."""
     plants = fit_modes(response).set_of_plants()
     scaled = [ccd.plant_from_control(plant, M_K) for plant in plants]
-    members = list(range(FEW))
     for _ in range(ROUNDS):
         design = ccd.synthesise_sections(
             [plants[i] for i in members], STRUCTURE, BOUNDS, sampling=SAMPLING, M_K=M_K,
@@ -77,9 +78,9 @@ def main() -> None:
     draws = arguments.parse_args().draws
     truth = [ccd.plant_from_control(true_plant(), M_K)]
     kappa: list[np.ndarray] = []
-    held, hz, excess = 0, [], []
+    held, hz, excess, members = 0, [], [], list(range(FEW))
     for seed in range(draws):
-        design, on_set = designed(measured(seed), kappa, 1 if kappa else 4)
+        design, on_set = designed(measured(seed), kappa, 1 if kappa else 4, members)
         if on_set is None:
             print(f"draw {seed}: {design.words}")
             continue
