@@ -50,12 +50,12 @@ def measured(seed: int, noise: float = 0.01) -> MeasuredResponse:
 def designed(
     response: MeasuredResponse, initial: list[np.ndarray], starts: int, members: list[int]
 ) -> tuple:
-    """A design on `members` of the set, and the judge's word on all; those that break a bound join."""
+    """A design on `members` of the set, and the judge's word on all; those that break one join."""
     plants = fit_modes(response).set_of_plants()
     scaled = [ccd.plant_from_control(plant, M_K) for plant in plants]
     for _ in range(ROUNDS):
         design = ccd.synthesise_sections(
-            [plants[i] for i in members], STRUCTURE, BOUNDS, sampling=SAMPLING, M_K=M_K,
+            [plants[i] for i in members if i < len(plants)], STRUCTURE, BOUNDS, sampling=SAMPLING, M_K=M_K,
             starts=starts, initial=initial,
         )  # fmt: skip
         if not design.certified:
