@@ -55,8 +55,8 @@ def designed(
     scaled = [ccd.plant_from_control(plant, M_K) for plant in plants]
     for _ in range(ROUNDS):
         design = ccd.synthesise_sections(
-            [plants[i] for i in members if i < len(plants)], STRUCTURE, BOUNDS, sampling=SAMPLING, M_K=M_K,
-            starts=starts, initial=initial,
+            [plants[i] for i in members if i < len(plants)], STRUCTURE, BOUNDS,
+            sampling=SAMPLING, M_K=M_K, starts=starts, initial=initial,
         )  # fmt: skip
         if not design.certified:
             return design, None
