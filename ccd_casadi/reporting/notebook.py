@@ -11,6 +11,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
@@ -155,6 +156,17 @@ def _(item: SectionsDesign) -> str:
         parts.append(facts_html([("Bandwidth ω_b", hz, "on every plant")]))
         parts.append(controller_html({"controller": sections_dict(item.structure, item.kappa)}))
     return _cell(*parts)
+
+
+@html_of.register
+def _(item: ModalFit) -> str:
+    n, off = len(item.hz), 100.0 * item.deviations
+    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains, off[2 * n :],
+               strict=False)  # fmt: skip
+    head = ("Hz", "± %", "damping ratio", "± %", "gain 1/kg", "± %")
+    words = f"{item.lines} lines; what is not fitted is {100.0 * item.noise:.3g} % of |G|."
+    table = table_html(Table(head, tuple(tuple(map(float, row)) for row in rows)))
+    return _cell(f"<h1>{n} modes of a measured response</h1>", table, paragraph(words))
 
 
 def _result_head(result: Mapping[str, Any]) -> str:
