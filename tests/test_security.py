@@ -38,8 +38,9 @@ LIVE = {
     "ccd_casadi/support/deadline.py",
 }
 # They import by names that sources spell out: optional packages, what a command needs, names.
-# Processes of this Python with a module of the package.
+# Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {
+    ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
     ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
     ("ccd_casadi/explorer/background.py", "subprocess.Popen"),
 }
