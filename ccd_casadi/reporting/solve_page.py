@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -141,8 +140,8 @@ def report_html(
 
 def ready() -> None:
     """Import what drawing takes, before there is anything to draw."""
-    for module in ("matplotlib.figure", "matplotlib.backends.backend_svg"):
-        import_module(module)
+    import matplotlib.backends.backend_svg
+    import matplotlib.figure  # noqa: F401
 
 
 def drawn_elsewhere(
