@@ -22,7 +22,6 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
 
 
-@pytest.mark.slow
 def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> None:
     found = []
     for name, pool in (("serial", Workers(1)), ("dask", Cluster(shared.address))):
@@ -36,6 +35,7 @@ def test_rows_are_those_of_the_serial_run(shared: Processes, tmp_path: Path) -> 
     assert len(found[0][3]["samples"]) > 50
 
 
+@pytest.mark.slow
 def test_a_solve_on_a_cluster_is_the_solve_on_one_worker(shared: Processes, tmp_path: Path) -> None:
     """Result, controller, surrogate and rows, to the last bit."""
     quick = "\n[sampling]\nlifted_points = 12\n[outer]\nbox_points = 4\nmax_refinements = 0\n"

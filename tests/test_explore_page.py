@@ -45,6 +45,7 @@ def opened(browser, url, width=1300, scheme="light"):
     return page, heard
 
 
+@pytest.mark.slow  # a browser: CI has that of the pages
 def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server, tmp_path):
     started, url = server
     page, heard = opened(browser, url)

@@ -26,6 +26,7 @@ def solved(case: Path, folder: Path) -> FinishedRun:
     return read_run(folder)
 
 
+@pytest.mark.slow  # the tutorial has a plant of its own, too
 def test_three_mass_axis_is_designed_between_its_bounds(tmp_path: Path) -> None:
     axis = Path(shutil.copytree(EXAMPLES / "three_mass_axis", tmp_path / "axis"))
     with (axis / "case.toml").open("a") as file:
