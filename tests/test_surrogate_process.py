@@ -44,8 +44,9 @@ def test_no_noise_interpolates(kernel: Kernel, seed: int, with_gradients: bool) 
     np.testing.assert_allclose(mean, Y, atol=1e-8 * gp.output_scale)
     assert std.max() < 1e-5 * gp.output_scale
     if with_gradients:
-        for j, e in enumerate(1e-5 * np.eye(2)):
-            slope = (gp.predict(X + e) - gp.predict(X - e)) / 2e-5
+        # rounding of the prediction over the step, and the step's own error, are 1e-7 both
+        for j, e in enumerate(3e-4 * np.eye(2)):
+            slope = (gp.predict(X + e) - gp.predict(X - e)) / 6e-4
             np.testing.assert_allclose(slope, dY[:, j], atol=2e-6 * np.abs(dY).max())
 
 
