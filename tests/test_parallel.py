@@ -264,7 +264,9 @@ def test_ctrl_c_while_the_workers_start_is_quiet(tmp_path: Path, delay: float) -
     assert len(errors.splitlines()) == 1, errors
 
 
-@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "kind", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_workers_end_with_a_killed_parent(tmp_path: Path, kind: signal.Signals) -> None:
     process = parent(tmp_path)
     pids = children(tmp_path)
