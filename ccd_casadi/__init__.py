@@ -13,6 +13,8 @@ from importlib import import_module
 from pathlib import PurePath
 from types import ModuleType
 
+from ccd_casadi.support.notebook import Shown
+
 # a command is starting, not a library: its first import is this
 if sys.argv[:1] == ["-m"] or PurePath(sys.argv[0] if sys.argv else "").stem == "ccd":
     import surrogates as _surrogates  # takes care of Ctrl-C while the rest is imported
@@ -74,6 +76,13 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def _html_of(item: object) -> str:
+    return str(import_module(f"{__name__}.reporting.notebook").html_of(item))
+
+
+Shown.drawn = _html_of  # loaded when something is shown, and not before
 
 
 class _Package(ModuleType):

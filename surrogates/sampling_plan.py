@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from surrogates.interface import Array, box
-from surrogates.sobol_sequence import scrambled_sobol
 
 
 class DesignKind(StrEnum):
@@ -61,9 +60,12 @@ def sobol(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
 
     Source: Owen, "Scrambling Sobol' and Niederreiter-Xing points", J. Complexity 1998.
     """
+    from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
+
     low, high = box(lower, upper)
     _positive(n)
-    return _spread(scrambled_sobol(low.size, (n - 1).bit_length(), seed)[:n], low, high)
+    sequence = qmc.Sobol(low.size, scramble=True, rng=np.random.default_rng(seed))
+    return _spread(sequence.random_base2((n - 1).bit_length())[:n], low, high)
 
 
 def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Array:
@@ -74,7 +76,7 @@ def latin_hypercube(lower: ArrayLike, upper: ArrayLike, n: int, seed: int) -> Ar
 
     Source: McKay, Beckman and Conover, Technometrics 1979.
     """
-    from scipy.stats import qmc  # 0.5 s to import, so only where it is needed
+    from scipy.stats import qmc
 
     low, high = box(lower, upper)
     _positive(n)

@@ -47,7 +47,6 @@ PROCESSES = {
 BY_NAME = {
     "ccd_casadi/support/optional_packages.py",
     "ccd_casadi/support/command_line.py",
-    "ccd_casadi/support/notebook.py",
     "ccd_casadi/kernels/compilation.py",
     "ccd_casadi/kernels/compiled.py",
     "ccd_casadi/__init__.py",

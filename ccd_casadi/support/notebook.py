@@ -1,19 +1,20 @@
 """What shows itself in a notebook."""
 
 import sys
-from importlib import import_module
+from collections.abc import Callable
+from typing import ClassVar
 
 
 class Shown:
     """Base of what a notebook shows as more than its `repr`.
 
-    The drawing is `ccd_casadi.reporting.notebook`'s, far above most of these classes: it is loaded
-    when something is shown, and not before.
+    How is far above most of these classes: the package sets `drawn` (an object to HTML).
     """
 
-    def _repr_html_(self) -> str:
-        text: str = import_module("ccd_casadi.reporting.notebook").html_of(self)
-        return text
+    drawn: ClassVar[Callable[[object], str] | None] = None
+
+    def _repr_html_(self) -> str | None:
+        return None if Shown.drawn is None else Shown.drawn(self)
 
 
 def in_notebook(stream: object) -> bool:
