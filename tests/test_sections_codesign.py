@@ -79,10 +79,15 @@ def test_a_theta_has_one_value_whoever_asks(anchored: CoDesignProblem, tmp_path:
     assert asked([0, 1], 1, "a.sqlite") == first
 
 
-def test_three_formulations_agree_and_a_resumed_run_is_the_same(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "structure", [PID.structure, pytest.param(Structure(biquads=1), marks=pytest.mark.slow)]
+)
+def test_three_formulations_agree_and_a_resumed_run_is_the_same(
+    structure: Structure, tmp_path: Path
+) -> None:
     store = tmp_path / "samples.sqlite"
-    case = replace(quick(replace(PID, uncertainty=Uncertainty(), starts=2)), lower=(58.0, 58.0),
-                   upper=(62.0, 62.0))  # fmt: skip
+    sections = replace(PID, structure=structure, uncertainty=Uncertainty(), starts=2)
+    case = replace(quick(sections), lower=(58.0, 58.0), upper=(62.0, 62.0))
     nested = solve(case, Nested(plan="sobol", points=4), store=store)
     others = [solve(case, kind, store=store) for kind in (Lifted(points=4), Direct(starts=1))]
     for found in (nested, *others):
