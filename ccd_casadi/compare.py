@@ -38,10 +38,14 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.support.errors import UserError
 
     case = load_case(options.case)
     problem = problem_of(case)
     require_bandwidth(problem, "compare")
+    for name, _ in problem.listed:
+        words = "compare needs a range; give fixed, as the case.toml of a finished solve does"
+        raise UserError(f"{options.case}: theta.{name}.values: {words}")
     plant_of(problem)
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)

@@ -33,12 +33,10 @@ def summary(solution: "Solution") -> str:
         return f"no feasible design: {result['reason']}"
     if solution.sections is not None:
         return sections_summary(solution.result)
-    units = result["units"]
-    theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *terminal_lines(result),
-        f"theta         {theta}",
+        f"theta         {_theta(result)}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "
         f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
@@ -58,6 +56,11 @@ def summary(solution: "Solution") -> str:
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def _theta(result: Mapping[str, Any]) -> str:
+    values = {**result["theta"], **result.get("fixed", {})}
+    return ", ".join(f"{k} = {v:.6g} {result['units'][k]}".strip() for k, v in values.items())
 
 
 def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
@@ -88,14 +91,12 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.reporting.verdict import terminal_lines
 
-    units = result["units"]
-    theta = ", ".join(f"{k} = {v:.6g} {units[k]}".strip() for k, v in result["theta"].items())
     residual = result["kkt"]["stationarity"]
     certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *terminal_lines(result),
-        f"theta         {theta}",
+        f"theta         {_theta(result)}",
         f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
         *inner_value_lines(result),
         f"controller    order {controller['order']}, gain {_gains(controller)}",

@@ -3,7 +3,6 @@
 `problem_of` makes of it the problem in SI that the lower layers take.
 """
 
-import difflib
 import inspect
 import math
 import tomllib
@@ -14,11 +13,11 @@ from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget, error_budget
 from ccd_casadi.cases.checks import (
-    ANY,
     FRACTION,
     POSITIVE,
     Check,
     choice,
+    closest,
     count,
     flag,
     number,
@@ -27,6 +26,7 @@ from ccd_casadi.cases.checks import (
     text,
     too_large,
 )
+from ccd_casadi.cases.checks import CaseError as CaseError
 from ccd_casadi.cases.diagnosis import Severity, diagnose
 from ccd_casadi.cases.kinds import (
     check_kind,
@@ -36,11 +36,12 @@ from ccd_casadi.cases.kinds import (
     sections_problem,
     weights_of,
 )
+from ccd_casadi.cases.parameters import parameters_of
+from ccd_casadi.cases.parameters import parse_theta as parse_theta
 from ccd_casadi.cases.sections import (
     SECTIONS,
     Case,
     ChannelSection,
-    Parameter,
     PlantSection,
     RobustSection,
 )
@@ -57,10 +58,6 @@ from ccd_casadi.support.units import HZ
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
-
-
-class CaseError(UserError):
-    """One line: file, key, what is wrong, what to do."""
 
 
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
@@ -151,7 +148,7 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     known = ("plant", "theta", *SECTIONS)
     for name, table in data.items():
         if name not in known:
-            raise fail(name, f"unknown section{_closest(name, known)}")
+            raise fail(name, f"unknown section{closest(name, known)}")
         if not isinstance(table, Mapping):
             raise fail(name, f"is {shown(table)}; write a table [{name}]")
     for name in ("plant", "theta"):
@@ -184,18 +181,18 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
     for file, place in zip(files, absolute, strict=True):
         _plant(dict(data["plant"]) | _options_in(file, place, fail), path, fail)
     sections["robust"] = replace(sections["robust"], plants=absolute)
-    theta = _theta(data["theta"], fail)
+    theta, fixed = parameters_of(data["theta"], fail)
     needed = _MODEL_THETA.get(plant.model or "")
     if needed is not None:
         for name in data["theta"]:
             if name not in needed:
-                hint = _closest(name, needed)
+                hint = closest(name, needed)
                 raise fail(f"theta.{name}", f"is no parameter of {plant.model}{hint}")
         for name in needed:
             if name not in data["theta"]:
                 words = f"is missing; add a table [theta.{name}], which {plant.model} needs"
                 raise fail(f"theta.{name}", words)
-    return Case(path=path, plant=plant, theta=theta, **sections)
+    return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
 
 
 def section_of(
@@ -205,7 +202,7 @@ def section_of(
     allowed = {item.name: item for item in fields(kind)}
     for key in table:
         if key not in allowed:
-            raise fail(f"{name}.{key}", f"unknown key{_closest(key, allowed)}")
+            raise fail(f"{name}.{key}", f"unknown key{closest(key, allowed)}")
     values = {}
     for key, item in allowed.items():
         if key not in table:
@@ -235,7 +232,7 @@ def _plant(
         words = "is one frequency response and has no theta: it goes with the command inner alone"
         raise fail("plant.model", words)
     if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
-        hint = _closest(str(model), _KNOWN_MODELS)
+        hint = closest(str(model), _KNOWN_MODELS)
         raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
@@ -256,7 +253,7 @@ def _plant(
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
         if takes is not None and key not in takes:
-            raise fail(f"plant.{key}", f"is no option of {model}{_closest(key, takes)}")
+            raise fail(f"plant.{key}", f"is no option of {model}{closest(key, takes)}")
         wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
@@ -299,77 +296,6 @@ def _option(value: Any) -> str | None:
     return f"is {shown(value)}; give a number, text, true or false, or a list of them"
 
 
-def _theta(
-    table: Mapping[str, Any], fail: Callable[[str, str], CaseError]
-) -> tuple[Parameter, ...]:
-    if not table:
-        raise fail("theta", "names no parameter; add a table [theta.NAME]")
-    checks = {"lower": ANY, "upper": ANY, "start": ANY, "unit": text}
-    found = []
-    for name, entry in table.items():
-        place = f"theta.{name}"
-        if not name.isidentifier():
-            raise fail(place, "is no identifier; use letters, digits and _")
-        if not isinstance(entry, Mapping):
-            raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
-        for key in entry:
-            if key not in checks:
-                raise fail(f"{place}.{key}", f"unknown key{_closest(key, checks)}")
-        for key in ("lower", "upper"):
-            if key not in entry:
-                raise fail(f"{place}.{key}", "is missing; add it")
-        for key, value in entry.items():
-            wrong = checks[key](value)
-            if wrong is not None:
-                raise fail(f"{place}.{key}", wrong)
-        lower, upper = float(entry["lower"]), float(entry["upper"])
-        if lower > upper:
-            raise fail(f"{place}.lower", f"{lower:g} is above upper = {upper:g}; swap them")
-        if lower == upper or not math.isfinite(upper - lower):
-            raise fail(f"{place}.lower", f"{lower:g} to {upper:g} is no range; widen it")
-        start = float(entry.get("start", 0.5 * lower + 0.5 * upper))
-        if not lower <= start <= upper:
-            words = f"{start:g} is outside {lower:g} to {upper:g}; give a start within the bounds"
-            raise fail(f"{place}.start", words)
-        found.append(Parameter(name, lower, upper, start, entry.get("unit", "")))
-    return tuple(found)
-
-
-def _closest(name: str, known: Any) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
-
-
-def parse_theta(case: Case, text: str) -> tuple[float, ...]:
-    """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
-
-    def fail(words: str) -> CaseError:
-        return CaseError(one_line(f"{case.path}: --theta: {words}"))
-
-    names = [parameter.name for parameter in case.theta]
-    found: dict[str, float] = {}
-    for part in text.split(","):
-        name, equals, value = (item.strip() for item in part.partition("="))
-        if not equals:
-            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
-        if name not in names:
-            raise fail(f"{shown(name)} is no parameter of the case{_closest(name, names)}")
-        if name in found:
-            raise fail(f"{name} is given twice; give it once")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
-    for parameter in case.theta:
-        if parameter.name not in found:
-            raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
-        number = found[parameter.name]
-        if not parameter.lower <= number <= parameter.upper:
-            bounds = f"{parameter.lower:g} to {parameter.upper:g}"
-            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
-    return tuple(found[name] for name in names)
-
-
 def problem_of(case: Case) -> CoDesignProblem:
     """The case in SI, as the lower layers take it.
 
@@ -388,13 +314,19 @@ def problem_of(case: Case) -> CoDesignProblem:
     options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
     problem = CoDesignProblem(
         source=PlantSource(
-            case.plant.model, file, function, options, case.limits.plant_seconds
+            case.plant.model,
+            file,
+            function,
+            options,
+            case.limits.plant_seconds,
+            fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
         ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
         lower=tuple(p.lower for p in case.theta),
         upper=tuple(p.upper for p in case.theta),
         start=tuple(p.start for p in case.theta),
+        listed=tuple((p.name, p.values) for p in case.theta if p.values),
         w1=case.objective.w1,
         w2=case.objective.w2,
         weights=weights_of(w, inner, disturbance_of(case.controller, w)),

@@ -1,10 +1,17 @@
 """Checks of single values in a case file: None where a value is good, else what is wrong and what
 to give instead. Each carries what JSON Schema can say of the same, for editors (`schema`)."""
 
+import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+from ccd_casadi.support.errors import UserError
+
+
+class CaseError(UserError):
+    """One line: file, key, what is wrong, what to do."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +135,13 @@ def factors(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers above 0"
 
 
+@_with(_list({"type": "number"}, 2))
+def listed(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
+        return None
+    return f"is {shown(value)}; give a list of numbers"
+
+
 @_with(_list({"type": "number"}, 1))
 def direction(value: Any) -> str | None:
     if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
@@ -188,3 +202,9 @@ ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, math.inf, "give a number above 1")
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """A hint for who wrote an unknown name: the one that was meant, or all."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"

@@ -10,17 +10,11 @@ from typing import Any
 
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
+from ccd_casadi.cases.parameters import KEYS as THETA
 from ccd_casadi.cases.sections import SECTIONS, ChannelSection
 from ccd_casadi.plants.registry import BUILDERS, MODELS
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_NUMBER = {"type": "number"}
-_THETA = {
-    "lower": ("number", "the least that may be chosen, in `unit`"),
-    "upper": ("number", "the most that may be chosen"),
-    "start": ("number", "where descents start; default: the middle"),
-    "unit": ("string", "for tables and pages; what the plant function takes"),
-}
 _PLANT = {
     "model": 'a model of the package, or "measured": a frequency response; or give function',
     "function": '"my_plant.py:model", relative to the case file: a Python function of θ',
@@ -50,9 +44,12 @@ def case_schema() -> dict[str, Any]:
             "additionalProperties": {
                 "type": "object",
                 "properties": {
-                    key: {"type": kind, "description": says} for key, (kind, says) in _THETA.items()
+                    key: {**check.schema, "description": says}
+                    for key, (check, says) in THETA.items()
                 },
-                "required": ["lower", "upper"],
+                "anyOf": [
+                    {"required": keys} for keys in (["lower", "upper"], ["values"], ["fixed"])
+                ],
                 "additionalProperties": False,
             },
         },
@@ -104,9 +101,11 @@ def keys_page() -> str:
         *_rows(
             [
                 (key, "required" if key in ("lower", "upper") else "", "", says)
-                for key, (_, says) in _THETA.items()
+                for key, (_, says) in THETA.items()
             ]
         ),
+        "",
+        "With `values` or `fixed` no bounds are given; see [own plant](own_plant.md).",
     ]
     for name, kind in {**SECTIONS, "controller.channel.NAME": ChannelSection}.items():
         lines += ["", f"## [{name}]", ""]

@@ -5,7 +5,7 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +51,31 @@ class PlantSection:
 
 @dataclass(frozen=True)
 class Parameter:
-    """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter."""
+    """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter.
+
+    `values`: those that it may have, in rising order, from `lower` to `upper`; none: all between
+    the bounds. With one value it is fixed, and no part of θ.
+    """
 
     name: str
     lower: float
     upper: float
     start: float
     unit: str
+    values: tuple[float, ...] = ()
+
+    def fixed_at(self, value: float) -> "Parameter":
+        """The same at one value."""
+        return replace(self, lower=value, upper=value, start=value, values=(value,))
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """What a case file says of it."""
+        if len(self.values) == 1:
+            return {"fixed": self.start, "unit": self.unit}
+        if self.values:
+            return {"values": self.values, "start": self.start, "unit": self.unit}
+        return {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
 
 
 @dataclass(frozen=True)
@@ -428,6 +446,7 @@ class Case(Shown):
     outer: OuterSection
     baseline: BaselineSection
     limits: LimitsSection
+    fixed: tuple[Parameter, ...] = ()
 
 
 SECTIONS: dict[str, type] = {

@@ -15,9 +15,8 @@ def case_to_toml(case: Case) -> str:
     """The resolved case, defaults included, as TOML."""
     plant = {"model": case.plant.model} if case.plant.model else {"function": case.plant.function}
     lines = ["[plant]", *_pairs(plant | dict(case.plant.options))]
-    for parameter in case.theta:
-        entry = {key: value for key, value in vars(parameter).items() if key != "name"}
-        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(entry)]
+    for parameter in (*case.theta, *case.fixed):
+        lines += ["", f"[theta.{_toml_key(parameter.name)}]", *_pairs(parameter.table)]
     for name in SECTIONS:
         entries = dict(vars(getattr(case, name)))
         tables = entries.pop("channel", ())

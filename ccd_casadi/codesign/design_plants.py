@@ -89,9 +89,9 @@ def best_over_design_plants(
                 outcome, held = continued(each, alone.verified.x)
                 share = max(share, held)
                 if outcome is not None:
-                    found[i] = min(found[i], conclude(each, outcome), key=_order)
+                    found[i] = min(found[i], conclude(each, outcome), key=order)
     violation = [np.inf if each.nearest is None else each.nearest.violation for each in samplers]
-    best = min(range(len(found)), key=lambda i: (*_order(found[i]), violation[i]))
+    best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
     result = found[best].result | {
         "seconds": perf_counter() - began,
         "syntheses": sampler.syntheses,
@@ -116,7 +116,7 @@ def _verified(item: Solution) -> bool:
     return bool(item.result["status"] == "verified")
 
 
-def _order(item: Solution) -> tuple[int, int, float]:
+def order(item: Solution) -> tuple[int, int, float]:
     """Verified first, then what fails the fewest checks, then the least J."""
     result = item.result
     failed = sum(not passed for passed in result.get("checks", {}).values())

@@ -13,6 +13,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign import FORMULATIONS as FORMULATIONS
 from ccd_casadi.codesign.box_look import BoxLook, look_over_box, perturbed
+from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -108,8 +109,13 @@ def co_design(
 ) -> Solution:
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
-    A robust problem that leaves its design plant open is solved for each, and the best one kept.
+    A robust problem that leaves its design plant open is solved for each, and the best one kept;
+    one with parameters from lists by branching over these (`catalogue`).
     """
+    if sampler.problem.listed:
+        if given is not None:
+            raise UserError("--surrogate: starts no solve with lists of values; leave it out")
+        return best_of_lists(sampler, lambda each: co_design(each, formulation, seed))
     began = perf_counter()
     name = type(formulation).__name__.lower()
 
@@ -313,17 +319,24 @@ def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> Formulati
 
 
 def resolved(case: Case, solution: Solution) -> Case:
-    """The case with the design plant that was found best, where it left that open."""
-    if solution.problem is None or solution.problem.robust is None:
+    """The case with what was found best of what it left open: design plant, listed values."""
+    problem = solution.problem
+    if problem is None:
         return case
-    robust = replace(case.robust, design_at=solution.problem.robust.design_at)
-    return replace(case, robust=robust)
+    held = problem.source.held
+    chosen = tuple(p.fixed_at(held[p.name]) for p in case.theta if p.name in held)
+    if chosen:
+        free = tuple(p for p in case.theta if p.name not in held)
+        case = replace(case, theta=free, fixed=(*case.fixed, *chosen))
+    if problem.robust is None:
+        return case
+    return replace(case, robust=replace(case.robust, design_at=problem.robust.design_at))
 
 
 def write_run(folder: Path, case: Case, solution: Solution) -> None:
     """Write what a run folder holds besides samples and report; clear an earlier run's.
 
-    The case in it names the design plant that was found best, so that what works on the run does.
+    The case in it names what was found best of what was open, so that what works on the run does.
     """
     for name in ("result.json", "controller.json", "surrogate.json", "report.html", "index.html"):
         (folder / name).unlink(missing_ok=True)

@@ -20,6 +20,7 @@ from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.differenced import own_plant
+from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Mechanics, ModelFunction, Plant, build_plant, mechanics
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
@@ -36,7 +37,10 @@ NUMERICS = 7  # raised whenever a change of ours moves the numbers that a sample
 
 @dataclass(frozen=True)
 class PlantSource:
-    """Where the model comes from: a known name or `file.py:function`, and its options."""
+    """Where the model comes from: a known name or `file.py:function`, and its options.
+
+    `fixed`: parameters that are not in θ, each with value and unit.
+    """
 
     model: str | None
     file: str | None
@@ -44,6 +48,12 @@ class PlantSource:
     options: tuple[tuple[str, object], ...]
     seconds: float = 60.0  # that a function may take; no part of what the plant is
     content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
+    fixed: tuple[tuple[str, float, str], ...] = ()
+
+    @property
+    def held(self) -> dict[str, float]:
+        """The fixed parameters' values."""
+        return {name: value for name, value, _ in self.fixed}
 
     def pinned(self) -> "PlantSource":
         """The same, with the hash of its file's content: a process must not keep an older one."""
@@ -67,6 +77,7 @@ class PlantSource:
             "function": self.function,
             "source": digest,
             "options": options,
+            **({"fixed": self.held} if self.fixed else {}),
         }
 
 
@@ -132,6 +143,7 @@ class CoDesignProblem(Shown):
     robust: RobustSet | None = None
     sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
     budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
+    listed: tuple[tuple[str, tuple[float, ...]], ...] = ()  # parameters that are one of a few
 
     def identity(self) -> dict[str, object]:
         """What determines one synthesis at (θ, ω_S, ω_T), and nothing more.
@@ -159,6 +171,12 @@ class CoDesignProblem(Shown):
             "gamma_backoff": self.inner.gamma_backoff,
             **perturbed,
         }
+
+    @property
+    def parameter_units(self) -> dict[str, str]:
+        """Units of θ and of the fixed parameters."""
+        fixed = {name: unit for name, _, unit in self.source.fixed}
+        return {**dict(zip(self.names, self.units, strict=True)), **fixed}
 
     def inner_identity(self) -> dict[str, object]:
         """What else determines ω_b*(θ)."""
@@ -195,17 +213,20 @@ def plant_of(problem: CoDesignProblem) -> Plant:
 
 @lru_cache(maxsize=8)
 def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
+    options, held = dict(source.options), source.held
     if source.model in BUILDERS:
-        return BUILDERS[source.model](names, **dict(source.options))
+        plant = BUILDERS[source.model]((*names, *held), **options)
+        return with_fixed(plant, held) if held else plant
     assert source.model is not None
-    return build_plant(MODELS[source.model], names, dict(source.options))
+    return build_plant(fixed_model(MODELS[source.model], held), names, options)
 
 
 @lru_cache(maxsize=8)
 def _own_plant(
     source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
 ) -> Plant:
-    return own_plant(_own_function(source), names, dict(source.options), lower, upper)
+    function = fixed_model(_own_function(source), source.held)
+    return own_plant(function, names, dict(source.options), lower, upper)
 
 
 class _PlantFile(SourceFileLoader):

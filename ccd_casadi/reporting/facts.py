@@ -38,7 +38,7 @@ def theta_words(result: Mapping[str, Any]) -> str:
     """`m1 = 55 kg, m2 = 55 kg`."""
     units = result.get("units", {})
     words = []
-    for name, value in result["theta"].items():
+    for name, value in {**result["theta"], **result.get("fixed", {})}.items():
         unit, factor = shown_unit(units.get(name, ""), value)
         words.append(f"{name} = {number(factor * value)} {unit}".strip())
     return ", ".join(words)
@@ -54,6 +54,11 @@ def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
         unit, factor = shown_unit(problem.units[i], high)
         numbers = (factor * float(v) for v in (value, low, high, problem.start[i]))
         rows.append((name, unit or "–", *numbers, place))
+    lists = result.get("listed", {}).get("values", {})
+    for name, value in result.get("fixed", {}).items():
+        unit, factor = shown_unit(problem.parameter_units[name], value)
+        place = f"one of {len(lists[name])}" if name in lists else "fixed"
+        rows.append((name, unit or "–", factor * value, "–", "–", "–", place))
     head = ("θ", "unit", "optimum", "lower", "upper", "start", "where")
     return Table(head, tuple(rows))
 

@@ -6,6 +6,7 @@ from functools import partial
 
 import casadi as ca
 
+from ccd_casadi.plants.fixed import WithFixed
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.rib_stage import nearby
 from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
@@ -129,6 +130,8 @@ def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Poo
 def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[float, ...]] | None:
     """The stage behind a plant and θ in the stage's own order; None for another plant."""
     found = plant.evaluate
+    if isinstance(found, WithFixed):
+        theta, found = found.at(theta), found.evaluate
     if not isinstance(found, StageEvaluator):
         return None
     return found.stage, tuple(float(theta[i]) for i in found.place)

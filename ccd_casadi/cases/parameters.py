@@ -1,0 +1,119 @@
+"""[theta.NAME]: the hardware parameters of a case: free within bounds, one of a list, or fixed."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ccd_casadi.cases.checks import ANY, CaseError, Check, closest, flag, listed, shown, text
+from ccd_casadi.cases.sections import Case, Parameter
+from ccd_casadi.support.errors import one_line
+
+MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
+
+# Every key of a [theta.NAME], what is asked of it, and what it says.
+KEYS: dict[str, tuple[Check, str]] = {
+    "lower": (ANY, "the least that may be chosen, in `unit`"),
+    "upper": (ANY, "the most that may be chosen"),
+    "start": (ANY, "where descents start; default: the middle"),
+    "unit": (text, "for tables and pages; what the plant function takes"),
+    "values": (listed, "instead of bounds: the values that it may have, as in a catalogue"),
+    "integer": (flag, "whether it is a whole number between the bounds; default false"),
+    "fixed": (ANY, "instead of all these but unit: its value, which is not searched"),
+}
+Fail = Callable[[str, str], CaseError]
+
+
+def parameters_of(
+    table: Mapping[str, Any], fail: Fail
+) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
+    """The parameters that are searched, and the fixed ones."""
+    if not table:
+        raise fail("theta", "names no parameter; add a table [theta.NAME]")
+    found = [_parameter(name, entry, fail) for name, entry in table.items()]
+    if not any(not parameter.values for parameter in found):
+        words = "has no parameter with a range: give one lower and upper, or ask inner for each"
+        raise fail("theta", words)
+    return (
+        tuple(parameter for parameter in found if len(parameter.values) != 1),
+        tuple(parameter for parameter in found if len(parameter.values) == 1),
+    )
+
+
+def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
+    place = f"theta.{name}"
+    if not name.isidentifier():
+        raise fail(place, "is no identifier; use letters, digits and _")
+    if not isinstance(entry, Mapping):
+        raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
+    for key, value in entry.items():
+        if key not in KEYS:
+            raise fail(f"{place}.{key}", f"unknown key{closest(key, KEYS)}")
+        wrong = KEYS[key][0](value)
+        if wrong is not None:
+            raise fail(f"{place}.{key}", wrong)
+    unit = entry.get("unit", "")
+    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer")),
+                        ("values", ("lower", "upper", "integer"))):  # fmt: skip
+        beside = [other for other in others if key in entry and other in entry]
+        if beside:
+            raise fail(f"{place}.{beside[0]}", f"has no place beside {key}; drop it")
+    if "fixed" in entry:
+        value = float(entry["fixed"])
+        return Parameter(name, value, value, value, unit, (value,))
+    values = tuple(sorted({float(value) for value in entry.get("values", ())}))
+    if "values" in entry and len(values) < 2:
+        raise fail(f"{place}.values", "needs two different numbers or more; or give fixed")
+    bounds = {"lower": values[0], "upper": values[-1]} if values else entry
+    for key in ("lower", "upper"):
+        if key not in bounds:
+            raise fail(f"{place}.{key}", "is missing; add it")
+    lower, upper = float(bounds["lower"]), float(bounds["upper"])
+    if lower > upper:
+        raise fail(f"{place}.lower", f"{lower:g} is above upper = {upper:g}; swap them")
+    if lower == upper or not math.isfinite(upper - lower):
+        raise fail(f"{place}.lower", f"{lower:g} to {upper:g} is no range; widen it, or give fixed")
+    start = float(entry.get("start", 0.5 * lower + 0.5 * upper))
+    if not lower <= start <= upper:
+        words = f"{start:g} is outside {lower:g} to {upper:g}; give a start within the bounds"
+        raise fail(f"{place}.start", words)
+    if entry.get("integer", False):
+        first, last = math.ceil(lower), math.floor(upper)
+        if last - first < 1 or last - first >= MOST_VALUES:
+            words = f"{lower:g} to {upper:g} holds {max(0, last - first + 1)} whole numbers"
+            raise fail(f"{place}.integer", f"{words}; give bounds with 2 to {MOST_VALUES}")
+        values = tuple(float(value) for value in range(first, last + 1))
+        lower, upper = values[0], values[-1]
+        start = min(max(start, lower), upper)
+    if len(values) > MOST_VALUES:
+        raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
+    return Parameter(name, lower, upper, start, unit, values)
+
+
+def parse_theta(case: Case, text: str) -> tuple[float, ...]:
+    """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
+
+    def fail(words: str) -> CaseError:
+        return CaseError(one_line(f"{case.path}: --theta: {words}"))
+
+    names = [parameter.name for parameter in case.theta]
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, value = (item.strip() for item in part.partition("="))
+        if not equals:
+            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
+        if name not in names:
+            raise fail(f"{shown(name)} is no parameter of the case{closest(name, names)}")
+        if name in found:
+            raise fail(f"{name} is given twice; give it once")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
+    for parameter in case.theta:
+        if parameter.name not in found:
+            raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
+        number = found[parameter.name]
+        if not parameter.lower <= number <= parameter.upper:
+            bounds = f"{parameter.lower:g} to {parameter.upper:g}"
+            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
+    return tuple(found[name] for name in names)

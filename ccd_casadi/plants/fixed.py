@@ -1,0 +1,86 @@
+"""A plant with some of its parameters at given values: the rest of θ is free."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
+
+
+def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
+    """The model as a function of the free parameters alone."""
+    if not fixed:
+        return model
+
+    def of_free(theta: Mapping[str, Any], **options: Any) -> Mapping[str, Any]:
+        return model({**theta, **fixed}, **options)
+
+    return of_free
+
+
+class WithFixed:
+    """Free θ -> Mechanics of a plant at all of θ, with the derivatives to the free ones.
+
+    `place` is where the free parameters are in the whole θ, whose others are those of `whole`.
+    """
+
+    def __init__(self, evaluate: Evaluate, place: Sequence[int], whole: Array) -> None:
+        self.evaluate, self.place, self._whole = evaluate, list(place), whole
+
+    def at(self, theta: Sequence[float]) -> tuple[float, ...]:
+        """The whole θ."""
+        out = self._whole.copy()
+        out[self.place] = theta
+        return tuple(out.tolist())
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        found = self.evaluate(self.at(theta))
+        if not len(found.derivatives[0]):  # values alone
+            return found
+        M, D, K, B, C = (array[self.place] for array in found.derivatives)
+        return replace(found, derivatives=(M, D, K, B, C))
+
+
+def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
+    """The plant as a function of the parameters that `fixed` does not name.
+
+    >>> from ccd_casadi.plants.plant import build_plant, mechanics
+    >>> from ccd_casadi.plants.two_mass import two_mass
+    >>> both = build_plant(two_mass, ["m1", "m2"], {})
+    >>> one = with_fixed(both, {"m1": 60.0})
+    >>> one.names, mechanics(one, (50.0,)).M.diagonal().tolist()
+    (('m2',), [60.0, 50.0])
+    """
+    place = [i for i, name in enumerate(plant.names) if name not in fixed]
+    whole = np.array([fixed.get(name, np.nan) for name in plant.names])
+
+    def of(evaluate: Evaluate) -> WithFixed:
+        return WithFixed(evaluate, place, whole)
+
+    own = of(plant.evaluate)
+    free = ca.MX.sym("theta", len(place))
+    entries = iter(ca.vertsplit(free))
+    theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
+    nearby, domain = plant.nearby, plant.domain
+
+    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+        assert nearby is not None
+        return of(nearby(own.at(theta), reach, pool))
+
+    return replace(
+        plant,
+        names=tuple(plant.names[i] for i in place),
+        evaluate=own,
+        hardware=ca.Function("hardware", [free], plant.hardware.call([ca.vertcat(*theta)])),
+        references={name: of(closer) for name, closer in plant.references.items()},
+        values=None if plant.values is None else of(plant.values),
+        notes=lambda theta: plant.notes(own.at(theta)),
+        nearby=None if nearby is None else near,
+        domain=None if domain is None else (domain[0][place], domain[1][place]),
+        doubt=lambda theta: plant.doubt(own.at(theta)),
+    )
