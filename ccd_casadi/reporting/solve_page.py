@@ -55,6 +55,7 @@ from ccd_casadi.reporting.slices import (
     tables_slices,
 )
 from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_figure
+from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
@@ -164,6 +165,7 @@ def _parts(
     return {
         "glance": lambda: [glance(problem, verified, float(solution.result["bandwidth_hz"]))],
         "design": lambda: [_design(problem, solution)],
+        "start": lambda: start_section(problem, verified),
         "theta": lambda: [_theta(problem, solution, verified, truths)],
         "stage": lambda: stage_sections(problem, stages),
         "loop": lambda: _loop(problem, solution, verified),

@@ -1,0 +1,171 @@
+"""What the co-design changed: the best loop of the hardware that it began with, beside its own."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    scaled_plant,
+    true_inner,
+)
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Section, Table, figure_html, number, paragraph, table_html
+from ccd_casadi.reporting.svg import BLUE, GREY, ORANGE
+from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.robust.signals import closed_loop
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+from ccd_casadi.synthesis.synthesis import Design, synthesise
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.verify import VerifiedDesign
+
+HEADING = "Start against optimum"
+SAME = 1e-6  # of the box: an optimum this close to the start is the start
+HEIGHTS = (3.0, 3.0)  # inches
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One θ: name, colour, f, the loop over frequency, its poles in 1/s."""
+
+    name: str
+    colour: str
+    theta: tuple[float, ...]
+    cost: float
+    loop: Loop
+    poles: np.ndarray
+
+    def objective(self, problem: CoDesignProblem) -> float:
+        return problem.w1 * self.cost + problem.w2 * HZ * self.loop.bandwidth_hz
+
+    @property
+    def resonance(self) -> float:
+        """The first flexible one in Hz; NaN where there is none."""
+        return min(self.loop.resonances_hz, default=np.nan)
+
+
+def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Section]:
+    """Both as figures, poles and a table; nothing where the run did not leave its start.
+
+    At the start the true inner problem is solved, so that each hardware has its best controller.
+    """
+    width = np.subtract(problem.upper, problem.lower)
+    if (np.abs(np.subtract(verified.theta, problem.start)) <= SAME * width).all():
+        return []
+    found = true_inner(problem, problem.start)
+    if found.optimum is None:
+        words = f"The hardware that the run began with has no feasible loop: {found.shortfall}."
+        return [Section(HEADING, paragraph(words))]
+    made = synthesise(
+        scaled_plant(problem, problem.start),
+        problem.weights.at(found.optimum.figures.omega_S, found.optimum.figures.omega_T),
+        omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
+    )  # fmt: skip
+    sides = (
+        _side(problem, "start", ORANGE, problem.start, made),
+        _side(problem, "optimum", BLUE, verified.theta, verified.design),
+    )
+    svg = figure_lines(
+        [[_gains(problem, sides)], [_plants(sides), _pole_map(sides)]],
+        key="start", title=HEADING, heights=HEIGHTS,
+    )  # fmt: skip
+    body = figure_html(svg, _caption(sides), _poles_table(sides)) + table_html(
+        _table(problem, sides)
+    )
+    return [Section(HEADING, body)]
+
+
+def _side(
+    problem: CoDesignProblem, name: str, colour: str, theta: tuple[float, ...], design: Design
+) -> _Side:
+    plant, f = scaled_plant(problem, theta), design.figures
+    loop = loop_data(
+        plant, design.controller, problem.weights.at(f.omega_S, f.omega_T), gamma=f.gamma,
+        bandwidth_hz=f.bandwidth / HZ, omega_low=problem.inner.omega_low, label=name,
+    )  # fmt: skip
+    poles = np.linalg.eigvals(closed_loop(plant.plant_si(), design.controller).A)
+    return _Side(name, colour, theta, hardware_cost(plant_of(problem), theta), loop, poles)
+
+
+def _gains(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Panel:
+    curves = tuple(Curve(s.loop.hz, s.loop.gains[0], s.name, s.colour) for s in sides)
+    levels = [Level(s.loop.bandwidth_hz, f"ω_b {number(s.loop.bandwidth_hz, 4)} Hz", True, s.colour)
+              for s in sides]  # fmt: skip
+    S_max = problem.inner.S_max
+    levels += [Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY)]
+    return Panel(
+        "frequency (Hz)", "σ_max(S) (–)", curves, levels=tuple(levels), log_x=True, log_y=True,
+        x_range=(float(sides[0].loop.hz[0]), float(sides[0].loop.hz[-1])), legend="lower right",
+    )  # fmt: skip
+
+
+def _plants(sides: tuple[_Side, ...]) -> Panel:
+    curves = tuple(
+        Curve(s.loop.hz, np.linalg.norm(s.loop.plant, 2, axis=(1, 2)), s.name, s.colour)
+        for s in sides
+    )
+    return Panel("frequency (Hz)", "σ_max(G) (m/N)", curves, log_x=True, log_y=True)
+
+
+def _pole_map(sides: tuple[_Side, ...]) -> Panel:
+    curves = tuple(
+        Curve(hz, zeta, s.name, s.colour, line="", marker="x")
+        for s in sides
+        for hz, zeta in [_frequency_and_damping(s.poles)]
+    )
+    return Panel("|pole| (Hz)", "damping ratio of the loop's poles (–)", curves,
+                 levels=(Level(0.0, "unstable below", colour=GREY),), log_x=True,
+                 y_range=(-0.1, 1.1), legend=None)  # fmt: skip
+
+
+def _frequency_and_damping(poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """|p| in Hz and -Re p/|p|, a conjugate pair once, in rising order."""
+    upper = poles[poles.imag >= 0.0]
+    upper = upper[np.argsort(np.abs(upper))]
+    size = np.abs(upper)
+    return size / HZ, -upper.real / np.maximum(size, np.finfo(float).tiny)
+
+
+def _caption(sides: tuple[_Side, ...]) -> str:
+    start, end = sides
+    gained = 100.0 * (end.loop.bandwidth_hz / start.loop.bandwidth_hz - 1.0)
+    cost = 100.0 * (end.cost / start.cost - 1.0) if start.cost else np.nan
+    spared = f", f changes by {cost:+.3g} %" if np.isfinite(cost) else ""
+    return (
+        f"Each hardware with its own best controller. From the start to the optimum the bandwidth "
+        f"changes by {gained:+.3g} %{spared}. Poles of the closed loops by size and damping "
+        f"ratio; the least damped one has {number(_least(start), 2)} at the start and "
+        f"{number(_least(end), 2)} at the optimum."
+    )
+
+
+def _least(side: _Side) -> float:
+    return float(_frequency_and_damping(side.poles)[1].min())
+
+
+def _table(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Table:
+    rows = []
+    for i, name in enumerate(problem.names):
+        unit, factor = shown_unit(problem.units[i], problem.upper[i])
+        rows.append((name, unit or "–", *(factor * s.theta[i] for s in sides)))
+    rows += [
+        ("hardware cost f", "–", *(s.cost for s in sides)),
+        ("first resonance", "Hz", *(s.resonance for s in sides)),
+        ("bandwidth ω_b", "Hz", *(s.loop.bandwidth_hz for s in sides)),
+        ("objective J", "–", *(s.objective(problem) for s in sides)),
+    ]
+    return Table(("", "unit", "start", "optimum"), tuple(rows))
+
+
+def _poles_table(sides: tuple[_Side, ...]) -> Table:
+    rows = [
+        (s.name, float(hz), float(zeta))
+        for s in sides
+        for hz, zeta in zip(*_frequency_and_damping(s.poles), strict=True)
+    ]
+    return Table(("loop", "Hz", "damping ratio"), tuple(rows))
