@@ -4,7 +4,12 @@ import shutil
 
 import pytest
 
-from ccd_casadi import deploy, insight, robustness
+from ccd_casadi.deploy import main as deploy
+from ccd_casadi.insight import main as insight
+from ccd_casadi.reporting.page import Section
+from ccd_casadi.reporting.page import page as html_page
+from ccd_casadi.reporting.steps import steps_html, with_steps
+from ccd_casadi.robustness import main as robustness
 
 WIDTHS, SCHEMES = (1300, 390), ("light", "dark")
 HEAVIEST = 1.5e6  # bytes of a page
@@ -106,9 +111,9 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
 def test_every_page_of_a_run(browser, solved, tmp_path):
     folder = shutil.copytree(solved("lifted"), tmp_path / "run")
     quiet = [str(folder), "--quiet"]
-    robustness.main(quiet)
-    deploy.main(quiet)
-    insight.main([*quiet, "--points", "3", "--workers", "1"])
+    robustness(quiet)
+    deploy(quiet)
+    insight([*quiet, "--points", "3", "--workers", "1"])
     page = browser.new_page()
     page.goto((folder / "index.html").as_uri())
     linked = page.locator("li a").evaluate_all("links => links.map(link => link.href)")
@@ -116,3 +121,25 @@ def test_every_page_of_a_run(browser, solved, tmp_path):
     assert sorted([*linked, (folder / "index.html").as_uri()]) == [p.as_uri() for p in pages]
     assert len(pages) == 5
     looked_at(browser, pages)
+
+
+def test_a_slider_shows_one_step_at_a_time(browser, tmp_path):
+    steps = [(f"step {i}", f"<i>{i}</i>") for i in range(4)]
+    place = tmp_path / "page.html"
+    section = Section("Steps", steps_html(steps, 1, "first to last"))
+    place.write_text(with_steps(html_page("a page", [section])), encoding="utf-8")
+    page = browser.new_page()
+    heard = complaints(page)
+    page.goto(place.as_uri())
+    shown = page.locator(".step:visible")
+    assert shown.all_inner_texts() == ["step 1\n\n1"]
+    slider = page.locator("input[type=range]")
+    slider.focus()
+    for key, expected in (("End", "3"), ("ArrowLeft", "2"), ("Home", "0")):
+        page.keyboard.press(key)
+        assert [text.split()[-1] for text in shown.all_inner_texts()] == [expected]
+    page.emulate_media(media="print")
+    assert not slider.is_visible()
+    assert shown.count() == 1
+    assert not heard
+    page.close()

@@ -8,6 +8,7 @@ from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.insight import (
     caption_front,
@@ -29,6 +30,7 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.sections_page import binding_words
+from ccd_casadi.reporting.steps import with_steps
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -68,7 +70,8 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     sections = [
         Section(
             "Weight against bandwidth",
-            figure_html(drawn, caption_front(front), table_front(problem, front)),
+            figure_html(drawn, caption_front(front), table_front(problem, front))
+            + front_walk(run, front),
         ),
         Section(
             "What each parameter of the case would change",
@@ -76,7 +79,7 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         ),
         Section("What limits the bandwidth", _limits(run, rule)),
     ]
-    return page(title, sections, head, index)
+    return with_steps(page(title, sections, head, index))
 
 
 def _limits(run: FinishedRun, rule: str) -> str:

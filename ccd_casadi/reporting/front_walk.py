@@ -1,0 +1,81 @@
+"""The designs along a front: machine and S of each, behind a slider."""
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.pareto import Front, FrontPoint
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.rib_stage.plant import stage_of
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.glance import machine
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.loops import forbidden, synthesised_loop
+from ccd_casadi.reporting.page import number
+from ccd_casadi.reporting.stage_drawing import draw_stages
+from ccd_casadi.reporting.steps import steps_html
+from ccd_casadi.reporting.svg import GREEN, GREY
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import Loop
+
+MOST = 12  # designs: each is synthesised and drawn
+
+
+def front_walk(run: FinishedRun, front: Front) -> str:
+    """HTML; empty where no point has a design. Of a fixed structure the machine alone is drawn."""
+    problem = run.problem
+    points = [point for point in front.points if np.isfinite(point.bandwidth)]
+    if not points:
+        return ""
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
+    shown = [points[i] for i in chosen]
+    loops = [] if problem.sections is not None else [_loop(problem, point) for point in shown]
+    tops = [float(loop.gains[0].max()) for loop in loops]
+    lows = [float(loop.gains[0].min()) for loop in loops]
+    steps = []
+    for i, point in enumerate(shown):
+        row: list[Panel | str | None] = [_machine(problem, point)]
+        if loops:
+            top = 1.5 * max(problem.inner.S_max, *tops)
+            row.append(_sensitivity(problem, loops[i], (0.5 * min(lows), top)))
+        drawn = figure_lines([row], key=f"walk{i}", title="A design of the front")
+        steps.append((_words(problem, point), drawn))
+    own = float(run.result["hardware_cost"])
+    first = int(np.argmin([abs(point.hardware_cost - own) for point in shown]))
+    return steps_html(steps, first, "lightest to heaviest")
+
+
+def _loop(problem: CoDesignProblem, point: FrontPoint) -> Loop:
+    return synthesised_loop(problem, point.theta, point.omega_S, point.omega_T, "")
+
+
+def _machine(problem: CoDesignProblem, point: FrontPoint) -> str:
+    found = stage_of(plant_of(problem), point.theta)
+    if found is None:
+        return machine(problem, point.theta)
+    stage, theta = found
+    return draw_stages(stage.geometry, {"": theta})
+
+
+def _sensitivity(problem: CoDesignProblem, loop: Loop, y_range: tuple[float, float]) -> Panel:
+    ends = float(loop.hz[0]), float(loop.hz[-1])
+    inner, hz = problem.inner, loop.bandwidth_hz
+    return Panel(
+        "frequency (Hz)", "σ_max(S) (–)", (Curve(loop.hz, loop.gains[0], width=1.8),),
+        levels=(
+            Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
+            Level(hz, f"ω_b {number(hz, 4)} Hz", True, GREEN),
+        ),
+        log_x=True, log_y=True, x_range=ends, y_range=y_range,
+        forbidden=forbidden(inner, *ends, y_range[1]),
+    )  # fmt: skip
+
+
+def _words(problem: CoDesignProblem, point: FrontPoint) -> str:
+    theta = dict(zip(problem.names, point.theta, strict=True))
+    named = theta_words({"theta": theta, "units": problem.parameter_units})
+    state = "verified" if point.verified else f"not verified: {point.reason}"
+    held = f"; at {', '.join(point.active)}" if point.active else ""
+    return (
+        f"f = {number(point.hardware_cost, 4)}, {named}: "
+        f"{number(point.bandwidth / HZ, 4)} Hz, {state}{held}."
+    )
