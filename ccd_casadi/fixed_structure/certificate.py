@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     frequency_grid,
     peaks,
 )
-from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced, transmission_zeros
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers

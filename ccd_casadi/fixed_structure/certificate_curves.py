@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 

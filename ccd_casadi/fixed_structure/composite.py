@@ -23,7 +23,8 @@ from ccd_casadi.fixed_structure.figures import (
     plant_of_row,
     to_theta,
 )
-from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
 from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, loop_matrices
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
