@@ -45,7 +45,7 @@ from ccd_casadi.cases.sections import (
     RobustSection,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import with_options
+from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS, SHIPPED
