@@ -1,8 +1,9 @@
 """Checks of single values in a case file: None where a value is good, else what is wrong and what
 to give instead. Each carries what JSON Schema can say of the same, for editors (`schema`)."""
 
+import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -188,3 +189,9 @@ ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, math.inf, "give a number above 1")
+
+
+def closest(name: str, known: Collection[str]) -> str:
+    """The end of a message: the known name nearest to a mistyped one, else all of them."""
+    near = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
