@@ -23,8 +23,9 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, uncertain_plant
+from ccd_casadi.inner_problem.sections_bandwidth import prepared
 from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.compliance import compliance_of, force_to_position

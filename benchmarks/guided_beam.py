@@ -20,7 +20,7 @@ from scipy.signal import tf2ss
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import bounds_of, structure_of
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
 from ccd_casadi.plants.scaling import StateSpace
 
 CASE = Path(__file__).resolve().parent.parent / "examples" / "guided_beam" / "case.toml"

@@ -43,7 +43,8 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structu
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import MARGIN, RESTORING, designed, problem_for
-from ccd_casadi.fixed_structure.figures import Curve, LoopProblem, assess
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.fixed_structure.race import FIRST
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.trust_region import Point, ascend

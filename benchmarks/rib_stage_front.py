@@ -26,12 +26,12 @@ from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import synthesise_sections
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import (
+from ccd_casadi.inner_problem.sections_bandwidth import with_range
+from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     sections_of_problem,
     structure_of,
     with_options,
-    with_range,
 )
 from ccd_casadi.inner_problem.sections_warm import moved
 from ccd_casadi.plants.plant import hardware_cost, mechanics

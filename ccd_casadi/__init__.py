@@ -30,7 +30,7 @@ _PUBLIC = {
     "Lifted": "codesign.lifted",
     "Nested": "codesign.nested",
     "Plant": "plants.plant",
-    "Sampling": "fixed_structure.loop",
+    "Sampling": "fixed_structure.hold_and_delay",
     "SectionsDesign": "fixed_structure.design",
     "Solution": "codesign.solution",
     "StateSpace": "plants.scaling",

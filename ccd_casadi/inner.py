@@ -173,17 +173,10 @@ def _sections(
         proof_dict,
         sections_controller,
     )
-    from ccd_casadi.inner_problem.sections_bandwidth import (
-        judged_widely,
-        prepared,
-        proof_of,
-        sections_of_problem,
-        structure_of,
-        too_slow,
-        with_range,
-        worst_members,
-    )
+    from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
     from ccd_casadi.inner_problem.sections_error import least_error_at
+    from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
+    from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)

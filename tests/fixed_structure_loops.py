@@ -5,7 +5,7 @@ from helpers import HZ, PAPER, SUSPENSION, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import Problem
+from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from case_documents import DROP, PLANT, TWO_MASS, edited, message
 
-from ccd_casadi.cases import case as case_module
+from ccd_casadi.cases import plant_tables
 from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta, problem_of
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.cases.toml_writer import case_to_toml
@@ -154,7 +154,7 @@ def test_a_plant_function_that_fails_is_told(plant_folder: Path, function: str, 
 
 def test_what_is_known_of_the_models_is_what_they_take() -> None:
     """A model that reads another θ, or renames an option, would make the checks refuse it."""
-    for name, theta in case_module._MODEL_THETA.items():
+    for name, theta in plant_tables._MODEL_THETA.items():
         if name in BUILDERS:
             BUILDERS[name](theta)
         else:
@@ -165,7 +165,7 @@ def test_what_is_known_of_the_models_is_what_they_take() -> None:
                 BUILDERS[name](rest) if name in BUILDERS else MODELS[name](
                     dict.fromkeys(rest, 60.0)
                 )
-    for name, option in case_module._MODEL_OPTIONS:
+    for name, option in plant_tables._MODEL_OPTIONS:
         assert option in inspect.signature({**MODELS, **BUILDERS}[str(name)]).parameters
 
 

@@ -17,7 +17,7 @@ from ccd_casadi.deployment.pipeline import Deployment, Timing, deploy
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import structure_of, uncertain_plant
+from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant
 from ccd_casadi.reporting.deploy_page import write_report
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ

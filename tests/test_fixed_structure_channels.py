@@ -27,7 +27,8 @@ from ccd_casadi.fixed_structure.decoupling import (
     in_channels,
     is_decoupled,
 )
-from ccd_casadi.fixed_structure.figures import Curve, assess
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.support.errors import PlantError

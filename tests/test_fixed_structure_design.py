@@ -17,7 +17,8 @@ from ccd_casadi.fixed_structure import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import Curve, assess
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept
 from ccd_casadi.fixed_structure.structure import response, state_space

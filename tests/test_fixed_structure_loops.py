@@ -9,11 +9,12 @@ from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, loop, plant
 from ccd_casadi.deployment.discretise import Conversion, Discretisation, discretise
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.fixed_structure import Sampling, Structure
-from ccd_casadi.fixed_structure.certificate import _grid
+from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
-from ccd_casadi.fixed_structure.figures import Curve, assess, constraints, evaluate, to_theta
+from ccd_casadi.fixed_structure.figures import assess, constraints, evaluate, to_theta
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
+from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.starts import at_random
 from ccd_casadi.fixed_structure.structure import (
     response,
@@ -252,6 +253,6 @@ def test_plants_that_cannot_be_in_a_set_are_refused() -> None:
 def test_grid_points_that_rounding_parts_count_as_one() -> None:
     """Two of them at a peak left the judge a bracket without it."""
     pair = np.array([-1.0 + 100.0j, (-1.0 + 100.0j) * (1.0 + 1e-13)])
-    grid = _grid([pair], None, 1.0, 100.0, 0.0)
+    grid = frequency_grid([pair], None, 1.0, 100.0, 0.0)
     assert (np.diff(grid) > 1e-10 * grid[1:]).all()
     assert np.abs(grid - 100.0).min() < 1e-9

@@ -12,8 +12,9 @@ from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi,
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.figures import Curve, evaluate
+from ccd_casadi.fixed_structure.figures import evaluate
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.modal_sum import modal_sum
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

@@ -13,7 +13,7 @@ from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensit
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
-from ccd_casadi.inner_problem.sections_bandwidth import structure_of
+from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.rib_stage import NAMES

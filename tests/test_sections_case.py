@@ -14,7 +14,7 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import (
+from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     plants_of,
     structure_of,

@@ -13,15 +13,13 @@ from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import (
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
+from ccd_casadi.inner_problem.sections_robustness import (
     judged_corners,
     judged_widely,
-    prepared,
-    sections_value,
-    with_range,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError

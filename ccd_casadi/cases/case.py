@@ -3,8 +3,6 @@
 `problem_of` makes of it the problem in SI that the lower layers take.
 """
 
-import inspect
-import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, replace
@@ -12,21 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget, error_budget
-from ccd_casadi.cases.checks import (
-    FRACTION,
-    POSITIVE,
-    Check,
-    choice,
-    closest,
-    count,
-    flag,
-    number,
-    rows,
-    shown,
-    text,
-    too_large,
-)
-from ccd_casadi.cases.checks import CaseError as CaseError
+from ccd_casadi.cases.checks import closest, shown
 from ccd_casadi.cases.diagnosis import Severity, diagnose
 from ccd_casadi.cases.kinds import (
     check_kind,
@@ -36,23 +20,13 @@ from ccd_casadi.cases.kinds import (
     sections_problem,
     weights_of,
 )
-from ccd_casadi.cases.parameters import parameters_of
-from ccd_casadi.cases.parameters import parse_theta as parse_theta
-from ccd_casadi.cases.sections import (
-    SECTIONS,
-    Case,
-    ChannelSection,
-    PlantSection,
-    RobustSection,
-)
+from ccd_casadi.cases.plant_tables import plant_table, theta_tables
+from ccd_casadi.cases.sections import SECTIONS, Case, ChannelSection, RobustSection
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import with_options
+from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
-from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS, SHIPPED
-from ccd_casadi.plants.rib_stage import NAMES
-from ccd_casadi.plants.rib_stage.model import OUTPUTS
-from ccd_casadi.plants.rib_stage.plant import MESHES
+from ccd_casadi.plants.registry import DATA, SHIPPED
 from ccd_casadi.support.errors import PlantError, UserError, described, one_line
 from ccd_casadi.support.units import HZ
 
@@ -60,34 +34,15 @@ DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
 
 
+class CaseError(UserError):
+    """One line: file, key, what is wrong, what to do."""
+
+
 # Which weight must lie below which: else it asks for nothing (W_S) or for the opposite (W_T).
 _ORDERED_WEIGHTS = (
     ("A_S", "M_S", "W_S asks for more at low frequency"),
     ("A_u", "A_l", "W_T asks for a roll-off"),
 )
-# What the models of the package take, as far as a function's signature does not say it.
-_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2"), "rib_stage": NAMES}
-_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
-    ("two_mass", "zeta"): FRACTION,
-    ("rib_stage", "zeta"): FRACTION,
-    ("rib_stage", "outputs"): choice(*OUTPUTS),
-    ("rib_stage", "mesh"): choice(*MESHES),
-    ("rib_stage", "side"): POSITIVE,
-    ("rib_stage", "young"): POSITIVE,
-    ("rib_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
-    ("rib_stage", "density"): POSITIVE,
-    ("rib_stage", "least_bay"): POSITIVE,
-    ("rib_stage", "actuators"): rows(2),
-    ("rib_stage", "sensors"): rows(2),
-    ("rib_stage", "point_masses"): rows(3),
-    ("modal_table", "table"): text,
-    ("modal_table", "rigid_below_hz"): POSITIVE,
-    ("sampled_matrices", "folder"): text,
-    ("sampled_matrices", "modes"): count(1),
-    ("sampled_matrices", "static_correction"): flag,
-    ("sampled_matrices", "rigid_below_hz"): POSITIVE,
-}
-_KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 
 
 def load_case(path: str | Path) -> Case:
@@ -175,23 +130,13 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(f"weights.{high}", words)
     check_kind(sections, fail)
     sections["budget"] = checked_budget(sections["budget"], path.parent, fail)
-    plant = _plant(data["plant"], path, fail)
+    plant = plant_table(data["plant"], path, fail)
     files = sections["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
     for file, place in zip(files, absolute, strict=True):
-        _plant(dict(data["plant"]) | _options_in(file, place, fail), path, fail)
+        plant_table(dict(data["plant"]) | _options_in(file, place, fail), path, fail)
     sections["robust"] = replace(sections["robust"], plants=absolute)
-    theta, fixed = parameters_of(data["theta"], fail)
-    needed = _MODEL_THETA.get(plant.model or "")
-    if needed is not None:
-        for name in data["theta"]:
-            if name not in needed:
-                hint = closest(name, needed)
-                raise fail(f"theta.{name}", f"is no parameter of {plant.model}{hint}")
-        for name in needed:
-            if name not in data["theta"]:
-                words = f"is missing; add a table [theta.{name}], which {plant.model} needs"
-                raise fail(f"theta.{name}", words)
+    theta, fixed = theta_tables(data["theta"], plant.model, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
 
 
@@ -222,57 +167,6 @@ def section_of(
     return kind(**values)
 
 
-def _plant(
-    table: Mapping[str, Any], path: Path, fail: Callable[[str, str], CaseError]
-) -> PlantSection:
-    model, function = table.get("model"), table.get("function")
-    if (model is None) == (function is None):
-        raise fail("plant", "give either model or function, and not both")
-    if model == "measured":
-        words = "is one frequency response and has no theta: it goes with the command inner alone"
-        raise fail("plant.model", words)
-    if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
-        hint = closest(str(model), _KNOWN_MODELS)
-        raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
-    if function is not None:
-        parts = function.rsplit(":", 1) if isinstance(function, str) else []
-        if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
-            raise fail("plant.function", f'is {shown(function)}; write "my_plant.py:model"')
-        try:
-            exists = (path.parent / parts[0]).is_file()
-        except (OSError, ValueError):
-            exists = False
-        if not exists:
-            words = f"there is no file {shown(parts[0])}; give its path relative to the case file"
-            raise fail("plant.function", words)
-        # Absolute, so that the resolved case means the same from the run folder.
-        function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
-    options = {key: value for key, value in table.items() if key not in ("model", "function")}
-    takes = None if model is None else list(inspect.signature(_KNOWN_MODELS[model]).parameters)[1:]
-    for key, value in options.items():
-        if not key.isidentifier():
-            raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
-        if takes is not None and key not in takes:
-            raise fail(f"plant.{key}", f"is no option of {model}{closest(key, takes)}")
-        wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
-        if wrong is not None:
-            raise fail(f"plant.{key}", wrong)
-    data = DATA.get(model or "")
-    if data is not None:
-        if data not in options:
-            raise fail(f"plant.{data}", f"is missing; add it, which {model} needs")
-        try:
-            place = (path.parent / options[data]).resolve()
-            exists = place.exists()
-        except (OSError, ValueError):
-            exists = False
-        if not exists:
-            words = f"there is no {shown(options[data])}; give its path relative to the case file"
-            raise fail(f"plant.{data}", words)
-        options[data] = str(place)  # absolute, as a function's file
-    return PlantSection(model, function, options)
-
-
 def _options_in(file: str, place: str, fail: Callable[[str, str], CaseError]) -> dict[str, Any]:
     try:
         return read_options(Path(place))
@@ -280,20 +174,34 @@ def _options_in(file: str, place: str, fail: Callable[[str, str], CaseError]) ->
         raise fail("robust.plants", f"{shown(file)}: {error}") from None
 
 
-def _option(value: Any) -> str | None:
-    if isinstance(value, float) and not math.isfinite(value):
-        return f"is {value}; give a finite number"
-    if too_large(value):
-        return f"is {shown(value)}; write it as a float"
-    if isinstance(value, list):
-        for item in value:
-            wrong = _option(item)
-            if wrong is not None:
-                return wrong
-        return None
-    if isinstance(value, str | bool | int | float):
-        return None
-    return f"is {shown(value)}; give a number, text, true or false, or a list of them"
+def parse_theta(case: Case, text: str) -> tuple[float, ...]:
+    """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
+
+    def fail(words: str) -> CaseError:
+        return CaseError(one_line(f"{case.path}: --theta: {words}"))
+
+    names = [parameter.name for parameter in case.theta]
+    found: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, value = (item.strip() for item in part.partition("="))
+        if not equals:
+            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
+        if name not in names:
+            raise fail(f"{shown(name)} is no parameter of the case{closest(name, names)}")
+        if name in found:
+            raise fail(f"{name} is given twice; give it once")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
+    for parameter in case.theta:
+        if parameter.name not in found:
+            raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
+        number = found[parameter.name]
+        if not parameter.lower <= number <= parameter.upper:
+            bounds = f"{parameter.lower:g} to {parameter.upper:g}"
+            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
+    return tuple(found[name] for name in names)
 
 
 def problem_of(case: Case) -> CoDesignProblem:

@@ -3,15 +3,9 @@ to give instead. Each carries what JSON Schema can say of the same, for editors 
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
-
-from ccd_casadi.support.errors import UserError
-
-
-class CaseError(UserError):
-    """One line: file, key, what is wrong, what to do."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +198,7 @@ FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, math.inf, "give a number above 1")
 
 
-def closest(name: str, known: Iterable[str]) -> str:
-    """A hint for who wrote an unknown name: the one that was meant, or all."""
-    near = difflib.get_close_matches(name, list(known), 1)
+def closest(name: str, known: Collection[str]) -> str:
+    """The end of a message: the known name nearest to a mistyped one, else all of them."""
+    near = difflib.get_close_matches(name, known, 1)
     return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"

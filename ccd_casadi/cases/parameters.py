@@ -4,9 +4,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ccd_casadi.cases.checks import ANY, CaseError, Check, closest, flag, listed, shown, text
-from ccd_casadi.cases.sections import Case, Parameter
-from ccd_casadi.support.errors import one_line
+from ccd_casadi.cases.checks import ANY, Check, closest, flag, listed, shown, text
+from ccd_casadi.cases.sections import Parameter
 
 MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 
@@ -20,7 +19,7 @@ KEYS: dict[str, tuple[Check, str]] = {
     "integer": (flag, "whether it is a whole number between the bounds; default false"),
     "fixed": (ANY, "instead of all these but unit: its value, which is not searched"),
 }
-Fail = Callable[[str, str], CaseError]
+Fail = Callable[[str, str], Exception]
 
 
 def parameters_of(
@@ -87,33 +86,3 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
     if len(values) > MOST_VALUES:
         raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
     return Parameter(name, lower, upper, start, unit, values)
-
-
-def parse_theta(case: Case, text: str) -> tuple[float, ...]:
-    """θ from `m1=60,m2=60`, in the case's order. Raises CaseError naming what is wrong."""
-
-    def fail(words: str) -> CaseError:
-        return CaseError(one_line(f"{case.path}: --theta: {words}"))
-
-    names = [parameter.name for parameter in case.theta]
-    found: dict[str, float] = {}
-    for part in text.split(","):
-        name, equals, value = (item.strip() for item in part.partition("="))
-        if not equals:
-            raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
-        if name not in names:
-            raise fail(f"{shown(name)} is no parameter of the case{closest(name, names)}")
-        if name in found:
-            raise fail(f"{name} is given twice; give it once")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            raise fail(f"{name} = {shown(value)} is not a number; give one") from None
-    for parameter in case.theta:
-        if parameter.name not in found:
-            raise fail(f"{parameter.name} is missing; give all of {', '.join(names)}")
-        number = found[parameter.name]
-        if not parameter.lower <= number <= parameter.upper:
-            bounds = f"{parameter.lower:g} to {parameter.upper:g}"
-            raise fail(f"{parameter.name} = {number:g} is outside its bounds; give {bounds}")
-    return tuple(found[name] for name in names)

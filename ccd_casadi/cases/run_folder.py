@@ -18,8 +18,10 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import judged_corners, structure_of, with_range
+from ccd_casadi.inner_problem.sections_bandwidth import with_range
+from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem
+from ccd_casadi.inner_problem.sections_robustness import judged_corners
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

@@ -20,12 +20,11 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_inner,
 )
-from ccd_casadi.inner_problem.sections_bandwidth import (
+from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
-    joined,
     plants_of,
     sections_of_problem,
-    sections_value,
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem

@@ -37,7 +37,7 @@ from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_qualit
 from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.sections_truth import sections_kkt
 from ccd_casadi.codesign.stored import stored_thetas
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.support.arrays import Array

@@ -22,7 +22,7 @@ from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.units import HZ

@@ -30,20 +30,17 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import (
     joined,
-    judged_widely,
-    plants_of,
     prepared,
-    proof_of,
     race,
-    sections_of_problem,
     sections_value,
     too_slow,
     valued,
     with_range,
-    worst_members,
 )
 from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key

@@ -4,7 +4,7 @@ import math
 
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.verdict import Line, State, Verdict
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.support.units import HZ
 
 # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3.

@@ -34,7 +34,7 @@ from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.structure import state_space
-from ccd_casadi.inner_problem.sections_bandwidth import structure_of
+from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError

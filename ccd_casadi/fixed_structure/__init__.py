@@ -9,5 +9,5 @@ from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
 from ccd_casadi.fixed_structure.design import bandwidth_and_gradient as bandwidth_and_gradient
 from ccd_casadi.fixed_structure.design import synthesise_sections as synthesise_sections
-from ccd_casadi.fixed_structure.loop import Sampling as Sampling
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling as Sampling
 from ccd_casadi.fixed_structure.structure import Structure as Structure

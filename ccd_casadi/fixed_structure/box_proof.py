@@ -16,7 +16,8 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.loop import Sampling, closed_loops, stable
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.modal_sum import modal_sum
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

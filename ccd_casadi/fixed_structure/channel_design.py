@@ -33,7 +33,7 @@ from ccd_casadi.fixed_structure.design import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.race import (
     LocalOptimum,
     finished,

@@ -11,7 +11,8 @@ from functools import singledispatch
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, LoopProblem, Problem, evaluate
+from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem, Problem
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
 

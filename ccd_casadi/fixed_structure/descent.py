@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from ccd_casadi.fixed_structure.elastic_programme import FLAT, ROWS, Answer, solve_elastic
-from ccd_casadi.fixed_structure.figures import Constraints
+from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.support.arrays import Array
 
 PENALTIES = (20.0, 200.0, 2000.0)  # the next one where a bound is left passed

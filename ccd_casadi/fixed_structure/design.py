@@ -16,8 +16,10 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.figures import Curve, LoopProblem, Problem, assess
-from ccd_casadi.fixed_structure.loop import Sampling, plant_set
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
 from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept

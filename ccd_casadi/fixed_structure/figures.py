@@ -1,119 +1,39 @@
 """Every local peak of S, KS, T and GS on every plant against its bound, with exact derivatives.
 
-All are logarithms of a gain over its bound, so that a constraint is c(κ, τ) <= 0 with τ = ln ω_b:
-
-    S_max   ln|S| - ln S_max                        every local peak
-    shape   ln|S| + ½ ln 2 - min(0, ln(shape ω/ω_b))    every local peak on ω <= ω_b, and ω_b itself
-    S_low   ln|S(jω_low)| - ln S_low
-    KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
-
-Candidates are the local maxima on a grid that runs through every pole and zero of plants,
-controller and closed loops with its flanks: a rational function has no narrower peak than these.
-Each is closed on the zero of its exact slope. At a peak the derivative to κ is that of the curve,
+The constraints are those of `loop_problem`, their peaks those that `peak_search` finds. At a peak
+the derivative to κ is that of the curve,
 
     ∂ln|S| = ∂ln|GS| = -Re(T ∂ln K),   ∂ln|KS| = ∂ln|T| = Re(S ∂ln K)      (κ)
     ∂ln|S| = ∂ln|KS| = -Re(S K ∂G),    ∂ln|T| = Re(S ∂G/G)                 (the plant, so θ)
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
-from functools import cached_property, singledispatch
+from functools import singledispatch
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.loop import PlantSet, closed_loops, stable
+from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.loop_problem import (
+    Assessment,
+    Constraints,
+    Curve,
+    LoopProblem,
+    Problem,
+    chain_of,
+    log_weights,
+    shaped_at,
+)
+from ccd_casadi.fixed_structure.peak_search import closed_on_zero, frequency_grid
 from ccd_casadi.fixed_structure.structure import (
-    Structure,
     response,
     response_and_slope,
     response_and_slopes,
     roots,
 )
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.weights import Weights
 
-PER_DECADE = 24
-FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
-AROUND_THE_KINK = np.array([0.97, 0.99, 0.997, 1.0, 1.003, 1.01, 1.03])
 RELEVANT = -1.0  # ln of the share of its bound under which a peak is none of ours
-APART = 1e-8  # relative: grid points that are closer count as one
-CLOSINGS = 9  # of a peak's bracket by false position; the error is squared, so is its effect
 HALF_POWER = 0.5 * np.log(2.0)
-
-
-class Curve(IntEnum):
-    """What is bounded."""
-
-    S_MAX = 0
-    SHAPE = 1
-    S_LOW = 2
-    KS = 3
-    T = 4
-    GS = 5
-    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the shape
-
-
-@dataclass(frozen=True)
-class LoopProblem:
-    """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ.
-
-    `margin` is how far (in logarithms) inside every bound its searches aim.
-    """
-
-    plants: PlantSet
-    structure: Structure | ChannelStructure
-    bounds: Bounds
-    box: Array
-    margin: float = 0.0
-
-    @cached_property
-    def low(self) -> float:
-        """ω_low over ω₀."""
-        return self.bounds.omega_low / self.plants.omega_0
-
-    @cached_property
-    def base(self) -> Array:
-        """v from far below ω_low and every root to far above, logarithmic."""
-        sizes = np.abs(self.plants.poles[self.plants.residues != 0.0])
-        bottom = 0.03 * min(self.low, float(sizes.min()))
-        top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
-        if self.bounds.weighted_level is not None and self.bounds.weights is not None:
-            w = self.bounds.weights  # a K without enough roll-off has its largest W_KS KS there
-            top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
-        if self.plants.period is not None:
-            top = 100.0 / self.plants.period
-        return np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
-
-    @cached_property
-    def fixed(self) -> Array:
-        """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
-        P = self.plants
-        widest = max(len(z) for z in P.zeros)
-        found = np.full((len(P.plants), P.A.shape[1] + widest), np.nan, complex)
-        for i, plant in enumerate(P.plants):
-            found[i, : len(plant.A)] = np.linalg.eigvals(plant.A)
-            found[i, P.A.shape[1] : P.A.shape[1] + len(P.zeros[i])] = P.zeros[i]
-        return np.concatenate([np.tile(self.base, (len(found), 1)), _flanked(found)], axis=1)
-
-    @cached_property
-    def curves(self) -> tuple[Curve, ...]:
-        """Those of which all peaks count."""
-        found = [Curve.S_MAX, Curve.SHAPE]
-        if self.bounds.weighted_level is not None:
-            found += [Curve.KS, Curve.T]
-        if self.bounds.compliance_max is not None:
-            found.append(Curve.GS)
-        return tuple(found)
-
-
-@dataclass(frozen=True)
-class Problem(LoopProblem):
-    """That of SISO plants."""
-
-    structure: Structure
 
 
 @dataclass(frozen=True)
@@ -127,48 +47,6 @@ class Loops:
     to_kappa: np.ndarray
     levels: dict[Curve, Array]
     slopes: dict[Curve, Array]
-
-
-@dataclass(frozen=True)
-class Constraints:
-    """M constraints c <= 0: curve, plant, v (over ω₀), value, derivatives to κ (M, n) and τ."""
-
-    curve: np.ndarray
-    plant: np.ndarray
-    v: Array
-    value: Array
-    to_kappa: Array
-    to_tau: Array
-
-    def only(self, chosen: np.ndarray) -> "Constraints":
-        """Some of them, by mask or index."""
-        parts = (self.curve, self.plant, self.v, self.value, self.to_kappa, self.to_tau)
-        return Constraints(*(part[chosen] for part in parts))
-
-
-def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
-    """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
-    return row % len(problem.plants.plants)
-
-
-@dataclass(frozen=True)
-class Assessment:
-    """One controller on all plants: stable or not, and where it is, its constraints.
-
-    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks.
-    """
-
-    stable: bool
-    poles: np.ndarray
-    peaks: Constraints | None
-    near: Constraints | None
-
-    @property
-    def violation(self) -> float:
-        """The largest c above 0; infinite for an unstable loop."""
-        if self.peaks is None:
-            return np.inf
-        return max(0.0, float(self.peaks.value.max()))
 
 
 @singledispatch
@@ -343,72 +221,6 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
     return out
 
 
-def log_weights(weights: Weights, omega: Array) -> tuple[Array, Array]:
-    """ln|W_KS| (m/N), ln|W_T| as rows, and their slopes to ln ω; ω in rad/s."""
-    w = weights
-    square = omega**2
-    pairs = ((w.omega_K, w.c_K * w.omega_K), (w.omega_T / w.A_l, w.omega_T / w.A_u))
-    scales = (w.c_K / w.M_K, 1.0 / w.A_u)
-    values = [
-        np.log(scale) + 0.5 * np.log((square + zero**2) / (square + pole**2))
-        for scale, (zero, pole) in zip(scales, pairs, strict=True)
-    ]
-    slopes = [square / (square + z**2) - square / (square + p**2) for z, p in pairs]
-    return np.array(values), np.array(slopes)
-
-
-def shaped_at(problem: LoopProblem, omega: Array) -> Array:
-    """The ω that the shape counts: its own, without an integrator at least ω_low."""
-    return omega if problem.structure.integrator else np.maximum(omega, problem.low)
-
-
-def chain_of(problem: LoopProblem, v: Array) -> Array:
-    """∂ln ω/∂ln v."""
-    T = problem.plants.period
-    if T is None:
-        return np.ones_like(v)
-    return np.asarray(v / problem.plants.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
-
-
-def frequency_grid(
-    problem: LoopProblem, controller: tuple[np.ndarray, np.ndarray], poles: np.ndarray, tau: float
-) -> tuple[Array, np.ndarray]:
-    """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
-
-    `controller`: the zeros and the poles of K. Where the shape turns level its curve has a kink,
-    and may have a peak on either side of it.
-    """
-    own = np.concatenate(controller)
-    own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
-    parts = [problem.fixed, _flanked(own), _flanked(poles)]
-    if problem.bounds.shape is not None:
-        kink = np.exp(tau) / problem.bounds.shape * AROUND_THE_KINK
-        parts.append(np.tile(problem.plants.variable(kink), (len(poles), 1)))
-    joint = np.concatenate(parts, axis=1)
-    bottom, top = problem.base[0], problem.base[-1]
-    # Points that fall together would hide a peak between them: spares go below the base instead.
-    spare = np.broadcast_to(bottom * np.linspace(0.5, 0.99, joint.shape[1]), joint.shape)
-    joint = np.where((joint >= bottom) & (joint <= top), joint, spare)
-    order = np.argsort(joint, axis=1, kind="stable")
-    v = np.take_along_axis(joint, order, axis=1)
-    twice = np.zeros(v.shape, bool)
-    twice[:, 1:] = np.diff(v, axis=1) < APART * v[:, 1:]
-    regular = (order < len(problem.base)) & ~twice
-    v = np.where(twice, spare * 0.5, v)
-    order = np.argsort(v, axis=1)
-    v, regular = np.take_along_axis(v, order, axis=1), np.take_along_axis(regular, order, axis=1)
-    # Conjugate roots fall together, so that nearly half were spares; one below the base is enough.
-    useless = slice(1, max(1, int((v < bottom).sum(axis=1).min())))
-    return np.delete(v, useless, axis=1), np.delete(regular, useless, axis=1)
-
-
-def _flanked(values: np.ndarray) -> Array:
-    """Frequencies around roots (P, n): the imaginary part with flanks, and the size."""
-    centre, half = np.abs(values.imag), np.abs(values.real)
-    found = centre[..., None] + half[..., None] * FLANKS
-    return np.concatenate([found.reshape(len(values), -1), np.abs(values)], axis=1)
-
-
 def _closed(
     problem: Problem,
     kappa: Array,
@@ -428,34 +240,3 @@ def _closed(
         return out
 
     return closed_on_zero(slope, start, low, high)
-
-
-def closed_on_zero(
-    slope: Callable[[Array, np.ndarray], Array], start: Array, low: Array, high: Array
-) -> tuple[Array, np.ndarray]:
-    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
-
-    `slope` takes logarithms and the indices of the brackets that they are in. Where a bracket's
-    slopes do not change sign (an end) the start stays; second: where they do.
-    """
-    if not len(start):
-        return start, np.zeros(0, bool)
-    every = np.arange(len(start))
-    middle = np.log(start)
-    f = slope(middle, every)
-    other = np.where(f > 0.0, np.log(high), np.log(low))
-    g = slope(other, every)
-    a, fa, b, fb = middle.copy(), f.copy(), other, g
-    inside = (fa * fb < 0.0) & np.isfinite(fa) & np.isfinite(fb)
-    left = np.flatnonzero(inside)
-    for _ in range(CLOSINGS):
-        if not len(left):
-            break
-        A, FA, B, FB = a[left], fa[left], b[left], fb[left]
-        x = B - FB * (B - A) / (FB - FA)
-        fx = slope(x, left)
-        opposite = fx * FB < 0.0
-        a[left], fa[left] = np.where(opposite, B, A), np.where(opposite, FB, 0.5 * FA)
-        b[left], fb[left] = x, fx
-        left = left[np.abs(fx) >= 1e-9]
-    return np.exp(np.where(inside, b, middle)), inside

@@ -34,8 +34,9 @@ from ccd_casadi.fixed_structure.design import (
     in_problem_units,
     problem_for,
 )
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, Problem, assess, to_theta
-from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.figures import assess, to_theta
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, Problem
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array

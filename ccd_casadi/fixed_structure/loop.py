@@ -15,61 +15,22 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import eig, expm
 
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling, moments, transfer
+from ccd_casadi.fixed_structure.loop_plant import (
+    LoopPlant,
+    finite_zeros,
+    loop_plants,
+    padded_modes,
+    padded_states,
+)
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
-FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
 CANCELLING = 1e-4  # |z - e^{pT}| below which the difference loses digits, and expm1 does not
-INSTANT = 1e-9  # share of a period that counts as none
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How the loop runs: rate in Hz, delay from measurement to force in µs."""
-
-    rate_hz: float
-    delay_us: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not self.rate_hz > 0.0:
-            raise ValueError(f"rate_hz is {self.rate_hz}; give a rate above 0")
-        if not self.delay_us >= 0.0:
-            raise ValueError(f"delay_us is {self.delay_us}; give 0 or more")
-
-    @property
-    def period(self) -> float:
-        """T in s."""
-        return 1.0 / self.rate_hz
-
-    @property
-    def delay(self) -> float:
-        """τ in s."""
-        return 1e-6 * self.delay_us
-
-
-@dataclass(frozen=True)
-class LoopPlant:
-    """One plant as the loop sees it.
-
-    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B (n, m) and `reading` =
-    CV (p, n) in its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    poles: np.ndarray
-    drive: np.ndarray
-    reading: np.ndarray
-    dA: np.ndarray
-    dB: np.ndarray
-    dC: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -96,7 +57,7 @@ class PlantSet:
     def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of hold and delay: d (P,), and a mode's two moments and e^{pT}, (P, n)."""
         assert self.period is not None
-        d, late, early = _moments(self.poles, self.period, self.delay)
+        d, late, early = moments(self.poles, self.period, self.delay)
         return np.full(len(self.poles), d), late, early, np.exp(self.poles * self.period)
 
     def frequency(self, v: Array) -> Array:
@@ -187,13 +148,13 @@ class PlantSet:
         p = plant.poles
         omega = self.frequency(np.asarray(v, float))
         period = None if free else self.period
-        f, slope = _transfer(p, omega, period, self.delay)
+        f, slope = transfer(p, omega, period, self.delay)
         gap = p[:, None] - p[None, :]
         near = np.abs(gap) <= CLOSE * np.maximum(np.abs(p)[:, None], np.abs(p)[None, :])
         middle = 0.5 * (p[:, None] + p[None, :])
         between = np.where(
             near,
-            _transfer(middle.ravel(), omega, period, self.delay)[1].reshape(-1, *gap.shape)
+            transfer(middle.ravel(), omega, period, self.delay)[1].reshape(-1, *gap.shape)
             if (near.sum() > len(p))
             else slope[:, :, None] * np.ones(len(p)),
             (f[:, :, None] - f[:, None, :]) / np.where(near, 1.0, gap),
@@ -228,49 +189,6 @@ def plant_set(plants: Sequence[ScaledPlant], sampling: Sampling | None = None) -
                     *padded_states(found))  # fmt: skip
 
 
-def loop_plants(
-    plants: Sequence[ScaledPlant], sampling: Sampling | None
-) -> tuple[list[LoopPlant], tuple[float, float, float | None, float]]:
-    """Plants of any number of inputs and outputs in the units of the first: ω₀, force, T and τ.
-
-    Raises PlantError for a plant that is not stable or not diagonalisable.
-    """
-    if not plants:
-        raise PlantError("there is no plant in the set; give at least one")
-    omega_0, force = plants[0].omega_0, plants[0].force
-    period = None if sampling is None else sampling.period * omega_0
-    delay = 0.0 if sampling is None else sampling.delay * omega_0
-    found = [
-        _loop_plant(plant, number, omega_0, force, period, delay)
-        for number, plant in enumerate(plants, 1)
-    ]
-    return found, (omega_0, force, period, delay)
-
-
-def padded_modes(found: Sequence[LoopPlant]) -> tuple[np.ndarray, np.ndarray]:
-    """Poles (P, n) and residues (P, n, p, m), shorter plants with residues of zero."""
-    most = max(len(plant.poles) for plant in found)
-    first = found[0]
-    poles = np.full((len(found), most), -1.0, complex)
-    residues = np.zeros((*poles.shape, len(first.reading), first.drive.shape[1]), complex)
-    for i, loop in enumerate(found):
-        poles[i, : len(loop.poles)] = loop.poles
-        residues[i, : len(loop.poles)] = np.einsum("pn,nm->npm", loop.reading, loop.drive)
-    return poles, residues
-
-
-def padded_states(found: Sequence[LoopPlant]) -> tuple[Array, Array, Array, Array]:
-    """(A, B, C, D) in w of all plants, shorter ones with stable states that do nothing."""
-    states = max(len(plant.A) for plant in found)
-    p, m = found[0].D.shape
-    A = np.tile(-np.eye(states), (len(found), 1, 1))
-    B, C = np.zeros((len(found), states, m)), np.zeros((len(found), p, states))
-    for i, loop in enumerate(found):
-        n = len(loop.A)
-        A[i, :n, :n], B[i, :n], C[i, :, :n] = loop.A, loop.B, loop.C
-    return A, B, C, np.array([plant.D for plant in found])
-
-
 def closed_loops(plants: PlantSet, structure: Structure, kappa: Array) -> np.ndarray:
     """Poles (N, P, n) in w of every plant's loop with N controllers κ (N, n_κ); NaN if ill-posed.
 
@@ -297,112 +215,3 @@ def stable(poles: np.ndarray) -> np.ndarray:
     """Whether all poles (..., n) lie in the open left half plane."""
     with np.errstate(invalid="ignore"):
         return np.asarray((poles.real < 0.0).all(-1))
-
-
-def _transfer(
-    p: np.ndarray, omega: Array, period: float | None, delay: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """f(p) and f'(p), (len(ω), len(p)), with which the plant's response is C f(A) B."""
-    s = 1j * omega[:, None]
-    if period is None:
-        f = 1.0 / (s - p)
-        return f, f * f
-    T = period
-    d, late, early = _moments(p, T, delay)
-    h = T * (np.floor(delay / T + INSTANT) + 1.0) - delay  # (1 - f)T
-    z = np.exp(s * T)
-    lam = np.exp(p * T)
-    gap = lam * np.expm1((s - p) * T)
-    d_late = (h * np.exp(p * h) - late) / p
-    rest = T - h
-    phi = np.expm1(p * rest) / p
-    d_early = h * early + np.exp(p * h) * (rest * np.exp(p * rest) - phi) / p
-    top = late + early / z
-    shift = np.exp(-s * T * d)
-    f = top / gap
-    return f * shift, ((d_late + d_early / z) / gap + f * T * lam / gap) * shift
-
-
-def _moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Whole periods d of delay, and what u_{k-d} and u_{k-d-1} give a mode in one period."""
-    d = float(np.floor(delay / T + INSTANT))
-    rest = max(delay - d * T, 0.0)
-    h = T - rest
-    late = np.expm1(p * h) / p
-    early = np.exp(p * h) * np.expm1(p * rest) / p
-    return d, late, early
-
-
-def _loop_plant(
-    plant: ScaledPlant,
-    number: int,
-    omega_0: float,
-    force: float,
-    period: float | None,
-    delay: float,
-) -> LoopPlant:
-    ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
-    A, B, C = ratio * plant.A, drive * plant.B, plant.C
-    poles, V = np.linalg.eig(A)
-    if not (poles.real < 0.0).all():
-        words = "is not stable; a suspension has to hold its rigid-body modes"
-        raise PlantError(f"plant {number} {words}")
-    W = np.linalg.inv(V)
-    b, c = W @ B, C @ V
-    at = 1j * np.geomspace(1e-2, 1e2, 7)
-    direct = np.array([C @ np.linalg.solve(s * np.eye(len(A)) - A, B) for s in at])
-    modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (at[:, None] - poles), b)
-    if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
-        words = "has poles that coincide and are coupled; move a damping ratio away from 1"
-        raise PlantError(f"plant {number} {words}")
-    state = (A, B, C, np.zeros((len(C), B.shape[1])))
-    if period is not None:
-        state = _in_w(*_sampled(A, B, C, period, delay), period)
-    dA = W @ (ratio * plant.dA) @ V
-    return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
-
-
-def _sampled(A: Array, B: Array, C: Array, T: float, delay: float) -> tuple[Array, Array, Array]:
-    """x_{k+1} = A x_k + B u_k behind hold and delay; states [x; u_{k-1}; …]."""
-    n, m = B.shape
-    d = int(np.floor(delay / T + INSTANT))
-    rest = max(delay - d * T, 0.0)
-    joint = np.zeros((n + m, n + m))
-    joint[:n] = np.hstack([A, B])
-    early, late = expm(joint * rest), expm(joint * (T - rest))
-    kept = m * (d + (rest > 0.0))
-    Ad, Bd = np.zeros((n + kept, n + kept)), np.zeros((n + kept, m))
-    Ad[:n, :n] = late[:n, :n] @ early[:n, :n]
-    for age, gain in ((d, late[:n, n:]), (d + 1, late[:n, :n] @ early[:n, n:])):
-        if age == 0:
-            Bd[:n] = gain
-        elif m * age <= kept:
-            Ad[:n, n + m * (age - 1) : n + m * age] = gain
-    if kept:
-        Bd[n : n + m] = np.eye(m)
-        Ad[n + m :, n : n + kept - m] = np.eye(kept - m)
-    return Ad, Bd, np.hstack([C, np.zeros((len(C), kept))])
-
-
-def _in_w(A: Array, B: Array, C: Array, T: float) -> tuple[Array, Array, Array, Array]:
-    """z = (1 + wT/2)/(1 - wT/2) in a discrete state space."""
-    inverse = np.linalg.inv(A + np.eye(len(A)))
-    root = 2.0 / np.sqrt(T)
-    return (
-        2.0 / T * inverse @ (A - np.eye(len(A))),
-        root * inverse @ B,
-        root * C @ inverse,
-        -C @ inverse @ B,
-    )
-
-
-def finite_zeros(plant: LoopPlant) -> np.ndarray:
-    """Finite eigenvalues of the system matrix's pencil in w; none where it is not square."""
-    n, m = plant.B.shape
-    if len(plant.C) != m:
-        return np.empty(0, complex)
-    system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
-    shape = np.zeros((n + m, n + m))
-    shape[:n, :n] = np.eye(n)
-    values = eig(system, shape, right=False)
-    return np.asarray(values[np.isfinite(values) & (np.abs(values) < 1e5)])

@@ -16,7 +16,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.descent import Point, descend
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, log_weights
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
     MeasuredFigures,
     MeasuredResponse,

@@ -15,7 +15,7 @@ holds where the model does. A peak moves as κ does: -c_xκ c_xκᵀ/c_xx is add
 import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import STEP
-from ccd_casadi.fixed_structure.figures import Constraints, Curve
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve
 from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, Rows, evaluate_rows
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array

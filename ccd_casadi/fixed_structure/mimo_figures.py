@@ -23,23 +23,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.figures import (
-    HALF_POWER,
+from ccd_casadi.fixed_structure.figures import HALF_POWER, assess, to_theta
+from ccd_casadi.fixed_structure.loop import stable
+from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
     Curve,
     LoopProblem,
-    assess,
     chain_of,
-    closed_on_zero,
-    frequency_grid,
     log_weights,
     plant_of_row,
     shaped_at,
-    to_theta,
 )
-from ccd_casadi.fixed_structure.loop import stable
 from ccd_casadi.fixed_structure.mimo_loop import MatrixPlantSet, whole_closed_loops
+from ccd_casadi.fixed_structure.peak_search import closed_on_zero, frequency_grid
 from ccd_casadi.fixed_structure.structure import response, response_and_slopes
 from ccd_casadi.support.arrays import Array
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from ccd_casadi.fixed_structure.figures import Constraints, Curve, LoopProblem, to_theta
+from ccd_casadi.fixed_structure.figures import to_theta
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.support.arrays import Array
 

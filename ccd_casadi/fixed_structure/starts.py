@@ -9,8 +9,8 @@ closed loop of the set is stable with are kept, as eigenvalues say, for hundreds
 import numpy as np
 from scipy.optimize import least_squares
 
-from ccd_casadi.fixed_structure.figures import Problem
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
+from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array

@@ -15,7 +15,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.elastic_programme import FLAT, ROWS, solve_elastic
-from ccd_casadi.fixed_structure.figures import Assessment, Constraints, LoopProblem, assess
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
 from ccd_casadi.support.arrays import Array
 
 FIRST_RADIUS = 0.2

@@ -27,8 +27,9 @@ from ccd_casadi.fixed_structure.design import (
     in_problem_units,
     problem_for,
 )
-from ccd_casadi.fixed_structure.figures import Constraints, LoopProblem, assess, to_theta
-from ccd_casadi.fixed_structure.loop import Sampling
+from ccd_casadi.fixed_structure.figures import assess, to_theta
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace

@@ -11,7 +11,7 @@ from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import plants_of
+from ccd_casadi.inner_problem.sections_plant_set import plants_of
 from ccd_casadi.plants.scaling import StateSpace
 
 

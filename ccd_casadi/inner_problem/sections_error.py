@@ -6,16 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import LeastError, least_error
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import (
-    Progress,
-    bounds_of,
-    joined,
-    plants_of,
-    sections_of_problem,
-    worst_members,
-)
+from ccd_casadi.inner_problem.sections_bandwidth import joined
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_robustness import worst_members
 
 ROUNDS = 4  # of a search on the set and one for plants that are worse
 

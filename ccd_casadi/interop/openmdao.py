@@ -13,7 +13,8 @@ import numpy as np
 
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem, sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

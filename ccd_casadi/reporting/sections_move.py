@@ -10,7 +10,7 @@ from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace

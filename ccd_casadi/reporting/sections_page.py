@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import Fact, binding, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance_of_sections

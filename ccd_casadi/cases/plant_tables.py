@@ -1,0 +1,140 @@
+"""The tables [plant] and [theta.NAME] of a case file, whose keys depend on the plant, checked."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.checks import (
+    FRACTION,
+    POSITIVE,
+    Check,
+    choice,
+    closest,
+    count,
+    flag,
+    number,
+    rows,
+    shown,
+    text,
+    too_large,
+)
+from ccd_casadi.cases.parameters import parameters_of
+from ccd_casadi.cases.sections import Parameter, PlantSection
+from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
+from ccd_casadi.plants.rib_stage import NAMES
+from ccd_casadi.plants.rib_stage.model import OUTPUTS
+from ccd_casadi.plants.rib_stage.plant import MESHES
+
+# What the models of the package take, as far as a function's signature does not say it.
+_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2"), "rib_stage": NAMES}
+_MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
+    ("two_mass", "zeta"): FRACTION,
+    ("rib_stage", "zeta"): FRACTION,
+    ("rib_stage", "outputs"): choice(*OUTPUTS),
+    ("rib_stage", "mesh"): choice(*MESHES),
+    ("rib_stage", "side"): POSITIVE,
+    ("rib_stage", "young"): POSITIVE,
+    ("rib_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
+    ("rib_stage", "density"): POSITIVE,
+    ("rib_stage", "least_bay"): POSITIVE,
+    ("rib_stage", "actuators"): rows(2),
+    ("rib_stage", "sensors"): rows(2),
+    ("rib_stage", "point_masses"): rows(3),
+    ("modal_table", "table"): text,
+    ("modal_table", "rigid_below_hz"): POSITIVE,
+    ("sampled_matrices", "folder"): text,
+    ("sampled_matrices", "modes"): count(1),
+    ("sampled_matrices", "static_correction"): flag,
+    ("sampled_matrices", "rigid_below_hz"): POSITIVE,
+}
+_KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
+
+
+def plant_table(
+    table: Mapping[str, Any], path: Path, fail: Callable[[str, str], Exception]
+) -> PlantSection:
+    """[plant], files in it as absolute paths."""
+    model, function = table.get("model"), table.get("function")
+    if (model is None) == (function is None):
+        raise fail("plant", "give either model or function, and not both")
+    if model == "measured":
+        words = "is one frequency response and has no theta: it goes with the command inner alone"
+        raise fail("plant.model", words)
+    if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
+        hint = closest(str(model), _KNOWN_MODELS)
+        raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
+    if function is not None:
+        parts = function.rsplit(":", 1) if isinstance(function, str) else []
+        if len(parts) != 2 or not parts[0].endswith(".py") or not parts[1].isidentifier():
+            raise fail("plant.function", f'is {shown(function)}; write "my_plant.py:model"')
+        try:
+            exists = (path.parent / parts[0]).is_file()
+        except (OSError, ValueError):
+            exists = False
+        if not exists:
+            words = f"there is no file {shown(parts[0])}; give its path relative to the case file"
+            raise fail("plant.function", words)
+        # Absolute, so that the resolved case means the same from the run folder.
+        function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
+    options = {key: value for key, value in table.items() if key not in ("model", "function")}
+    takes = None if model is None else list(inspect.signature(_KNOWN_MODELS[model]).parameters)[1:]
+    for key, value in options.items():
+        if not key.isidentifier():
+            raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
+        if takes is not None and key not in takes:
+            raise fail(f"plant.{key}", f"is no option of {model}{closest(key, takes)}")
+        wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
+        if wrong is not None:
+            raise fail(f"plant.{key}", wrong)
+    data = DATA.get(model or "")
+    if data is not None:
+        if data not in options:
+            raise fail(f"plant.{data}", f"is missing; add it, which {model} needs")
+        try:
+            place = (path.parent / options[data]).resolve()
+            exists = place.exists()
+        except (OSError, ValueError):
+            exists = False
+        if not exists:
+            words = f"there is no {shown(options[data])}; give its path relative to the case file"
+            raise fail(f"plant.{data}", words)
+        options[data] = str(place)  # absolute, as a function's file
+    return PlantSection(model, function, options)
+
+
+def _option(value: Any) -> str | None:
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"is {value}; give a finite number"
+    if too_large(value):
+        return f"is {shown(value)}; write it as a float"
+    if isinstance(value, list):
+        for item in value:
+            wrong = _option(item)
+            if wrong is not None:
+                return wrong
+        return None
+    if isinstance(value, str | bool | int | float):
+        return None
+    return f"is {shown(value)}; give a number, text, true or false, or a list of them"
+
+
+def theta_tables(
+    table: Mapping[str, Any], model: str | None, fail: Callable[[str, str], Exception]
+) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
+    """[theta.NAME] of every parameter, searched ones and fixed ones.
+
+    Those that a model of the package needs, and no other.
+    """
+    searched, fixed = parameters_of(table, fail)
+    needed = _MODEL_THETA.get(model or "")
+    if needed is not None:
+        for name in table:
+            if name not in needed:
+                raise fail(f"theta.{name}", f"is no parameter of {model}{closest(name, needed)}")
+        for name in needed:
+            if name not in table:
+                words = f"is missing; add a table [theta.{name}], which {model} needs"
+                raise fail(f"theta.{name}", words)
+    return searched, fixed

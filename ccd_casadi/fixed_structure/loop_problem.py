@@ -1,0 +1,175 @@
+"""What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
+
+    S_max   ln|S| - ln S_max                        every local peak
+    shape   ln|S| + ½ ln 2 - min(0, ln(shape ω/ω_b))    every local peak on ω <= ω_b, and ω_b itself
+    S_low   ln|S(jω_low)| - ln S_low
+    KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
+
+A constraint is c(κ, τ) <= 0 with τ = ln ω_b.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.loop import PlantSet
+from ccd_casadi.fixed_structure.structure import (
+    Structure,
+)
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.weights import Weights
+
+PER_DECADE = 24
+FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
+
+
+class Curve(IntEnum):
+    """What is bounded."""
+
+    S_MAX = 0
+    SHAPE = 1
+    S_LOW = 2
+    KS = 3
+    T = 4
+    GS = 5
+    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the shape
+
+
+@dataclass(frozen=True)
+class LoopProblem:
+    """The plants, the structure and the bounds, frequencies over ω₀; `box` (2, n) bounds κ.
+
+    `margin` is how far (in logarithms) inside every bound its searches aim.
+    """
+
+    plants: PlantSet
+    structure: Structure | ChannelStructure
+    bounds: Bounds
+    box: Array
+    margin: float = 0.0
+
+    @cached_property
+    def low(self) -> float:
+        """ω_low over ω₀."""
+        return self.bounds.omega_low / self.plants.omega_0
+
+    @cached_property
+    def base(self) -> Array:
+        """v from far below ω_low and every root to far above, logarithmic."""
+        sizes = np.abs(self.plants.poles[self.plants.residues != 0.0])
+        bottom = 0.03 * min(self.low, float(sizes.min()))
+        top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
+        if self.bounds.weighted_level is not None and self.bounds.weights is not None:
+            w = self.bounds.weights  # a K without enough roll-off has its largest W_KS KS there
+            top = max(top, 10.0 * max(w.c_K * w.omega_K, w.omega_T / w.A_u) / self.plants.omega_0)
+        if self.plants.period is not None:
+            top = 100.0 / self.plants.period
+        return np.geomspace(bottom, top, int(PER_DECADE * np.log10(top / bottom)))
+
+    @cached_property
+    def fixed(self) -> Array:
+        """The base grid and the flanks of every plant's poles and zeros, (P, k)."""
+        P = self.plants
+        widest = max(len(z) for z in P.zeros)
+        found = np.full((len(P.plants), P.A.shape[1] + widest), np.nan, complex)
+        for i, plant in enumerate(P.plants):
+            found[i, : len(plant.A)] = np.linalg.eigvals(plant.A)
+            found[i, P.A.shape[1] : P.A.shape[1] + len(P.zeros[i])] = P.zeros[i]
+        return np.concatenate([np.tile(self.base, (len(found), 1)), flanked(found)], axis=1)
+
+    @cached_property
+    def curves(self) -> tuple[Curve, ...]:
+        """Those of which all peaks count."""
+        found = [Curve.S_MAX, Curve.SHAPE]
+        if self.bounds.weighted_level is not None:
+            found += [Curve.KS, Curve.T]
+        if self.bounds.compliance_max is not None:
+            found.append(Curve.GS)
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class Problem(LoopProblem):
+    """That of SISO plants."""
+
+    structure: Structure
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """M constraints c <= 0: curve, plant, v (over ω₀), value, derivatives to κ (M, n) and τ."""
+
+    curve: np.ndarray
+    plant: np.ndarray
+    v: Array
+    value: Array
+    to_kappa: Array
+    to_tau: Array
+
+    def only(self, chosen: np.ndarray) -> "Constraints":
+        """Some of them, by mask or index."""
+        parts = (self.curve, self.plant, self.v, self.value, self.to_kappa, self.to_tau)
+        return Constraints(*(part[chosen] for part in parts))
+
+
+def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
+    """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
+    return row % len(problem.plants.plants)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """One controller on all plants: stable or not, and where it is, its constraints.
+
+    `peaks` are exact; `near` lie on the base grid and tell how curves go between the peaks.
+    """
+
+    stable: bool
+    poles: np.ndarray
+    peaks: Constraints | None
+    near: Constraints | None
+
+    @property
+    def violation(self) -> float:
+        """The largest c above 0; infinite for an unstable loop."""
+        if self.peaks is None:
+            return np.inf
+        return max(0.0, float(self.peaks.value.max()))
+
+
+def log_weights(weights: Weights, omega: Array) -> tuple[Array, Array]:
+    """ln|W_KS| (m/N), ln|W_T| as rows, and their slopes to ln ω; ω in rad/s."""
+    w = weights
+    square = omega**2
+    pairs = ((w.omega_K, w.c_K * w.omega_K), (w.omega_T / w.A_l, w.omega_T / w.A_u))
+    scales = (w.c_K / w.M_K, 1.0 / w.A_u)
+    values = [
+        np.log(scale) + 0.5 * np.log((square + zero**2) / (square + pole**2))
+        for scale, (zero, pole) in zip(scales, pairs, strict=True)
+    ]
+    slopes = [square / (square + z**2) - square / (square + p**2) for z, p in pairs]
+    return np.array(values), np.array(slopes)
+
+
+def shaped_at(problem: LoopProblem, omega: Array) -> Array:
+    """The ω that the shape counts: its own, without an integrator at least ω_low."""
+    return omega if problem.structure.integrator else np.maximum(omega, problem.low)
+
+
+def chain_of(problem: LoopProblem, v: Array) -> Array:
+    """∂ln ω/∂ln v."""
+    T = problem.plants.period
+    if T is None:
+        return np.ones_like(v)
+    return np.asarray(v / problem.plants.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
+
+
+def flanked(values: np.ndarray) -> Array:
+    """Frequencies around roots (P, n): the imaginary part with flanks, and the size."""
+    centre, half = np.abs(values.imag), np.abs(values.real)
+    found = centre[..., None] + half[..., None] * FLANKS
+    return np.concatenate([found.reshape(len(values), -1), np.abs(values)], axis=1)

@@ -1,0 +1,105 @@
+"""What a problem with a fixed structure is made of: structure, channels, bounds, plants at a θ."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+
+
+def sections_of_problem(problem: CoDesignProblem) -> SectionsProblem:
+    """The sections of a problem that has them."""
+    assert problem.sections is not None
+    return problem.sections
+
+
+def bounds_of(problem: CoDesignProblem) -> Bounds:
+    """The bounds on every plant, SI."""
+    sections, inner = sections_of_problem(problem), problem.inner
+    weighted = sections.weighted_level is not None
+    return Bounds(
+        S_max=inner.S_max,
+        S_low=inner.S_low,
+        omega_low=inner.omega_low,
+        shape=sections.shape,
+        weighted_level=sections.weighted_level,
+        weights=problem.weights if weighted else None,
+        compliance_max=sections.compliance_max,
+    )
+
+
+def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:
+    """The controller's structure: one, or one for each channel of a plant with several."""
+    if plant_of(problem).outputs == 1:
+        return sections_of_problem(problem).structure
+    channels = sections_of_problem(with_channels(problem)).channels
+    names, outputs, inputs = zip(
+        *((channel.name, channel.outputs or (), channel.inputs or ()) for channel in channels),
+        strict=True,
+    )
+    structures = tuple(channel.structure for channel in channels)
+    owners = tuple(names.index(channel.like or channel.name) for channel in channels)
+    return ChannelStructure(given_decoupling(names, outputs, inputs), structures, owners)
+
+
+def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with the directions of its channels, by the plant at its start, for every θ."""
+    sections = sections_of_problem(problem)
+    known = {channel.name: channel for channel in sections.channels}
+    given = [channel.outputs is not None for channel in sections.channels]
+    if plant_of(problem).outputs == 1 or any(given):
+        return problem
+    found = find_decoupling(scaled_plant(problem, problem.start))
+    channels = []
+    for i, name in enumerate(found.names):
+        own = known.get(name, ChannelProblem(name, sections.structure))
+        outputs, inputs = (tuple(map(float, M[:, i])) for M in (found.outputs, found.inputs))
+        channels.append(replace(own, outputs=outputs, inputs=inputs))
+    return with_sections(problem, channels=tuple(channels))
+
+
+def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
+    """The model at θ with every option set, and the box of what may differ from it."""
+    u = sections_of_problem(problem).uncertainty
+    systems = [mechanics(plant_of(problem), theta)]
+    for options in u.options:
+        systems.append(mechanics(plant_of(with_options(problem, options)), theta))
+    return UncertainPlant(
+        tuple(systems), problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift,
+        u.damping, u.gain,
+    )  # fmt: skip
+
+
+def with_options(
+    problem: CoDesignProblem, options: Sequence[tuple[str, object]]
+) -> CoDesignProblem:
+    """The problem with some options of its plant replaced."""
+    merged = tuple(sorted((dict(problem.source.options) | dict(options)).items()))
+    source: PlantSource = replace(problem.source, options=merged)
+    return replace(problem, source=source)
+
+
+def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
+    """The plant set at θ: its members, or the corners of the box where none are known yet."""
+    uncertain = uncertain_plant(problem, theta)
+    return uncertain.plants(_points(problem, uncertain))
+
+
+def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[int, Array]]:
+    members = sections_of_problem(problem).members
+    if not members:
+        return uncertain.corners()
+    return [(option, np.array(point)) for option, point in members]
+
+
+def with_sections(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
+    return replace(problem, sections=replace(sections_of_problem(problem), **changes))  # type: ignore[arg-type]

@@ -1,0 +1,118 @@
+"""A controller of fixed structure on the whole box of plants: the worst of them, judge, proof.
+
+The worst plants join the set that `sections_bandwidth` designs for; the judge looks at a lattice of
+the box beside them, branch and bound at all of it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
+from ccd_casadi.fixed_structure.box_proof import Proof, prove
+from ccd_casadi.fixed_structure.design import Progress
+from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_plant_set import (
+    bounds_of,
+    sections_of_problem,
+    structure_of,
+    uncertain_plant,
+)
+from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.process_pool import Pool
+
+AT_ONCE = 3  # plants added in a round
+APART = 1e-4  # of the box: members that are closer are the same plant
+CHECKED = 200  # plants that the judge looks at in the end
+LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
+
+
+def worst_members(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    turn: int = 0,
+    progress: Progress | None = None,
+) -> tuple[Excess, tuple[Member, ...]]:
+    """The worst plant of the box for a design, and those to add: past a bound, each a new one."""
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    heads, count = worst_plants(
+        uncertain, structure_of(problem), made.kappa, made.bandwidth, bounds_of(problem),
+        sections.sampling, seed=sections.seed + turn,
+    )  # fmt: skip
+    if progress is not None:
+        progress(f"worst of {count} plants: {np.expm1(heads[0].value):+.3%} of a bound")
+    width = uncertain.box[1] - uncertain.box[0]
+    known = list(sections.members)
+    found: list[Member] = []
+    for head in heads:
+        near = [
+            float(np.abs((head.point - np.array(point)) / width).max(initial=0.0))
+            for option, point in (*known, *found)
+            if option == head.option
+        ]
+        if head.value > WITHIN and (not near or min(near) > APART) and len(found) < AT_ONCE:
+            found.append((head.option, tuple(map(float, head.point))))
+    return heads[0], tuple(found)
+
+
+def judged_widely(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    controller: StateSpace,
+    worst: Excess,
+    workers: Pool | None = None,
+) -> tuple[Certificate, int]:
+    """The independent judge on a lattice of the box and the worst plant; how many plants it saw.
+
+    The bounds count as met within `LOOSE`, since the search stops at `WITHIN`.
+    """
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    points = [*lattice(uncertain, CHECKED, sections.seed + 1000), (worst.option, worst.point)]
+    if not uncertain.names:
+        points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
+    return _judged(problem, uncertain.plants(points), controller, workers), len(points)
+
+
+def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:
+    """Branch and bound over the whole box of plants at θ."""
+    sections = sections_of_problem(problem)
+    return prove(
+        uncertain_plant(problem, theta), made.structure, made.kappa, made.bandwidth,
+        bounds_of(problem), sections.sampling,
+    )  # fmt: skip
+
+
+def judged_corners(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> Certificate:
+    """The same on the model of every option and the corners of the box."""
+    uncertain = uncertain_plant(problem, theta)
+    return _judged(problem, uncertain.plants(uncertain.corners()), controller)
+
+
+def _judged(
+    problem: CoDesignProblem,
+    plants: Sequence[ScaledPlant],
+    controller: StateSpace,
+    workers: Pool | None = None,
+) -> Certificate:
+    sections, bounds = sections_of_problem(problem), bounds_of(problem)
+    loose = replace(
+        bounds,
+        S_max=bounds.S_max * (1.0 + LOOSE),
+        S_low=bounds.S_low * (1.0 + LOOSE),
+        weighted_level=_times(bounds.weighted_level),
+        compliance_max=_times(bounds.compliance_max),
+    )
+    integrator = structure_of(problem).integrator
+    return certify(
+        plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
+    )
+
+
+def _times(value: float | None) -> float | None:
+    return None if value is None else value * (1.0 + LOOSE)
