@@ -37,7 +37,7 @@ def summary(solution: "Solution") -> str:
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *terminal_lines(result),
         f"theta         {_theta(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
+        f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
         f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "
         f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
         f"weights       omega_S = {result['omega_S_hz']:.5g} Hz, "
@@ -56,6 +56,10 @@ def summary(solution: "Solution") -> str:
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def _cost(result: Mapping[str, Any]) -> str:
+    return f"{result['hardware_cost']:.6g} {result['cost_unit']}".strip()
 
 
 def _theta(result: Mapping[str, Any]) -> str:
@@ -97,7 +101,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *terminal_lines(result),
         f"theta         {_theta(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {result['hardware_cost']:.6g}",
+        f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
         *inner_value_lines(result),
         f"controller    order {controller['order']}, gain {_gains(controller)}",
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),

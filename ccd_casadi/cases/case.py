@@ -237,6 +237,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         listed=tuple((p.name, p.values) for p in case.theta if p.values),
         w1=case.objective.w1,
         w2=case.objective.w2,
+        cost_unit=case.objective.cost_unit,
         weights=weights_of(w, inner, disturbance_of(case.controller, w)),
         inner=InnerProblem(
             S_max=inner.S_max,

@@ -90,6 +90,7 @@ class ObjectiveSection:
         signed("give a negative number: J must reward bandwidth"),
         says="what bandwidth is worth in J, negative, in 1/(rad/s); of an RMS error positive, 1/m",
     )
+    cost_unit: str = _key(text, "", says="of the hardware cost f(θ), for tables and pages")
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,7 @@ def result_dict(
         "formulation": formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
+        "cost_unit": problem.cost_unit,
         **({"fixed": problem.source.held} if problem.source.fixed else {}),
         "objective": verified.objective,
         "hardware_cost": verified.hardware_cost,

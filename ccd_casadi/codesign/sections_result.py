@@ -181,6 +181,7 @@ def sections_result(
         "formulation": formulation,
         "theta": dict(zip(problem.names, verified.theta, strict=True)),
         "units": problem.parameter_units,
+        "cost_unit": problem.cost_unit,
         **({"fixed": problem.source.held} if problem.source.fixed else {}),
         "objective": verified.objective,
         "hardware_cost": verified.hardware_cost,

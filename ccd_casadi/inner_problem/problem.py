@@ -143,6 +143,7 @@ class CoDesignProblem(Shown):
     robust: RobustSet | None = None
     sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
     budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
+    cost_unit: str = ""  # of f(θ)
     listed: tuple[tuple[str, tuple[float, ...]], ...] = ()  # parameters that are one of a few
 
     def identity(self) -> dict[str, object]:

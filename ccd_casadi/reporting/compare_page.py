@@ -132,8 +132,9 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
     shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
     names = [axis_label(n, unit) for n, (unit, _) in zip(problem.names, shown, strict=True)]
+    cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
     head = (
-        "method", *names, "cost f", "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "s",
+        "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "s",
         "certified",
     )  # fmt: skip
     rows: list[tuple[Any, ...]] = []

@@ -28,10 +28,20 @@ def conclusion(result: Mapping[str, Any]) -> str:
     return (
         f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}, with a "
         f"closed-loop bandwidth of {number(result['bandwidth_hz'])} Hz at a hardware cost of "
-        f"{number(result['hardware_cost'])} (J = {number(result['objective'], 6)}), "
+        f"{cost_words(result)} (J = {number(result['objective'], 6)}), "
         f"{proof}, predicted to {number(result['verification_error'], 2)} of the truth, after "
         f"{result['syntheses']} true syntheses in {number(result['seconds'], 2)} s."
     )
+
+
+def cost_words(result: Mapping[str, Any], digits: int = 5) -> str:
+    """The hardware cost with its unit, where the case gives one."""
+    return f"{number(result['hardware_cost'], digits)} {result.get('cost_unit', '')}".strip()
+
+
+def cost_axis(problem: CoDesignProblem) -> str:
+    """The hardware cost on an axis."""
+    return f"hardware cost f ({problem.cost_unit})" if problem.cost_unit else "hardware cost f"
 
 
 def theta_words(result: Mapping[str, Any]) -> str:
@@ -80,7 +90,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
     error = f"relative error {number(r['verification_error'], 2)}"
     return [
         ("Objective J", number(r["objective"], 7), J),
-        ("Hardware cost f(θ)", number(r["hardware_cost"], 6), ""),
+        ("Hardware cost f(θ)", cost_words(r, 6), ""),
         ("Bandwidth ω_b", hz["bandwidth"], "true: first -3 dB crossing of σ_max(S)"),
         ("Predicted bandwidth", hz["surrogate_bandwidth"], error),
         ("Weight on S: ω_S", hz["omega_S"], ranges[0]),

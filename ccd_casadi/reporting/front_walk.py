@@ -76,6 +76,6 @@ def _words(problem: CoDesignProblem, point: FrontPoint) -> str:
     state = "verified" if point.verified else f"not verified: {point.reason}"
     held = f"; at {', '.join(point.active)}" if point.active else ""
     return (
-        f"f = {number(point.hardware_cost, 4)}, {named}: "
+        f"f = {f'{number(point.hardware_cost, 4)} {problem.cost_unit}'.strip()}, {named}: "
         f"{number(point.bandwidth / HZ, 4)} Hz, {state}{held}."
     )

@@ -8,6 +8,7 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.reporting.facts import cost_axis
 from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
@@ -45,7 +46,7 @@ def figure_front(
         Curve(cost, theta[:, i], name, CYCLE[i % len(CYCLE)], marker=".")
         for i, name in enumerate(problem.names)
     )
-    bottom = Panel("hardware cost f", "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
+    bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
     title = "Largest bandwidth at each hardware cost, and the hardware that reaches it"
     return figure_lines([[top], [bottom]], key=key, title=title, heights=(3.3, 2.8))
 

@@ -7,7 +7,7 @@ from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.insight import (
@@ -61,7 +61,7 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         f"{verified} of {len(front.points)} points of the front",
         f"around the design of {run.folder.name}/result.json",
         f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
-        f"of {number(cost)}. {rule}",
+        f"of {cost_words(run.result)}. {rule}",
         warned=worst(run.result) is not State.PASSED,
         verdict=verdict_html(run.result),
     )

@@ -7,6 +7,7 @@ import numpy as np
 from ccd_casadi.codesign.comparison import Method
 from ccd_casadi.codesign.steepest_descent import Descent
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.facts import cost_axis
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
@@ -107,7 +108,7 @@ def figure_histories(problem: CoDesignProblem, descent: Descent, *, key: str) ->
         Panel(x, "bandwidth (Hz)", (Curve(steps, bandwidth, marker="."),), whole_x=True),
     ]
     if cost is not None:
-        lower.append(Panel(x, "hardware cost f", (Curve(steps, cost, marker="."),), whole_x=True))
+        lower.append(Panel(x, cost_axis(problem), (Curve(steps, cost, marker="."),), whole_x=True))
     bounds = tuple(
         Level(value, "") for value in sorted({*problem.lower, *problem.upper}) if len(units) == 0
     )

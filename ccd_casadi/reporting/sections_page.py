@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
-from ccd_casadi.reporting.facts import Fact, binding, theta_table, theta_words
+from ccd_casadi.reporting.facts import Fact, binding, cost_words, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance_of_sections
 from ccd_casadi.reporting.page import (
     Section,
@@ -34,7 +34,7 @@ def sections_conclusion(result: dict[str, Any]) -> str:
         f"controller of order {result['controller']['order']} with a bandwidth of "
         f"{number(result['bandwidth_hz'])} Hz on each of {certificate['plants']} plants, judged "
         f"again on {robust['plants']} plants of the box, at a hardware cost of "
-        f"{number(result['hardware_cost'])} (J = {number(result['objective'], 6)})."
+        f"{cost_words(result)} (J = {number(result['objective'], 6)})."
     )
 
 
@@ -159,7 +159,7 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     return [
         ("Objective J", number(r["objective"], 7),
          f"{problem.w1:g} f(θ) + ({problem.w2:g}) {'e, in m' if of_error else 'ω_b'}"),
-        ("Hardware cost f(θ)", number(r["hardware_cost"], 6), ""),
+        ("Hardware cost f(θ)", cost_words(r, 6), ""),
         ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", "on every plant of the set"),
         (*predicted, f"relative error {number(r['verification_error'], 2)}"),
         ("Loop", runs, ""),

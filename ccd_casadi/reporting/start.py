@@ -154,7 +154,7 @@ def _table(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Table:
         unit, factor = shown_unit(problem.units[i], problem.upper[i])
         rows.append((name, unit or "–", *(factor * s.theta[i] for s in sides)))
     rows += [
-        ("hardware cost f", "–", *(s.cost for s in sides)),
+        ("hardware cost f", problem.cost_unit or "–", *(s.cost for s in sides)),
         ("first resonance", "Hz", *(s.resonance for s in sides)),
         ("bandwidth ω_b", "Hz", *(s.loop.bandwidth_hz for s in sides)),
         ("objective J", "–", *(s.objective(problem) for s in sides)),
