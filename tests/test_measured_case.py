@@ -117,5 +117,6 @@ def test_other_commands_say_whose_it_is(tmp_path: Path, capsys: pytest.CaptureFi
     path = written(tmp_path, CASE + "[theta.m]\nlower = 1.0\nupper = 2.0\n", lines=20)
     assert solve([str(path)]) == 2
     path = written(tmp_path, lines=20)
-    assert inner([str(path), "--theta", "m=1"]) == 2
-    assert "has no theta" in capsys.readouterr().err
+    for option in (("--theta", "m=1"), ("--begin-at", str(tmp_path))):
+        assert inner([str(path), *option]) == 2
+        assert "has no theta" in capsys.readouterr().err
