@@ -91,10 +91,10 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.fixed_structure.measured_design import design_on_data
     from ccd_casadi.inner_problem.sections_words import sections_dict
 
-    given = (options.theta, options.omega_S_hz, options.omega_T_hz)
+    given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
         words = 'plant.model = "measured" has no theta and no weights to place; leave out --theta'
-        raise CaseError(f"{case.path}: {words}, --omega-s-hz and --omega-t-hz")
+        raise CaseError(f"{case.path}: {words}, --omega-s-hz, --omega-t-hz and --begin-at")
     began, hz = perf_counter(), case.response.hz
     tell = None if options.quiet else lambda words: print(words, file=sys.stderr, flush=True)
     made = design_on_data(

@@ -29,6 +29,24 @@ def broken(theta):
 
 not_callable = 3
 """
+# What is left of [inner] after S_max, then weights and structure: quick to design.
+SECTIONS_TABLES = """S_low = 0.2
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1800.0]
+omega_T_hz = [25.0, 1000.0]
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 2e7
+A_l = 1.0
+A_u = 1e-2
+[controller]
+structure = "sections"
+starts = 4
+weighted_level = 8.426
+biquads = 0"""
 
 
 def edited(*changes: tuple[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import casadi as ca
 import numpy as np
+from differences import slopes
 from helpers import HZ, SUSPENSION, scaled
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
@@ -103,27 +104,22 @@ def assert_derivatives(
     tau, model = -1.5, problem_at((1.0, 1.0))
     peaks = assess(model, kappa, tau, depth=-2.0).peaks
     assert peaks is not None
-    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
-    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
-    gap[range(len(peaks.v)), found.at] = np.inf
+    rows = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
+    gap = np.abs(rows.s / rows.s[range(len(peaks.v)), rows.at][:, None] - 1.0)
+    gap[range(len(peaks.v)), rows.at] = np.inf
     peaks = peaks.only(chosen(peaks.plant) & (gap.min(axis=1) > 0.03))
 
     def values(of, kappa, tau):
         return whole_constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
 
-    size = np.abs(peaks.to_kappa).max(1) + 1e-2
-    h = 1e-4
-    for i, step in enumerate(h * np.eye(len(kappa))):
-        a, b, c, d = (values(model, kappa + x * step, tau) for x in (1, -1, 2, -2))
-        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
-        assert (np.abs(slope - peaks.to_kappa[:, i]) / size).max() < 1e-5
+    size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-2
+    to_kappa = slopes(lambda x: values(model, x, tau), kappa, 1e-4)
+    assert (np.abs(to_kappa - peaks.to_kappa) / size).max() < 1e-5
     rising = peaks.curve != Curve.CROSSING
     slope = (values(model, kappa, tau + 1e-6) - values(model, kappa, tau - 1e-6)) / 2e-6
     np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
     exact = to_theta(model, kappa, peaks)
-    scale = np.abs(exact).max(1) + 1e-3 * np.abs(exact).max()
-    for i, step in enumerate(h * np.eye(2)):
-        a, b, c, d = (values(problem_at(tuple(1.0 + x * step)), kappa, tau) for x in (1, -1, 2, -2))
-        slope = (8.0 * (a - b) - (c - d)) / (12.0 * h)
-        assert (np.abs(slope - exact[:, i]) / scale).max() < 1e-5
+    scale = np.abs(exact).max(1, keepdims=True) + 1e-3 * np.abs(exact).max()
+    found = slopes(lambda theta: values(problem_at(tuple(theta)), kappa, tau), np.ones(2), 1e-4)
+    assert (np.abs(found - exact) / scale).max() < 1e-5
     return set(peaks.curve.tolist())

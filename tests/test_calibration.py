@@ -1,10 +1,10 @@
 """The calibrated case reproduces the published figures as well as its study says."""
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scripts import benchmark
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
@@ -39,9 +39,7 @@ def test_the_shipped_case_has_the_reported_bandwidths(
 
 
 def test_every_published_figure_is_within_the_reported_residual(case: CoDesignProblem) -> None:
-    spec = importlib.util.spec_from_file_location("study", ROOT / "benchmarks" / "calibration.py")
-    study = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(study)
+    study = benchmark("calibration")
     S_hi, T = case.inner.omega_S[1] / HZ, np.array(case.inner.omega_T) / HZ
     setting = study.Setting(case.inner.S_max, T[0], T[1], S_hi, case.inner.gamma_backoff)
     figures = study.figures(case, setting)

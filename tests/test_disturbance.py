@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from case_documents import TWO_MASS
+from differences import difference
 from helpers import HZ, PAPER, few, random_plant, scaled, two_mass
 from hypothesis import given
 from hypothesis import strategies as st
@@ -236,8 +237,7 @@ def test_derivatives_are_those_of_differences(
 
         exact = done.to_theta[:, i] if name == "theta" else done.to_weights[name]
         size = np.array([done.values[0], 1.0, 1.0, done.values[3]])
-        h = 2e-3
-        found = (8.0 * (value(h) - value(-h)) - (value(2.0 * h) - value(-2.0 * h))) / (12.0 * h)
+        found = difference(value, 2e-3)
         error = np.abs(found - exact) / np.maximum(np.abs(exact), 1e-2 * size)
         worst = max(worst, float(error.max()))
     assert worst < 1e-5

@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from differences import difference
 from helpers import HZ, PAPER, few, flexible_case, random_plant, scaled
 from hypothesis import given
 from hypothesis import strategies as st
@@ -35,11 +36,6 @@ def small_plant(seed: int, p: int) -> tuple[ScaledPlant, np.ndarray]:
     w0 = plant.omega_0
     weights = Weights(2.0, 0.3, 0.8 * w0, 4.0, 0.7 * w0, 1e5, 0.9, 0.3, 1.3 * w0)
     return plant, weights.scaled(w0)
-
-
-def difference(f, h: float) -> float:  # type: ignore[no-untyped-def]
-    """df/dh at zero, of fourth order."""
-    return (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
 
 
 @few(max_examples=20)

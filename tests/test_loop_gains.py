@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from differences import difference
 from helpers import (
     HZ,
     OMEGA_LOW,
@@ -100,8 +101,7 @@ def test_the_slope_of_the_sensitivity_is_that_of_its_gain(outputs: int, seed: in
     def f(x: float) -> float:
         return sensitivity.sensitivity_gain(g, k, Dk, omega + x)
 
-    found = (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
-    assert slope == pytest.approx(found, rel=1e-5, abs=1e-6 * gain / omega)
+    assert slope == pytest.approx(difference(f, h), rel=1e-5, abs=1e-6 * gain / omega)
 
 
 @few(max_examples=12)

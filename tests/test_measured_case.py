@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from case_documents import SECTIONS_TABLES
 from fixed_structure_loops import FAST
 from scipy.io import savemat
 from test_measured import measured
@@ -17,29 +18,13 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ
 
-CASE = """
+CASE = f"""
 [plant]
 model = "measured"
 file = "stage.csv"
 [inner]
 S_max = 2.0
-S_low = 0.2
-omega_low_hz = 1.0
-omega_S_hz = [10.0, 1800.0]
-omega_T_hz = [25.0, 1000.0]
-[weights]
-M_S = 2.0
-A_S = 1e-4
-c_K = 1e4
-omega_K_hz = 100.0
-M_K = 2e7
-A_l = 1.0
-A_u = 1e-2
-[controller]
-structure = "sections"
-starts = 4
-weighted_level = 8.426
-biquads = 0
+{SECTIONS_TABLES}
 """
 
 
@@ -132,5 +117,6 @@ def test_other_commands_say_whose_it_is(tmp_path: Path, capsys: pytest.CaptureFi
     path = written(tmp_path, CASE + "[theta.m]\nlower = 1.0\nupper = 2.0\n", lines=20)
     assert solve([str(path)]) == 2
     path = written(tmp_path, lines=20)
-    assert inner([str(path), "--theta", "m=1"]) == 2
-    assert "has no theta" in capsys.readouterr().err
+    for option in (("--theta", "m=1"), ("--begin-at", str(tmp_path))):
+        assert inner([str(path), *option]) == 2
+        assert "has no theta" in capsys.readouterr().err

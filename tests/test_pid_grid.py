@@ -1,11 +1,8 @@
 """PID by the search against a grid that shares nothing with it: benchmarks/pid_grid.py, coarser."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from benchmark_scripts import benchmark
 
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -15,14 +12,8 @@ from ccd_casadi.plants.scaling import scale_plant
 
 @pytest.fixture(scope="module")
 def study():
-    """The benchmark, with fewer points, gains and samples."""
-    path = Path(__file__).parents[1] / "benchmarks" / "pid_grid.py"
-    spec = importlib.util.spec_from_file_location("pid_grid", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["pid_grid"] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["pid_grid"]
+    """The benchmark."""
+    return benchmark("pid_grid")
 
 
 def test_no_point_of_a_grid_is_better_than_the_search(study, monkeypatch) -> None:

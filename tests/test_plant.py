@@ -6,6 +6,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from differences import difference
 from helpers import (
     HZ,
     STIFF_SUSPENSION,
@@ -42,11 +43,6 @@ thetas = st.lists(st.floats(0.1, 0.9), min_size=2, max_size=2)
 
 def scaled_system(plant: ScaledPlant) -> StateSpace:
     return StateSpace(plant.A, plant.B, plant.C, np.zeros((plant.C.shape[0], plant.B.shape[1])))
-
-
-def fourth_order(f, h: float) -> np.ndarray:
-    """df/dh at zero from f(±h), f(±2h)."""
-    return (8.0 * (f(h) - f(-h)) - (f(2.0 * h) - f(-2.0 * h))) / (12.0 * h)
 
 
 # ---- frequency response -----------------------------------------------------------------------
@@ -190,7 +186,7 @@ def test_matrix_derivatives_are_those_of_the_matrices(seed, shape, theta) -> Non
 
         exact = at(0.0).derivatives
         for name, slope in zip("MDKBC", exact, strict=True):
-            found = fourth_order(lambda h, name=name: getattr(at(h), name), 1e-3)
+            found = difference(lambda h, name=name: getattr(at(h), name), 1e-3)
             size = max(np.abs(getattr(at(0.0), name)).max(), 1e-300)
             np.testing.assert_allclose(slope[i] / size, found / size, atol=1e-11)
 
@@ -221,7 +217,7 @@ def check_response_slopes(model, theta, M_K: float, h: float) -> float:
             return reference_response(mechanics(model, moved), omega, STIFF_SUSPENSION)
 
         size = np.abs(at(0.0)).max(axis=(1, 2)) + np.abs(slopes[i]).max(axis=(1, 2))
-        error = np.abs(slopes[i] - fourth_order(at, h)).max(axis=(1, 2)) / size
+        error = np.abs(slopes[i] - difference(at, h)).max(axis=(1, 2)) / size
         worst = max(worst, float(error.max()))
     return worst
 

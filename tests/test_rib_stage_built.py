@@ -1,11 +1,11 @@
 """The design of benchmarks/rib_stage_design: light enough, and within its bounds as it runs."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scripts import FOLDER, benchmark
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
@@ -20,31 +20,30 @@ from ccd_casadi.plants.rib_stage import NAMES
 from ccd_casadi.plants.rib_stage.plant import rib_stage
 from ccd_casadi.support.errors import UserError
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
-
-from rib_stage_built import DELAY, DESIGN, HZ, M_K, RATE, S_MAX, controller, theta_of  # noqa: E402
+built = benchmark("rib_stage_built")
 
 
 def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
     """Sampled with hold and delay by code that the synthesis does not use; no payload here."""
-    theta = theta_of(DESIGN)
+    theta = built.theta_of(built.DESIGN)
     stage = rib_stage(NAMES)
     assert hardware_cost(stage, theta) <= 0.6
-    box = UncertainPlant((mechanics(stage, theta, derivatives=False),), Suspension(), M_K,
+    box = UncertainPlant((mechanics(stage, theta, derivatives=False),), Suspension(), built.M_K,
                          mode_shift=0.02, damping=(0.5, 2.0))  # fmt: skip
-    K = controller(DESIGN)
+    K = built.controller(built.DESIGN)
     for _, point in box.corners()[1:]:
-        loop = sensitivity_loop(sampled_plant(box.plant(point).plant_si(), 1.0 / RATE, DELAY), K)
+        loop = sensitivity_loop(
+            sampled_plant(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K
+        )
         figures = sampled_figures(loop)
         assert figures.stable
-        assert figures.sensitivity_peak <= S_MAX * (1.0 + 1e-4)
-        assert figures.bandwidth > 75.0 * HZ
+        assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-4)
+        assert figures.bandwidth > 75.0 * built.HZ
 
 
 def test_tip_and_tilt_have_one_controller() -> None:
     """So that a payload to any side is the one that the set has."""
-    channels = json.loads((DESIGN / "controller.json").read_text())["sections"]["channels"]
+    channels = json.loads((built.DESIGN / "controller.json").read_text())["sections"]["channels"]
     one, other = (
         [row["value"] for row in channel["parameters"]]
         for channel in channels
@@ -58,13 +57,13 @@ def test_a_known_controller_is_where_inner_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its parameters are read for the case's structure alone, and for sections alone."""
-    runs = BENCHMARKS.parent / "runs"
+    runs = FOLDER.parent / "runs"
     problem = problem_of(load_case(runs / "rib_stage_built.toml"))
-    kappa = sections_kappa(DESIGN, structure_of(problem))
+    kappa = sections_kappa(built.DESIGN, structure_of(problem))
     assert len(kappa) == len(structure_of(problem).names)
     with pytest.raises(UserError, match="name a run of this case"):
-        sections_kappa(DESIGN, Structure())
-    asked = ["--theta", "m1=60,m2=60", "--begin-at", str(DESIGN), "--quiet"]
+        sections_kappa(built.DESIGN, Structure())
+    asked = ["--theta", "m1=60,m2=60", "--begin-at", str(built.DESIGN), "--quiet"]
     assert inner_main([str(runs / "two_mass.toml"), *asked]) == 2
     assert "--begin-at" in capsys.readouterr().err
     with pytest.raises(UserError):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from case_documents import SECTIONS_TABLES
 from helpers import problem
 
 from ccd_casadi.cases.run_folder import read_run
@@ -33,7 +34,7 @@ from surrogates.retrain import main as retrain_main
 
 COMMON = ["--quiet", "--workers", "1"]
 
-QUICK = """
+QUICK = f"""
 [plant]
 model = "two_mass"
 [theta.m1]
@@ -49,25 +50,9 @@ unit = "kg"
 [objective]
 w1 = 0.0995
 w2 = -0.9950
-[weights]
-M_S = 2.0
-A_S = 1e-4
-c_K = 1e4
-omega_K_hz = 100.0
-M_K = 2e7
-A_l = 1.0
-A_u = 1e-2
 [inner]
 S_max = 1.75
-S_low = 0.2
-omega_low_hz = 1.0
-omega_S_hz = [10.0, 1800.0]
-omega_T_hz = [25.0, 1000.0]
-[controller]
-structure = "sections"
-biquads = 0
-weighted_level = 8.426
-starts = 4
+{SECTIONS_TABLES}
 [loop]
 rate_hz = 8000.0
 delay_us = 80.0

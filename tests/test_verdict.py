@@ -1,6 +1,5 @@
 """The verdict: states follow their figures; what is not optimal is never verified; kinks count."""
 
-import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scripts import benchmark
 from helpers import HZ, problem
 from hypothesis import given
 from hypothesis import strategies as st
@@ -254,13 +254,8 @@ def test_a_descent_from_an_inner_optimum_ends_stationary(theta: tuple[float, flo
 @pytest.fixture(scope="module")
 def chain_problem() -> Callable[[int], CoDesignProblem]:
     """The random chains of `benchmarks/formulations_agree.py`."""
-    place = ROOT / "benchmarks" / "chain_plants.py"
-    spec = importlib.util.spec_from_file_location("chain_plants", place)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.chain_problem
+    found: Callable[[int], CoDesignProblem] = benchmark("chain_plants").chain_problem
+    return found
 
 
 def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:

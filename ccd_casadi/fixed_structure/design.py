@@ -303,7 +303,7 @@ def designed(
     outcome, words = SectionsOutcome.CERTIFIED, judged.words
     if short:
         outcome = SectionsOutcome.BOUND_NOT_MET
-        missed = ", ".join(f"{name} by a factor {ratio:.4g}" for name, ratio in short.items())
+        missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
         words = f"the nearest controller misses {missed}"
     elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
         outcome = SectionsOutcome.NOT_CERTIFIED

@@ -30,10 +30,8 @@ from ccd_casadi.support.units import HZ
 if TYPE_CHECKING:
     import control
 
-BELOW, ABOVE = (
-    0.1,
-    (1.5, 6.0),
-)  # of the first and last line: where a rigid body and the rest are put
+BELOW = 0.1  # of the first line: where a rigid body is put
+ABOVE = (1.5, 6.0)  # of the last line: where what lies above it is put
 BELOW_DAMPING, ABOVE_DAMPING = 0.7, 0.02
 UNKNOWN = 0.2  # relative deviation of a damping ratio above which there is no such mode
 STARTS = (0.003, 0.02)  # damping ratios that a new mode is tried with

@@ -47,19 +47,17 @@ def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bod
         return figure_lines([top], key=key, title=title, heights=(3.4,))
     several = len(parts) > 1  # whose resonances are not marked: the words would meet
     marks = () if several else tuple(_marks(loop, G))
+    look: dict[str, dict[str, Any]] = {
+        "G": {"marks": marks} | ({} if several else {"y_range": gap}),
+        "K": {"levels": at, "legend": None},  # the colours are those of G
+        "L": {"levels": (Level(1.0, "1"),), "legend": None},
+    }
     sizes: list[Panel] = []
     phases: list[Panel] = []
     for k, (name, unit) in enumerate((("G", "m/N"), ("K", "N/m"), ("L", "–"))):
         values = {channel: part[k] for channel, part in parts.items()}
-        more: dict[str, Any] = {"levels": at} if k == 1 else {}
-        if k == 0:
-            more = {"marks": marks} | ({} if several else {"y_range": gap})
-        if k == 2:
-            more = {"levels": (Level(1.0, "1"),)}
-        if sizes:
-            more["legend"] = None  # the colours are those of G
         size = {channel: np.abs(v) for channel, v in values.items()}
-        sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **more))
+        sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **look[name]))
         angle = {channel: _phase(v) for channel, v in values.items()}
         phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0, legend=None))
     return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
@@ -133,8 +131,8 @@ def table_bode(loop: Loop) -> Table:
     if loop.plant.shape[1:] == (1, 1):
         head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
         G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])
-        phases = (_phase(part[:, 0, 0]) for part in (loop.plant, loop.controller))
-        columns = [loop.hz, *(c for pair in zip((G, K), phases, strict=True) for c in pair)]
+        phases = [_phase(part[:, 0, 0]) for part in (loop.plant, loop.controller)]
+        columns = [loop.hz, G, phases[0], K, phases[1]]
     else:
         G, K = _singular_values(loop.plant), _singular_values(loop.controller)
         head = (

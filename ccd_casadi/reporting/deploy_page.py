@@ -21,6 +21,7 @@ from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import (
+    INDEX,
     Section,
     Table,
     facts_html,
@@ -37,6 +38,7 @@ from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
+from surrogates.files import write_whole
 
 POINTS = 900
 SHOWN = 40  # measured points in the plot, and rows in the tables
@@ -68,8 +70,7 @@ def write_report(
         warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
     )  # fmt: skip
     inside = path.resolve().parent.parent == run.folder.resolve()
-    made = page(title, sections, head, "../index.html" if inside else "")
-    path.write_text(made, encoding="utf-8")
+    write_whole(path, page(title, sections, head, f"../{INDEX}" if inside else ""))
     write_index(run.folder)
 
 

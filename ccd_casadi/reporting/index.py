@@ -6,6 +6,7 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.page import INDEX, Section, Table, escape, header, page, table_html
 from ccd_casadi.reporting.sections_page import sections_conclusion
@@ -53,7 +54,7 @@ def write_index(folder: Path) -> None:
     head = header(
         f"Run: {name}", status == "verified", status.replace("_", " "),
         str(result.get("reason") or ""), f"{result.get('formulation', '')} formulation", lead,
-        warned=worst(result) is not worst({}), verdict=verdict_html(result),
+        warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
     )  # fmt: skip
     sections = [
         Section("Pages", f"<ul>{items}</ul>"),

@@ -84,9 +84,7 @@ def figure_gains(
     return figure_lines([panels[:1], panels[1:]], key=key, title=title, heights=(3.3, 2.7))
 
 
-def forbidden(
-    inner: InnerProblem, low: float, high: float, top: float
-) -> tuple[tuple[np.ndarray, str], ...]:
+def forbidden(inner: InnerProblem, low: float, high: float, top: float) -> Areas:
     """Where |S| may not be, over Hz: above S_max, and above S_low up to ω_low."""
     ends = (inner.omega_low / HZ, inner.S_low)
     return (

@@ -161,8 +161,8 @@ def _(item: SectionsDesign) -> str:
 @html_of.register
 def _(item: ModalFit) -> str:
     n, off = len(item.hz), 100.0 * item.deviations
-    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains, off[2 * n :],
-               strict=False)  # fmt: skip
+    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains[:n], off[2 * n : 3 * n],
+               strict=True)  # fmt: skip
     head = ("Hz", "± %", "damping ratio", "± %", "gain 1/kg", "± %")
     words = f"{item.lines} lines; what is not fitted is {100.0 * item.noise:.3g} % of |G|."
     table = table_html(Table(head, tuple(tuple(map(float, row)) for row in rows)))
