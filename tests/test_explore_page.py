@@ -71,6 +71,12 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert after > before
     assert 55.0 < theta[0] < 67.0
     page.get_by_text("certified, keeps its bounds").wait_for()
+    hz, gain = page.evaluate(
+        "(d => [[...d.hz], [...d.S]])(Bokeh.documents[0].get_model_by_name('gains').data)"
+    )
+    assert hz == sorted(hz)
+    assert len(hz) == len(gain)
+    assert max(gain) == pytest.approx(1.75, rel=1e-6)  # S_max binds in the search at this θ
     page.get_by_role("button", name="Save as case").click()
     page.get_by_text("explored_1.toml").wait_for()
     page.reload()  # a second document of the same session
