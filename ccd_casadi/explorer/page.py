@@ -1,5 +1,6 @@
 """One browser page: sliders, figures and buttons over a session; an answer to every drag."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +30,9 @@ from ccd_casadi.support.errors import UserError
 
 TOGETHER = 1  # ms: drags that come within it are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
-LINES = 12  # of a solve's output
+LINES = 40  # of a solve's output
+BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
+SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
 
 
 class Page:
@@ -53,6 +56,7 @@ class Page:
         self.now: Drawn | None = None
         self.solve: Solve | None = None
         self._output: list[str] = []
+        self._solved = session.folder
         # what was answered last: a watch in the browser stops when this has been drawn
         nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
         self.answer = ColumnDataSource(nothing, name="answer")
@@ -80,7 +84,7 @@ class Page:
             "controls": self.controls.all(),
             "note_place": [self.note],
             "modes": [self.modes],
-            "pins_place": [wrapped, self.pins.table, self.output],
+            "pins_place": [wrapped, self.output, self.pins.table],
             "map_place": [self.map.root()],
         } | {f"{name}_place": [made] for name, made in self.figures.all().items()}
         for name, parts in roots.items():
@@ -255,7 +259,7 @@ class Page:
     def start_solve(self) -> None:
         """Solve from here, in the background."""
         folder, case = self.session.folder_for_solve(self.controls.knobs())
-        self._output = [f"solving into {folder}"]
+        self._output, self._solved = [f"solving into {folder}"], folder
         self.solve_button.disabled, self.stop.disabled = True, False
         said, ended = self._then(self._said), self._then(self._ended)
         self.solve = Solve(case, folder, self.workers, said, ended)
@@ -267,7 +271,9 @@ class Page:
             self.solve.stop()
 
     def _said(self, line: str) -> None:
-        if line:
+        if BAR.search(line) and BAR.search(self._output[-1]):
+            self._output[-1] = line
+        elif line:
             self._output.append(line)
         shown = "\n".join(self._output[:1] + self._output[1:][-LINES:])
         self.output.text = f"<pre>{escape(shown)}</pre>"
@@ -275,6 +281,9 @@ class Page:
     def _ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
         self._said(f"the solve ended: {end_words(code)}")
+        if (self._solved / "report.html").exists():
+            place = f"{SOLVED}/{self._solved.name}/report.html"
+            self.output.text += f'<p><a href="{place}" target="_blank">the report of it</a></p>'
 
     def close(self) -> None:
         """The page was closed: a solve goes on only while somebody sees it."""
