@@ -97,7 +97,7 @@ def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int, float]:
         page.set_default_timeout(400e3)
         page.goto(url)
         page.wait_for_function(
-            "window.Bokeh?.documents[0]?.get_model_by_name('verdict')?.text?.length > 10",
+            "document.getElementById('verdict')?.textContent.length > 10",
         )
         page.wait_for_timeout(2000.0 + 1e3 * given.wait)
         scale = page.evaluate(

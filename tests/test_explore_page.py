@@ -71,6 +71,12 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert after > before
     assert 55.0 < theta[0] < 67.0
     page.get_by_text("certified, keeps its bounds").wait_for()
+    hz, gain = page.evaluate(
+        "(d => [[...d.hz], [...d.S]])(Bokeh.documents[0].get_model_by_name('gains').data)"
+    )
+    assert hz == sorted(hz)
+    assert len(hz) == len(gain)
+    assert max(gain) == pytest.approx(1.75, rel=1e-6)  # S_max binds in the search at this θ
     page.get_by_role("button", name="Save as case").click()
     page.get_by_text("explored_1.toml").wait_for()
     page.reload()  # a second document of the same session
@@ -81,6 +87,25 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert "does not answer" in page.get_by_role("alert").inner_text()
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
+
+
+@pytest.mark.slow
+def test_a_solve_from_here_tells_how_far_it_is_and_ends_with_its_report(browser, server, tmp_path):
+    page, heard = opened(browser, server[1])
+    page.get_by_role("button", name="Solve from here").click()
+    page.get_by_text(re.compile(r"sampling +\d+/\d+ \[")).wait_for()
+    page.get_by_text("the solve ended: done and verified").wait_for()
+    assert (tmp_path / "solved_1" / "report.html").exists()
+    with page.expect_popup() as opening:
+        page.get_by_role("link", name="the report of it").click()
+    report = opening.value
+    report.on("console", lambda said: heard.append(said.text) if said.type == "error" else None)
+    report.on("pageerror", lambda error: heard.append(str(error)))
+    report.reload()  # now that its complaints are heard
+    report.get_by_role("heading", name="At a glance").wait_for()
+    report.get_by_role("link", name="All pages of this run").click()
+    report.get_by_role("heading", name="Pages").wait_for()
+    assert not heard
 
 
 @pytest.mark.slow
@@ -105,11 +130,17 @@ def test_without_the_token_every_path_is_refused(tmp_path):
     root = explorer.url.split(token)[0]
     wrong = f"{token[:-1]}{'A' if token[-1] != 'A' else 'B'}"
     paths = ("", "ws", "autoload.js", "static/js/bokeh.min.js", f"{wrong}/", f"{wrong}/ws", "none/")
+    page = "runs/solved_1/report.html"
+    (tmp_path / page[5:]).parent.mkdir()
+    (tmp_path / page[5:]).write_text("a page")
+    (tmp_path.parent / "private").write_text("no page of a solve")
+    names = ("samples.sqlite", "solved_1/../../private", "solved_1/%2e%2e/%2e%2e/private")
+    outside = [f"{token}/runs/{name}" for name in names]
 
     async def codes():
         explorer._server.start()
         found = {}
-        for path in (*paths, f"{token}/static/js/bokeh.min.js"):
+        for path in (*paths, page, *outside, f"{token}/{page}", f"{token}/static/js/bokeh.min.js"):
             answer = await client().fetch(root + path, raise_error=False, follow_redirects=False)
             found[path] = answer.code
             assert token not in str(answer.headers)
@@ -118,6 +149,7 @@ def test_without_the_token_every_path_is_refused(tmp_path):
     found = explorer._server.io_loop.run_sync(codes)
     explorer.close()
     assert found.pop(f"{token}/static/js/bokeh.min.js") == 200  # the page's own scripts, from here
+    assert found.pop(f"{token}/{page}") == 200
     assert set(found.values()) <= {403, 404}
     assert root.startswith("http://127.0.0.1:")
 

@@ -15,6 +15,7 @@ from bokeh.plotting import figure
 
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 
 HEIGHT = 230
@@ -27,8 +28,6 @@ PADDING = 0.1  # of the data, that an axis reaches beyond them
 # After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
 FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
   range.have_updated_interactively = false"""
-
-Change = tuple[Any, dict[str, Any]]  # a model, and new values of its properties
 
 
 @dataclass(frozen=True)
@@ -46,9 +45,8 @@ class Figures:
     def __init__(self, dark: bool) -> None:
         self.main = SKY if dark else BLUE
         self.ink = "#d0d0d0" if dark else "#333333"
-        self.gains = ColumnDataSource(
-            {k: [] for k in ("hz", "S", "KS", "T", "bS", "bKS", "bT", "top")}
-        )
+        columns = ("hz", "S", "KS", "T", "bS", "bKS", "bT", "top")
+        self.gains = ColumnDataSource({k: [] for k in columns}, name="gains")
         self.sampled = ColumnDataSource({"hz": [], "S": []})
         self.loci = ColumnDataSource({"xs": [], "ys": []})
         self.poles = {
@@ -165,14 +163,10 @@ class Figures:
         for name, (marker, colour, words) in looks.items():
             found = made.scatter(
                 "hz", "damping", source=self.poles[name], marker=marker, size=9, line_color=colour,
-                fill_alpha=0.0, line_width=1.6, legend_label=words,
+                fill_alpha=0.0, line_width=1.6,
             )  # fmt: skip
             tips = [(words, "@hz{0.000} Hz, ζ = @damping{0.0000}")]
             made.add_tools(HoverTool(renderers=[found], tooltips=tips))
-        made.add_layout(made.legend[0], "above")  # it would lie over poles
-        made.legend.orientation = "horizontal"
-        made.legend.label_text_font_size = "11px"
-        made.legend.background_fill_alpha = 0.4
         return made
 
     def _time(self, name: str, unit: str, label: str, source: ColumnDataSource, y: str) -> Any:

@@ -12,8 +12,8 @@ from bokeh.plotting import figure
 
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.explorer.controls import DARK, shown_unit
-from ccd_casadi.explorer.figures import Change
 from ccd_casadi.explorer.landscape import Field
+from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import GREY, ORANGE
 

@@ -1,15 +1,12 @@
 """One browser page: sliders, figures and buttons over a session; an answer to every drag."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
-from bokeh.core.properties import Any as Anything
-from bokeh.core.properties import List
 from bokeh.document import Document
-from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.model import DataModel
-from bokeh.models import ColumnDataSource, CustomJS
+from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
@@ -21,6 +18,7 @@ from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.landscape import field_of, run_surrogate
 from ccd_casadi.explorer.map_figure import MapFigure
+from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.modes import frequency_error, in_modal_form
 from ccd_casadi.explorer.pins import Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
@@ -30,19 +28,11 @@ from ccd_casadi.reporting.machine import machine_html
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
 
-TOGETHER = 4  # ms: drags that come within it are answered at once
+TOGETHER = 1  # ms: drags that come within it are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
-LINES = 12  # of a solve's output
-# In the browser alone: sent back they would be heard here as changes. What somebody zoomed stays.
-APPLY = """for (const [model, values] of message.changes)
-  if (!model.have_updated_interactively)
-    model.setv(values, {sync: false, check_eq: !("data" in values)})"""
-
-
-class Answer(DataModel):
-    """All that an answer changes on the page, as one message in place of some forty."""
-
-    changes: Any = List(Anything)
+LINES = 40  # of a solve's output
+BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
+SOLVED = "runs"  # where the pages of such a solve are found, below the address of this one
 
 
 class Page:
@@ -66,20 +56,14 @@ class Page:
         self.now: Drawn | None = None
         self.solve: Solve | None = None
         self._output: list[str] = []
+        self._solved = session.folder
         # what was answered last: a watch in the browser stops when this has been drawn
         nothing: dict[str, list[Any]] = {"serial": [0], "theta": [[]], "how": [""]}
         self.answer = ColumnDataSource(nothing, name="answer")
-        self._message, self._serial = Answer(), 0
-        apply = CustomJS(args={"message": self._message}, code=APPLY)
-        self._message.js_on_change("changes", apply)
-        document.js_on_event(DocumentReady, apply)  # what was answered before the page was there
+        self._message, self._serial = Message(), 0
+        self._message.applied_in(document)
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
-        self.verdict, self.note, self.output = (
-            Div(name="verdict"),
-            Div(name="note"),
-            Div(name="output"),
-        )
-        self.machine = Div(name="machine_picture", stylesheets=[WIDE])
+        self.note, self.output = Div(name="note"), Div(name="output")
         self.modes = Div(stylesheets=[WIDE])
         self.design = _button("Design sections here", "design", self.design_sections)
         self.solve_button = _button("Solve from here", "solve", self.start_solve)
@@ -98,9 +82,9 @@ class Page:
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
         roots: dict[str, list[Any]] = {
             "controls": self.controls.all(),
-            "verdict_place": [self.verdict, self.note],
-            "machine": [self.machine, self.modes],
-            "pins_place": [wrapped, self.pins.table, self.output],
+            "note_place": [self.note],
+            "modes": [self.modes],
+            "pins_place": [wrapped, self.output, self.pins.table],
             "map_place": [self.map.root()],
         } | {f"{name}_place": [made] for name, made in self.figures.all().items()}
         for name, parts in roots.items():
@@ -157,14 +141,13 @@ class Page:
         )  # fmt: skip
         self._serial += 1
         answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
-        self._message.changes = [
+        words = {"verdict": standing_html(look, sampled), "machine": machine}
+        self._message.send(words, [
             *self.figures.changes(self.now, pinned),
             *(self.figures.frame(self.now) if look.how is not How.PRESENT else []),
-            (self.verdict, {"text": standing_html(look, sampled)}),
-            (self.machine, {"text": machine}),
             self.map.mark(look.theta),
             (self.answer, {"data": answer}),
-        ]
+        ])  # fmt: skip
         self._seen.append(look)
 
     def settle(self) -> None:
@@ -276,7 +259,7 @@ class Page:
     def start_solve(self) -> None:
         """Solve from here, in the background."""
         folder, case = self.session.folder_for_solve(self.controls.knobs())
-        self._output = [f"solving into {folder}"]
+        self._output, self._solved = [f"solving into {folder}"], folder
         self.solve_button.disabled, self.stop.disabled = True, False
         said, ended = self._then(self._said), self._then(self._ended)
         self.solve = Solve(case, folder, self.workers, said, ended)
@@ -288,7 +271,9 @@ class Page:
             self.solve.stop()
 
     def _said(self, line: str) -> None:
-        if line:
+        if BAR.search(line) and BAR.search(self._output[-1]):
+            self._output[-1] = line
+        elif line:
             self._output.append(line)
         shown = "\n".join(self._output[:1] + self._output[1:][-LINES:])
         self.output.text = f"<pre>{escape(shown)}</pre>"
@@ -296,6 +281,9 @@ class Page:
     def _ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
         self._said(f"the solve ended: {end_words(code)}")
+        if (self._solved / "report.html").exists():
+            place = f"{SOLVED}/{self._solved.name}/report.html"
+            self.output.text += f'<p><a href="{place}" target="_blank">the report of it</a></p>'
 
     def close(self) -> None:
         """The page was closed: a solve goes on only while somebody sees it."""

@@ -9,9 +9,10 @@ from bokeh.events import ClientReconnected, ConnectionLost
 from bokeh.models import CustomJS
 from bokeh.server.server import Server
 from jinja2 import Template
+from tornado.web import StaticFileHandler
 
 from ccd_casadi.explorer.background import Background
-from ccd_casadi.explorer.page import Page
+from ccd_casadi.explorer.page import SOLVED, Page
 from ccd_casadi.explorer.session import Session
 
 HOST = "127.0.0.1"
@@ -27,6 +28,8 @@ class Explorer:
         self._pages: list[Page] = []
         self._workers = workers
         token = secrets.token_urlsafe(16)
+        # a page from here may not link to a file of the disk
+        solved = {"path": str(session.folder.resolve())}
         self._server = Server(
             {"/": self._document},
             prefix=token,  # of every path, the socket's and the scripts' too
@@ -34,6 +37,7 @@ class Explorer:
             port=0,
             use_index=False,
             num_procs=1,
+            extra_patterns=[(rf"/{SOLVED}/(solved_\d+/.+)", StaticFileHandler, solved)],
         )
         self.url = f"http://{HOST}:{self._server.port}/{token}/"
         # known only now; Bokeh's own default is localhost by name
