@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.fixed_structure import Bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
@@ -85,7 +86,7 @@ def figure_gains(
 
 
 def forbidden(
-    inner: InnerProblem, low: float, high: float, top: float
+    inner: InnerProblem | Bounds, low: float, high: float, top: float
 ) -> tuple[tuple[np.ndarray, str], ...]:
     """Where |S| may not be, over Hz: above S_max, and above S_low up to ω_low."""
     ends = (inner.omega_low / HZ, inner.S_low)
