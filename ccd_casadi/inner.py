@@ -129,12 +129,16 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
         "controller": parts,
     }
     if options.out is not None:
+        from ccd_casadi.reporting.measured_page import write_measured
+
         loop: dict[str, Any] = {} if case.period is None else {
             "loop": {"rate_hz": 1.0 / case.period, "delay_us": 0.0, "method": "tustin"}
         }  # fmt: skip
         folder = run_folder(options.case, options.out)
         controller = controller_dict(made.controller) | {"sections": parts | loop}
         write_json(folder / "controller.json", controller)
+        if f.stable:
+            write_measured(folder, case, made.controller, answer)
     _print(answer, (), options, began)
     return ExitCode.DONE if made.usable else ExitCode.NOT_VERIFIED
 

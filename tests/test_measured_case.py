@@ -1,6 +1,7 @@
 """A measured frequency response as the plant of a case: designed with, and refused in words."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ from test_measured import measured
 
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
-from ccd_casadi.fixed_structure.measured import judge
+from ccd_casadi.fixed_structure.measured import controller_response, judge
 from ccd_casadi.inner import main as inner
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.page import escape
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ
 
@@ -58,6 +60,17 @@ def test_inner_designs_on_the_lines(
     assert figures.stable
     assert figures.S_peak <= 2.0
     assert figures.bandwidth == pytest.approx(HZ * answer["bandwidth_hz"], rel=1e-6)
+    # the page's data: |S| on the lines that it shows, none above the peak that the judge found
+    shown = (tmp_path / "run" / "report.html").read_text()
+    assert escape(answer["words"]) in shown
+    assert ("sampled at 10000 Hz" in shown) == sampled
+    data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){7})</tr>", shown)
+    cells = np.array([[float(v) for v in re.findall(r">([^<]+)</td>", row)] for row in data])
+    k = controller_response(K, case.response.hz, case.period)
+    S = np.abs(1.0 / (1.0 + case.response.G * k))
+    at = [int(np.abs(case.response.hz - hz).argmin()) for hz in cells[:, 0]]
+    np.testing.assert_allclose(cells[:, 2], S[at], rtol=1e-3)
+    assert cells[:, 2].max() == pytest.approx(figures.S_peak, rel=1e-4)
 
 
 def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
 from ccd_casadi.cases.case import CaseError, load_case, problem_of
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.sections_run import seeded_and_prepared
 from ccd_casadi.codesign.sections_truth import objective
@@ -69,9 +70,10 @@ def test_the_gradient_is_the_slope_of_the_least_error(
 
 @pytest.mark.slow
 def test_a_solve_counts_the_error(tmp_path: Path) -> None:
-    """Direct and lifted at the same θ; J = w1 f + w2 e; the answer says so wherever it is shown."""
+    """All three at the same θ; J = w1 f + w2 e; the answer says so wherever it is shown."""
     case, store = least(), tmp_path / "samples.sqlite"
-    found = [solve(case, kind, store=store).result for kind in (Direct(starts=1), Lifted(points=4))]
+    kinds = (Direct(starts=1), Lifted(points=4), Nested(points=3))
+    found = [solve(case, kind, store=store).result for kind in kinds]
     for result in found:
         assert result["status"] == "verified", result["reason"]
         assert result["minimise"] == "rms_error"
@@ -82,7 +84,10 @@ def test_a_solve_counts_the_error(tmp_path: Path) -> None:
         assert "RMS" in result["verdict"]["optimal"]["words"]
         # the budget's own figure, on the one plant that there is
         assert result["budget"]["error_rms_largest"] == pytest.approx(e, rel=1e-6)
-    assert found[0]["objective"] == pytest.approx(found[1]["objective"], rel=1e-4)
+    for result in found[1:]:
+        assert result["objective"] == pytest.approx(found[0]["objective"], rel=1e-4)
+        # the surrogate is of the error: what it says of the design is what was found there
+        assert result["surrogate_error_rms"] == pytest.approx(result["error_rms_of_set"], rel=1e-3)
 
 
 def test_too_much_bandwidth_is_said(tmp_path: Path) -> None:

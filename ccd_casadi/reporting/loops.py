@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.fixed_structure import Bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
@@ -84,7 +85,7 @@ def figure_gains(
     return figure_lines([panels[:1], panels[1:]], key=key, title=title, heights=(3.3, 2.7))
 
 
-def forbidden(inner: InnerProblem, low: float, high: float, top: float) -> Areas:
+def forbidden(inner: InnerProblem | Bounds, low: float, high: float, top: float) -> Areas:
     """Where |S| may not be, over Hz: above S_max, and above S_low up to ω_low."""
     ends = (inner.omega_low / HZ, inner.S_low)
     return (

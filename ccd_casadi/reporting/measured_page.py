@@ -1,0 +1,125 @@
+"""The page of a controller on a measured response: figures, sections, the loop on its lines."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.measured_case import MeasuredCase
+from ccd_casadi.fixed_structure.measured import clearances, controller_response
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.reporting.facts import Fact
+from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.loops import forbidden, shown_rows
+from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    facts_html,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+)
+from ccd_casadi.reporting.sections_page import controller_html
+from ccd_casadi.reporting.svg import GREY
+from ccd_casadi.support.units import HZ
+from surrogates.files import write_whole
+
+HEIGHT = 3.0  # inches of a row
+
+
+def write_measured(
+    folder: Path, case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]
+) -> Path:
+    """Write `folder`/report.html of a stable design; `answer` is what `inner` prints of it."""
+    good = answer["status"] == "verified"
+    lines = f"{len(case.response.hz)} lines of {case.file}"
+    lead = (
+        f"A controller of order {answer['controller']['order']} with a bandwidth of "
+        f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}; no model."
+    )
+    head = header(
+        f"Controller on {case.file}", good, "verified" if good else "not verified",
+        answer["reason"], f"{case.path.name} · {lines}", lead,
+    )  # fmt: skip
+    sections = [
+        Section("The loop on the lines", _loop_html(case, controller, answer)),
+        Section("The figures", facts_html(_facts(case, answer))
+                + paragraph(f"What this rests on: {answer['words']}.")),
+        Section("The controller", controller_html(answer)),
+    ]  # fmt: skip
+    path = folder / "report.html"
+    write_whole(path, page(f"Controller on {case.file}", sections, head, index=""))
+    return path
+
+
+def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> str:
+    """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight."""
+    hz, G, bounds = case.response.hz, case.response.G, case.bounds
+    K = controller_response(controller, hz, case.period)
+    L = G * K
+    S, ends = 1.0 / (1.0 + L), (float(hz[0]), float(hz[-1]))
+    size = np.abs(S)
+    room = clearances(hz, L)
+    between = np.full(len(room), np.nan)  # what |S| may reach between two lines, at their middle
+    between[room > 0.0] = 1.0 / room[room > 0.0]
+    top = 2.5 * max(bounds.S_max, float(size.max()))
+    at = Level(answer["bandwidth_hz"], f"ω_b {number(answer['bandwidth_hz'], 4)} Hz", True)
+    levels = (
+        Level(bounds.S_max, f"S_max {bounds.S_max:g}", colour=GREY),
+        Level(2**-0.5, "-3 dB", colour=GREY),
+        at,
+    )
+
+    def gain(label: str, curves: tuple[Curve, ...], **more: Any) -> Panel:
+        return Panel("frequency (Hz)", label, curves, log_x=True, log_y=True, x_range=ends, **more)
+
+    locus = np.where(np.abs(L) <= FAR, L, np.nan)
+    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), between, "at most between lines", GREY, width=0.9)
+    rows = [
+        [gain("|S| (–)", (allowed, Curve(hz, size, "at the lines")), levels=levels,
+              y_range=(0.5 * float(size.min()), top), legend="lower right",
+              forbidden=forbidden(bounds, *ends, top)),
+         nyquist_panel([locus], bounds.S_max, HEIGHT)],
+        [gain("|G| measured (m/N)", (Curve(hz, np.abs(G)),)),
+         gain("|L| (–)", (Curve(hz, np.abs(L)),), levels=(Level(1.0, "1"), at))],
+        [gain("|KS| (N/m)", (Curve(hz, np.abs(K * S)),), levels=(at,)),
+         gain("|T| (–)", (Curve(hz, np.abs(L * S)),), levels=(at,))],
+    ]  # fmt: skip
+    svg = figure_lines(rows, key="measured", title="The loop on the measured lines",
+                       heights=(HEIGHT, 2.6, 2.6))  # fmt: skip
+    words = (
+        "Every bound is asked for on every line: S out of the shaded area, L out of the disk. "
+        "Grey: what |S| may reach between two lines, if GK bends there as around them. A resonance "
+        "that fits between two lines is not seen."
+    )
+    table = Table(("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"), tuple(
+        (float(hz[i]), float(abs(G[i])), float(size[i]), float(L[i].real), float(L[i].imag),
+         float(abs(K[i] * S[i])), float(abs(L[i] * S[i])))
+        for i in shown_rows(hz, [answer["bandwidth_hz"], answer["sensitivity_peak_hz"]])
+    ))  # fmt: skip
+    return figure_html(svg, words, table)
+
+
+def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
+    bounds, shares = case.bounds, answer["certificate"]["figures_over_bounds"]
+    runs = "continuous" if case.period is None else (
+        f"sampled at {number(1.0 / case.period)} Hz; hold and delay are in the response"
+    )  # fmt: skip
+    found = [
+        ("Bandwidth", f"{number(answer['bandwidth_hz'])} Hz", runs),
+        ("Peak of S", number(answer["sensitivity_peak"]),
+         f"at {number(answer['sensitivity_peak_hz'], 4)} Hz, S_max {bounds.S_max:g}; between lines "
+         f"at most {number(answer['sensitivity_peak_between_lines'])}"),
+        ("|S| at ω_low", number(answer["sensitivity_low"]),
+         f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
+        ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} um/N", "the largest |GS|"),
+        ("Largest |KS|", f"{number(answer['KS_max'], 4)} N/m", ""),
+    ]  # fmt: skip
+    names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",
+             "GS": "compliance_max"}  # fmt: skip
+    over = ", ".join(f"{names[key]} {number(share, 4)}" for key, share in shares.items())
+    return [*found, ("Figures over bounds", over, "1 is on the bound")]
