@@ -33,11 +33,7 @@ def true_plant() -> control.StateSpace:
     for hz, damping, gain in MODES:
         omega = ccd.HZ * hz
         parts.append(control.tf([gain], [1.0, 2.0 * damping * omega, omega**2]))
-    systems = [control.ss(part) for part in parts]
-    found = systems[0]
-    for system in systems[1:]:
-        found = control.parallel(found, system)
-    return found
+    return control.parallel(*(control.ss(part) for part in parts))
 
 
 def measured(seed: int, noise: float = 0.01) -> MeasuredResponse:
@@ -50,7 +46,10 @@ def measured(seed: int, noise: float = 0.01) -> MeasuredResponse:
 def designed(
     response: MeasuredResponse, initial: list[np.ndarray], starts: int, members: list[int]
 ) -> tuple:
-    """A design on `members` of the set, and the judge's word on all; those that break one join."""
+    """A design on `members` of the set, and the judge's word on all; those that break one join.
+
+    `members` grows: the next draw begins with the plants that were worst in this one.
+    """
     plants = fit_modes(response).set_of_plants()
     scaled = [ccd.plant_from_control(plant, M_K) for plant in plants]
     for _ in range(ROUNDS):

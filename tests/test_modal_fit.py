@@ -33,7 +33,10 @@ def measured(seed: int, noise: float = 0.01) -> MeasuredResponse:
 
 
 def test_the_modes_are_found_and_as_far_off_as_said() -> None:
-    """Over twelve draws the errors over their deviations have a root mean square of about one."""
+    """Over twelve draws the errors over their deviations have a root mean square of about one.
+
+    It is 1.003; that of 48 normal numbers scatters by 0.1, s from 600 parts by 3 %.
+    """
     errors = []
     for seed in range(12):
         fit = fit_modes(measured(seed))
@@ -42,15 +45,15 @@ def test_the_modes_are_found_and_as_far_off_as_said() -> None:
             i = int(np.abs(fit.hz - hz).argmin())
             errors += [np.log(fit.hz[i] / hz) / fit.deviations[i],
                        np.log(fit.damping[i] / damping) / fit.deviations[n + i]]  # fmt: skip
-        assert 0.4 * 0.01 < fit.noise < 1.5 * 0.01
-    assert 0.4 < np.sqrt(np.mean(np.square(errors))) < 2.5
+        assert fit.noise == pytest.approx(0.01 / np.sqrt(2.0), rel=0.1)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.3)
 
 
 def test_its_system_is_what_was_fitted() -> None:
     fit = fit_modes(measured(0))
     G = fit.system()
     gap = np.abs(G(1j * HZ * LINES) / true_response(LINES) - 1.0)
-    assert gap.max() < 0.03
+    assert gap.max() < 0.02  # 0.008, at the end of the band
     assert control.poles(G).real.max() < 0.0
 
 
