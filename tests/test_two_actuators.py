@@ -99,7 +99,7 @@ def test_the_peak_of_s_is_that_of_the_sum_of_both_loops() -> None:
 def test_the_judge_sees_a_loop_at_rest_with_one_integrator_of_two(
     sampling: Sampling | None,
 ) -> None:
-    """K has a pole at 0 Hz then: S G goes to 0 with frequency, and without integrator to G/(1+L)."""
+    """K has a pole at 0 Hz then, S G goes to 0; with no integrator it goes to G/(1 + L)."""
     first, kappa = one_sensor(), start(sampling)
     own = STRUCTURE.in_units(kappa, first.omega_0, first.force)
     K = STRUCTURE.state_space(own)
