@@ -31,6 +31,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.fixed_structure.peak_search import closed_on_zero
 from ccd_casadi.support.errors import PlantError
 
 SKEWED = given_decoupling(("a", "b", "c"), [[1, 0.2, 0], [0, 1, 0.1], [0.1, 0, 1]],
@@ -200,3 +201,35 @@ def test_a_maximum_beside_a_crossing_of_singular_values_is_found(
     assert (rows == 0).sum() == 2  # and the one that was known stays
     assert ((low <= start) & (start <= high)).all()
     assert (kind == Curve.T).all()
+
+
+def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Past the crossing the largest rises again: the ends of the grid's bracket have one slope.
+
+    The search then took the point of the grid for the maximum, and on a rib stage with a payload
+    passed S_max by 0.6 % unseen.
+    """
+    peaks = ((1.0, 0.0), (1.02, -0.01))
+
+    def largest(v: np.ndarray) -> np.ndarray:
+        return np.max([top - 2e2 * (v - at) ** 2 for at, top in peaks], axis=0)
+
+    def levels(problem, kappa, tau, which, v, least):  # type: ignore[no-untyped-def]
+        return {Curve.S_MAX: largest(v)[..., None]}
+
+    def slope(x: np.ndarray, of: np.ndarray) -> np.ndarray:
+        return (largest(np.exp(x + 1e-7)) - largest(np.exp(x - 1e-7))) / 2e-7
+
+    monkeypatch.setattr(mimo_figures, "_levels", levels)
+    problem = cast(MatrixProblem, SimpleNamespace(plants=SimpleNamespace(plants=(None,))))
+    low, start, high = (np.array([v]) for v in (0.99, 0.9985, 1.0145))
+    assert largest(start) > max(largest(low), largest(high))
+    assert not closed_on_zero(slope, start, low, high)[1].any()
+    brackets = (np.full(1, Curve.S_MAX), np.zeros(1, int), start, low, high)
+    _, rows, *bracket = mimo_figures._split(problem, np.zeros(0), 0.0, brackets, largest(start))
+    top, closed = closed_on_zero(slope, *bracket)
+    assert closed.all()
+    assert (rows == 0).all()
+    assert top == pytest.approx(1.0, abs=1e-6)

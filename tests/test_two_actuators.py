@@ -12,6 +12,7 @@ from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
 from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
+from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
@@ -93,6 +94,25 @@ def test_the_peak_of_s_is_that_of_the_sum_of_both_loops() -> None:
     peaks = assess(model, kappa, -1.5).peaks
     own = peaks.value[(peaks.plant == 0) & (peaks.curve == Curve.S_MAX)].max()
     assert np.exp(own) * BOUNDS.S_max == pytest.approx(np.abs(1.0 / (1.0 + loops)).max(), rel=1e-3)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_judge_sees_a_loop_at_rest_with_one_integrator_of_two(
+    sampling: Sampling | None,
+) -> None:
+    """K has a pole at 0 Hz then, S G goes to 0; with no integrator it goes to G/(1 + L)."""
+    first, kappa = one_sensor(), start(sampling)
+    own = STRUCTURE.in_units(kappa, first.omega_0, first.force)
+    K = STRUCTURE.state_space(own)
+    found = certify([first], K, BOUNDS, sampling, integrator=STRUCTURE.integrator).plants[0]
+    assert 0.0 < found.static_compliance < 1e-3 * found.low_compliance
+    G = first.plant_si()
+    g = G.C @ np.linalg.solve(-G.A, G.B)
+    k = np.array([[0.1], [0.2]]) / np.abs(g).max()
+    still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), k)
+    found = certify([first], still, BOUNDS, sampling, integrator=False).plants[0]
+    expected = np.linalg.norm(g) / abs(1.0 + (g @ k).item())
+    assert found.static_compliance == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -120,11 +120,17 @@ def lifted_bounds(problem: CoDesignProblem) -> tuple[Array, Array]:
 
 
 def solve_program(
-    program: NonlinearProgram, starts: Array, *, warm: bool = False, tolerance: float = 1e-9
+    program: NonlinearProgram,
+    starts: Array,
+    *,
+    warm: bool = False,
+    tolerance: float = 1e-9,
+    settled: float | None = None,
 ) -> OuterSolution:
     """IPOPT from every row of `starts`; variables are scaled to the unit box.
 
-    `warm` starts close to a solution without pushing it into the interior.
+    `warm` starts close to a solution without pushing it into the interior. `settled`: an end is
+    also where f changes by no more than that (relative) in four iterations one after the other.
     Raises OuterFailure where no start converges.
     """
     width = program.upper - program.lower
@@ -138,6 +144,12 @@ def solve_program(
         options["ipopt.acceptable_iter"] = 4
         # Where it has not converged by then it goes to and fro over a kink; `kinked` does not.
         options["ipopt.max_iter"] = 100
+    if settled is not None:
+        options |= {
+            "ipopt.acceptable_tol": 1e10,
+            "ipopt.acceptable_constr_viol_tol": 1e-9,
+            "ipopt.acceptable_obj_change_tol": settled,
+        }
     if warm:
         options |= {
             "ipopt.warm_start_init_point": "yes",

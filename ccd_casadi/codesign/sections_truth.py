@@ -31,6 +31,7 @@ from surrogates import design
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
+SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
 
 
 class TrueBandwidth(VectorCallback):
@@ -82,7 +83,7 @@ def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> Formul
     program = nested_program(problem, truth)
     program = type(program)(**{**vars(program), "exact_hessian": False})
     try:
-        solution = solve_program(program, np.array(good), tolerance=PRECISE)
+        solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
     except OuterFailure as error:
         best = min((truth.at(p) for p in good), key=lambda s: objective(problem, s))
         if not np.isfinite(objective(problem, best)):
@@ -107,7 +108,9 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, Ou
     program = type(program)(**{**vars(program), "exact_hessian": False})
     solution: OuterSolution | None = None
     try:
-        solution = solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE)
+        solution = solve_program(
+            program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED
+        )
     except OuterFailure:
         pass
     return min(truth.known.values(), key=lambda s: objective(problem, s)), solution

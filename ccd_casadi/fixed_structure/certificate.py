@@ -30,6 +30,7 @@ from ccd_casadi.synthesis.norms import hinf_norm
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
+REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class PlantFigures:
 
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
-    `static_compliance` is GS at 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
+    `static_compliance` is GS towards 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
     `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peak by a Hamiltonian.
     """
 
@@ -166,7 +167,8 @@ def judged(
         GS=tops["GS"][0],
         weighted_KS=weighted[0],
         weighted_T=weighted[1],
-        static_compliance=0.0 if integrator else float(table.at(np.zeros(1))["GS"][0]),
+        # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
+        static_compliance=0.0 if integrator else float(table.at(REST * grid[:1])["GS"][0]),
         low_compliance=float(low["GS"][0]),
         confirmed=abs(norm / top - 1.0) <= CONFIRMED,
     )

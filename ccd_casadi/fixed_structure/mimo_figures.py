@@ -45,9 +45,11 @@ from ccd_casadi.support.arrays import Array
 RELEVANT = -0.4
 WITHIN = 0.4
 # Sorted singular values may have two maxima between neighbours of the grid, where the smooth ones
-# cross: brackets of a maximum above -CLOSE are looked at again at so many places.
+# cross, or one and a crossing, past which the slope has no change of sign: brackets of a maximum
+# above -CLOSE are looked at again at so many places and at the maximum (an even number: the middle
+# of a regular grid's bracket is the maximum itself).
 CLOSE = 0.1
-FINER = 13
+FINER = 12
 # Curve, row, start, low and high end of each.
 Brackets = tuple[np.ndarray, np.ndarray, Array, Array, Array]
 OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING)
@@ -249,7 +251,7 @@ def _channels(
 def _split(
     problem: MatrixProblem, kappa: Array, tau: float, brackets: Brackets, value: Array
 ) -> Brackets:
-    """Brackets of one curve's maxima with `value` there; those that hold several come apart.
+    """Brackets of one curve's maxima with `value` there, narrowed; several in one come apart.
 
     A maximum of σ_k+1 where smooth ones cross has one of σ_k beside it, which the grid may miss.
     """
@@ -259,6 +261,7 @@ def _split(
         return brackets
     P = len(problem.plants.plants)
     inside = np.geomspace(low[at], high[at], FINER, axis=1)
+    inside = np.sort(np.concatenate([inside, start[at, None]], axis=1), axis=1)
     which = np.broadcast_to((rows[at] % P)[:, None], inside.shape)
     level = _levels(problem, kappa, tau, which, inside, -2.0 * CLOSE)[Curve(int(kind[0]))]
 
@@ -270,15 +273,14 @@ def _split(
         i, m = np.nonzero(top)
         return kind[at[i]], row[i], inside[i, m + 1], inside[i, m], inside[i, m + 2]
 
-    several = tops(rows[at])
-    several &= (several.sum(axis=1) > 1)[:, None]
-    kept = np.setdiff1d(np.arange(len(start)), at[several.any(axis=1)])
+    own = tops(rows[at])
+    kept = np.setdiff1d(np.arange(len(start)), at[own.any(axis=1)])
     above = np.maximum(rows[at] - P, rows[at] % P)
     beside = tops(above) & (rows[at] >= P)[:, None]
     known = above[:, None] == rows  # no maximum twice
     x = inside[:, 1:-1, None]
     beside &= ~(known[:, None] & (low <= x) & (x <= high)).any(axis=2)
-    parts = zip((part[kept] for part in brackets), bracketed(rows[at], several),
+    parts = zip((part[kept] for part in brackets), bracketed(rows[at], own),
                 bracketed(above, beside), strict=True)  # fmt: skip
     kind, rows, start, low, high = (np.concatenate(part) for part in parts)
     return kind, rows, start, low, high
