@@ -4,7 +4,9 @@ import shutil
 
 import pytest
 
-from ccd_casadi import deploy, insight, robustness
+from ccd_casadi.deploy import main as deploy
+from ccd_casadi.insight import main as insight
+from ccd_casadi.robustness import main as robustness
 
 WIDTHS, SCHEMES = (1300, 390), ("light", "dark")
 HEAVIEST = 1.5e6  # bytes of a page
@@ -106,9 +108,9 @@ def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
 def test_every_page_of_a_run(browser, solved, tmp_path):
     folder = shutil.copytree(solved("lifted"), tmp_path / "run")
     quiet = [str(folder), "--quiet"]
-    robustness.main(quiet)
-    deploy.main(quiet)
-    insight.main([*quiet, "--points", "3", "--workers", "1"])
+    robustness(quiet)
+    deploy(quiet)
+    insight([*quiet, "--points", "3", "--workers", "1"])
     page = browser.new_page()
     page.goto((folder / "index.html").as_uri())
     linked = page.locator("li a").evaluate_all("links => links.map(link => link.href)")
