@@ -14,6 +14,7 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 180  # of the frequency grid, besides those around resonances
+SAME = 1e-9  # relative distance of two frequencies below which they are one
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ def grid_of(look: Look) -> Array:
     around = around_resonances(plant, look.controller)
     special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
     grid = np.concatenate([np.geomspace(low, high, POINTS), around, special])
-    return np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
+    grid = np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
+    return grid[np.diff(grid, prepend=0.0) > SAME * grid]  # around a double pole they come twice
 
 
 def sampled_of(look: Look) -> AsSampled | None:

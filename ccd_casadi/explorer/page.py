@@ -28,7 +28,7 @@ from ccd_casadi.reporting.machine import machine_html
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
 
-TOGETHER = 1  # ms: drags that come within it are answered at once
+TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
 LINES = 40  # of a solve's output
 BAR = re.compile(r"\d+/\d+ \[[#-]+\]")  # of a line that tells progress
@@ -50,7 +50,7 @@ class Page:
         self.map = MapFigure(parameters, self.draw_map, dark)
         run = session.run
         self._surrogate = () if run is None else run_surrogate(run.folder)
-        self._open, self._scheduled, self._let_go = True, False, False
+        self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
@@ -98,9 +98,21 @@ class Page:
     def moved(self, let_go: bool) -> None:
         """A slider moved: answer soon, once for all that moved meanwhile."""
         self._let_go = self._let_go or let_go
+        self._moves += 1
         if not self._scheduled:
             self._scheduled = True
-            self.document.add_timeout_callback(self._answer, TOGETHER)
+            self._answer_after(self._moves)
+
+    def _answer_after(self, moves: int) -> None:
+        # While a slow design was made, moves queued up that come now one by one: to answer each
+        # would leave the page further and further behind the slider.
+        def still() -> None:
+            if self._moves == moves:
+                self._answer()
+            else:
+                self._answer_after(self._moves)
+
+        self.document.add_timeout_callback(still, TOGETHER)
 
     def improved(self) -> None:
         """There is a better surrogate of the modes."""
