@@ -138,7 +138,7 @@ def judged(
     S = _sensitivity(*loop)
     poles = np.linalg.eigvals(S.A)
     stability = float(poles.real.max() if sampling is None else np.abs(poles).max() - 1.0)
-    if not stability < 0.0:
+    if not stability < -_rounding(S.A):
         return _unstable(stability)
     roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
     roots += [transmission_zeros(*_scaled(x)) * _size(x) for x in (G, K) if not x.D.any()]
@@ -172,6 +172,11 @@ def judged(
         low_compliance=float(low["GS"][0]),
         confirmed=abs(norm / top - 1.0) <= CONFIRMED,
     )
+
+
+def _rounding(A: Array) -> float:
+    """What rounding may move a pole by: one that is no further from the axis may lie on it."""
+    return float(10.0 * np.finfo(float).eps * np.linalg.norm(A))
 
 
 def _unstable(stability: float) -> PlantFigures:

@@ -6,7 +6,12 @@ import numpy as np
 
 from ccd_casadi.kernels.blocks import all_finite, ascending, place
 from ccd_casadi.kernels.certificate import level_test, stack_norm
-from ccd_casadi.kernels.closed_loop import loop_matrices, reachable_loop, weighted_loop
+from ccd_casadi.kernels.closed_loop import (
+    loop_matrices,
+    pole_rounding,
+    reachable_loop,
+    weighted_loop,
+)
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.disturbance_certificate import (
     four_block_level_test,
@@ -60,7 +65,7 @@ def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
     if info != 0:
         row[Figure.CODE] = Code.EIGENVALUES_FAILED.value
         return
-    if not wr.max() < 0.0:
+    if not wr.max() < -pole_rounding(As):
         row[Figure.CODE] = Code.UNSTABLE_LOOP.value
         return
     G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
@@ -118,7 +123,7 @@ def _four_block_code(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
     row[Figure.MAX_REAL_POLE] = wr.max()
     if info != 0:
         return Code.EIGENVALUES_FAILED
-    if not wr.max() < 0.0:
+    if not wr.max() < -pole_rounding(As):
         return Code.UNSTABLE_LOOP
     G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
     norm, at = four_block_norm(G, K, Dk, w, delta, certificate_grid(wr, wi))
