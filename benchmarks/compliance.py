@@ -33,7 +33,7 @@ from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parent.parent
 ROBUST = "\n[robust]\nresonance_shift = 0.03\n"
-BLOCK = re.compile(r"^```\w+ title=\"(my_stage\.\w+)\"\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```\w+ title=\"(my_\w+\.\w+)\"\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 # Two-sided 1 N²/Hz; sections of either case: γ of its own full-order optimum as the level
@@ -101,9 +101,10 @@ def main() -> None:
     parser.add_argument("--disturbance", type=float, nargs="*", default=[1.0, 10.0, 20.0])
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in BLOCK.findall((ROOT / "docs" / "tutorial.md").read_text()):
-            (Path(folder) / name).write_text(text)
-        stage = Path(folder) / "my_stage.toml"
+        for page in ("tutorial.md", "mixed_sensitivity.md"):
+            for name, text in BLOCK.findall((ROOT / "docs" / page).read_text()):
+                (Path(folder) / name).write_text(text)
+        stage = Path(folder) / "my_nominal.toml"
         cases = (
             ("case study 1", ROOT / "runs" / "two_mass.toml", (60.0, 60.0)),
             ("tutorial", stage, (19.0, 8.0)),
