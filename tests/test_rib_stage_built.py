@@ -1,6 +1,7 @@
 """The design of benchmarks/rib_stage_design: light enough, and within its bounds as it runs."""
 
 import json
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ from benchmark_scripts import FOLDER, benchmark
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
+from ccd_casadi.codesign.on_the_set import sentences, stages_of, stored_rows
+from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -18,9 +21,11 @@ from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.rib_stage import NAMES
 from ccd_casadi.plants.rib_stage.plant import rib_stage
+from ccd_casadi.reporting.published_figures import published_sections
 from ccd_casadi.support.errors import UserError
 
 built = benchmark("rib_stage_built")
+conclusions = benchmark("rib_stage_conclusions")
 
 
 def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
@@ -68,3 +73,48 @@ def test_a_known_controller_is_where_inner_begins(
     assert "--begin-at" in capsys.readouterr().err
     with pytest.raises(UserError):
         sections_kappa(tmp_path, structure_of(problem))
+
+
+def test_the_conclusions_of_the_page_and_of_the_report_are_those_of_the_stored_figures() -> None:
+    rows = stored_rows()
+    kept = (
+        conclusions.PAGE.read_text(encoding="utf-8")
+        .split(conclusions.BEGIN)[1]
+        .split(conclusions.END)[0]
+        .strip()
+    )
+    assert kept == conclusions.markdown(rows)
+    report = published_sections(
+        problem_of(load_case(conclusions.CASE)), {"published": PUBLISHED["rib_stage"]}
+    )
+    problem = problem_of(load_case(conclusions.CASE))
+    for words in sentences(stages_of(rows, problem.w1, problem.w2)):
+        assert words in kept
+        assert words in unescape(report[0].body)
+
+
+def test_another_figure_is_another_conclusion() -> None:
+    """The same stages on a set that the sequential one suffers from, and on one that all do."""
+    problem = problem_of(load_case(conclusions.CASE))
+
+    def said(hz: dict[str, float]) -> list[str]:
+        rows = {name: {"theta": [1e-3], "mass": mass, "apart_hz": {"z": 1.0},
+                       "nominal": {"bandwidth_hz": alone},
+                       "whole": {"certified": True, "bandwidth_hz": hz[name]}}
+                for name, mass, alone in (("sequential", 1.0, 50.0), ("lifted", 0.4, 80.0),
+                                          ("this set", 0.6, 70.0))}  # fmt: skip
+        return sentences(stages_of(rows, problem.w1, problem.w2))
+
+    first = said({"sequential": 75.0, "lifted": 45.0, "this set": 76.0})
+    assert first[1].endswith("the nominal optimum is 60 % lighter and 60 % faster.")
+    assert "keeps 45.0 of its 80.0 Hz: 60 % lighter and 40 % slower" in first[3]
+    assert "The nominal optimum, the best nominal one, has the worst." in first
+    assert first[-1].endswith("has to run: the mass, not the bandwidth.")
+    other = said({"sequential": 50.0, "lifted": 45.0, "this set": 70.0})
+    assert "40 % lighter and 40 % faster" in other[-1]
+    assert other[-1].endswith("has to run: all of it.")
+    part = said({"sequential": 50.0, "lifted": 45.0, "this set": 55.0})
+    assert part[-1].endswith("has to run: the mass and 36 % of the gain in bandwidth.")
+    nothing = said({"sequential": 75.0, "lifted": 45.0, "this set": 60.0})
+    assert "No stage here has a better J on the set than the sequential one." in nothing
+    assert nothing[-1].endswith("nothing is left.")
