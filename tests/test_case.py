@@ -32,7 +32,7 @@ def test_the_contracts_case_is_read_as_it_stands() -> None:
         Parameter("m1", 55.0, 70.0, 67.56, "kg"),
         Parameter("m2", 55.0, 70.0, 67.56, "kg"),
     )
-    assert vars(case.objective) == {"w1": 0.0995, "w2": -0.9950}
+    assert vars(case.objective) == {"w1": 0.0995, "w2": -0.9950, "cost_unit": "kg"}
     assert vars(case.weights) == {
         "M_S": 2.0, "A_S": 1e-4, "c_K": 1e4, "omega_K_hz": 100.0, "M_K": 2e7, "A_l": 1.0,
         "A_u": 1e-2, "disturbance": None,

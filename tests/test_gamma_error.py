@@ -73,7 +73,7 @@ def test_where_the_limit_passes_from_the_riccati_level_to_the_bound_both_sides_a
         assert found[Figure.CODE] == Code.CERTIFIED
         return found
 
-    ends = [-4.0, 4.0]
+    ends = [-4.0, 2.0]
     sides = [row(x) for x in ends]
     limited = [bool(side[Figure.LIMITED_BY_BOUND]) for side in sides]
     assert limited[0] != limited[1]

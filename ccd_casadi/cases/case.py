@@ -48,8 +48,8 @@ _ORDERED_WEIGHTS = (
 def load_case(path: str | Path) -> Case:
     """Read and check a case file. Raises CaseError on the first mistake.
 
-    >>> load_case("runs/two_mass.toml").theta[0]
-    Parameter(name='m1', lower=55.0, upper=70.0, start=67.56, unit='kg')
+    >>> load_case("runs/two_mass.toml").theta[0].table
+    {'lower': 55.0, 'upper': 70.0, 'start': 67.56, 'unit': 'kg'}
     """
     path = Path(path)
     return parse_case(read_toml(path), path)

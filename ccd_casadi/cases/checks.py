@@ -195,7 +195,7 @@ def shown(value: Any) -> str:
 ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
-ABOVE_ONE = number(1.0, math.inf, "give a number above 1")
+ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
 
 def closest(name: str, known: Collection[str]) -> str:
