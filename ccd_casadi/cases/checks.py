@@ -155,6 +155,12 @@ def files(value: Any) -> str | None:
     return None if good else f"is {shown(value)}; give a list of file names in quotes"
 
 
+@_with(_list({"type": "string", "minLength": 1}, 1))
+def names(value: Any) -> str | None:
+    good = isinstance(value, list | tuple) and value and all(isinstance(v, str) for v in value)
+    return None if good else f"is {shown(value)}; give a list of texts in quotes"
+
+
 @_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
 def tables(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]

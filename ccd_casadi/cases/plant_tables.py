@@ -14,6 +14,7 @@ from ccd_casadi.cases.checks import (
     closest,
     count,
     flag,
+    names,
     number,
     rows,
     shown,
@@ -48,6 +49,16 @@ _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
     ("sampled_matrices", "modes"): count(1),
     ("sampled_matrices", "static_correction"): flag,
     ("sampled_matrices", "rigid_below_hz"): POSITIVE,
+    ("cad_stage", "morph"): text,
+    ("cad_stage", "forces"): names,
+    ("cad_stage", "sensors"): names,
+    ("cad_stage", "rigid"): names,
+    ("cad_stage", "held"): names,
+    ("cad_stage", "modes"): count(1),
+    ("cad_stage", "zeta"): FRACTION,
+    ("cad_stage", "young"): POSITIVE,
+    ("cad_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
+    ("cad_stage", "density"): POSITIVE,
 }
 _KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 

@@ -5,6 +5,7 @@ A model function speaks CasADi; a plant builder takes the names of θ and evalua
 
 from collections.abc import Callable
 
+from ccd_casadi.plants.cad.plant import cad_stage as cad_stage
 from ccd_casadi.plants.imported.plant import modal_table as modal_table
 from ccd_casadi.plants.imported.plant import sampled_matrices as sampled_matrices
 from ccd_casadi.plants.plant import ModelFunction, Plant
@@ -16,7 +17,8 @@ BUILDERS: dict[str, Callable[..., Plant]] = {
     "rib_stage": rib_stage,
     "modal_table": modal_table,
     "sampled_matrices": sampled_matrices,
+    "cad_stage": cad_stage,
 }
 # The option of a model that names its data, relative to the case file.
-DATA: dict[str, str] = {"modal_table": "table", "sampled_matrices": "folder"}
+DATA: dict[str, str] = {"modal_table": "table", "sampled_matrices": "folder", "cad_stage": "morph"}
 SHIPPED = frozenset({"two_mass", "rib_stage"})  # known to be sound: not diagnosed on loading

@@ -1,0 +1,164 @@
+"""The mesh as a polynomial of θ: drawn once with the CAD kernel, and needed no more afterwards.
+
+Node positions are x(θ) = Σ_k c_k ξ^k, ξ the place in the box from -1 to 1, fitted by least squares
+to the moved mesh at twice as many θ as there are terms, denser towards the bounds. Their
+velocities ∂x/∂θ are therefore exact derivatives of this model; how far it is from the drawn solid
+is measured at θ that the fit has not seen.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from ccd_casadi.plants.cad import solid
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.progress import Progress
+
+FORMAT = "ccd_casadi morph 1"
+UNSEEN = 5  # θ that measure the fit
+MOST_ERROR = 1e-3  # of the mesh size
+ROUNDING = 1e-12  # m: a coefficient below is none
+# θ by name -> the solid (build123d, in mm, or a STEP file) and a point in mm on each named face
+Drawing = Callable[[Mapping[str, float]], tuple[Any, Mapping[str, Sequence[float]]]]
+
+
+@dataclass(frozen=True)
+class Morph:
+    """Tetrahedra (t, 4) whose points (n, 3) in m are polynomials of θ between `lower` and `upper`.
+
+    `exponents` (k, p) and `coefficients` (k, n, 3) of ξ; `faces` are triangles (f, 3) by name;
+    `error` is the largest distance of a node to its place on the drawn solid, in m.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    exponents: np.ndarray
+    coefficients: Array
+    tets: np.ndarray
+    faces: Mapping[str, np.ndarray]
+    error: float
+
+    def points(self, theta: Sequence[float] | Array) -> Array:
+        """(n, 3) in m. Raises PlantError where an element is inside out."""
+        points = np.tensordot(_terms(self._unit(theta), self.exponents), self.coefficients, 1)
+        if not solid.volumes(points, self.tets).min() > 0.0:
+            place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
+            raise PlantError(f"an element of the mesh is inside out at {place}; narrow the bounds")
+        return points
+
+    def velocities(self, theta: Sequence[float] | Array) -> Array:
+        """∂points/∂θ, (p, n, 3)."""
+        unit, found = self._unit(theta), []
+        for i, width in enumerate(0.5 * (self.upper - self.lower)):
+            lowered = self.exponents.copy()
+            lowered[:, i] = np.maximum(lowered[:, i] - 1, 0)
+            slope = self.exponents[:, i] * _terms(unit, lowered) / width
+            found.append(np.tensordot(slope, self.coefficients, 1))
+        return np.array(found)
+
+    def _unit(self, theta: Sequence[float] | Array) -> Array:
+        return (2.0 * np.asarray(theta, float) - self.lower - self.upper) / (
+            self.upper - self.lower
+        )
+
+
+def draw_morph(
+    drawing: Drawing,
+    bounds: Mapping[str, tuple[float, float]],
+    file: str | Path,
+    *,
+    size: float,
+    degree: int = 3,
+    quiet: bool = False,
+) -> Morph:
+    """Mesh the solid in the middle of `bounds` with elements of `size` in m, follow it, write it.
+
+    Raises PlantError where the solid at some θ has other faces, or `degree` does not follow it.
+    """
+    names = tuple(bounds)
+    lower, upper = np.array([bounds[name] for name in names], float).T
+    powers = product(range(degree + 1), repeat=len(names))
+    exponents = np.array([row for row in powers if sum(row) <= degree])
+    count = 2 * len(exponents) + UNSEEN
+    draws = qmc.Halton(len(names), scramble=False).random(count)
+    unit = -np.cos(np.pi * draws)
+    theta = lower + 0.5 * (unit + 1.0) * (upper - lower)
+
+    def drawn(row: Array) -> tuple[Any, Mapping[str, Sequence[float]]]:
+        values = dict(zip(names, map(float, row), strict=True))
+        try:
+            return drawing(values)
+        except Exception as error:
+            raise PlantError(f"it cannot be drawn: {error}") from error
+
+    with solid.kernel() as gmsh, Progress(count + 1, "drawing the solid", quiet=quiet) as bar:
+        part, named = drawn(0.5 * (lower + upper))
+        solid.load(gmsh, part)
+        tags = {name: solid.face_at(gmsh, name, point) for name, point in named.items()}
+        mesh = solid.meshed(gmsh, size)
+        bar.advance()
+        samples = []
+        for row in theta:
+            try:
+                solid.load(gmsh, drawn(row)[0])
+                samples.append(solid.moved(gmsh, mesh))
+            except PlantError as refused:
+                place = ", ".join(f"{n}={v:g}" for n, v in zip(names, row, strict=True))
+                raise PlantError(f"the solid at {place}: {refused}") from refused
+            bar.advance()
+    flat = np.array(samples).reshape(count, -1)
+    fit = np.array([_terms(row, exponents) for row in unit])
+    coefficients = np.linalg.lstsq(fit[UNSEEN:], flat[UNSEEN:], rcond=None)[0]
+    gap = (fit[:UNSEEN] @ coefficients - flat[:UNSEEN]).reshape(-1, 3)
+    error = float(np.linalg.norm(gap, axis=1).max())
+    if error > MOST_ERROR * size:
+        raise PlantError(
+            f"a polynomial of degree {degree} is {error:.1e} m off the solid; raise `degree`, "
+            "narrow the bounds, or look for a face that leaps"
+        )
+    morph = Morph(
+        names, lower, upper, exponents,
+        np.round(coefficients / ROUNDING).reshape(len(exponents), -1, 3) * ROUNDING,
+        mesh.tets, {name: mesh.faces[tag] for name, tag in tags.items()}, error,
+    )  # fmt: skip
+    write_morph(morph, file)
+    return morph
+
+
+def write_morph(morph: Morph, file: str | Path) -> None:
+    """As an .npz file without pickled objects."""
+    faces = {f"face:{name}": triangles for name, triangles in morph.faces.items()}
+    fields = {key: value for key, value in vars(morph).items() if key != "faces"}
+    with Path(file).open("wb") as stream:
+        np.savez_compressed(stream, format=FORMAT, **fields, **faces)  # type: ignore[arg-type]
+
+
+def read_morph(file: str | Path) -> Morph:
+    """Raises PlantError where the file is none of `draw_morph`."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            if str(data["format"]) != FORMAT:
+                raise ValueError(f"its format is {data['format']}, not {FORMAT}")
+            faces = {key[5:]: data[key] for key in data.files if key.startswith("face:")}
+            arrays = ("lower", "upper", "exponents", "coefficients", "tets")
+            lower, upper, exponents, coefficients, tets = (data[key] for key in arrays)
+            names = tuple(map(str, data["names"]))
+            morph = Morph(
+                names, lower, upper, exponents, coefficients, tets, faces, float(data["error"])
+            )
+    except Exception as error:
+        words = "write it with ccd_casadi.plants.cad.draw_morph"
+        raise PlantError(f"{Path(file).name}: is no morphed mesh ({error}); {words}") from None
+    return morph
+
+
+def _terms(unit: Array, exponents: np.ndarray) -> Array:
+    """(k,) monomials at ξ."""
+    return np.prod(unit[None, :] ** exponents, axis=1)

@@ -1,0 +1,222 @@
+"""A stage from CAD as the case file names it: the options of `cad_stage`, and its plant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.plants.cad.elements import Body, Material
+from ccd_casadi.plants.cad.modes import Reduced, reduced
+from ccd_casadi.plants.cad.morph import Morph, read_morph
+from ccd_casadi.plants.cad.solid import volumes
+from ccd_casadi.plants.plant import Mechanics, Plant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.optional_packages import require
+
+MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
+REMEMBERED = 64  # θ whose modes are kept
+
+
+def cad_stage(
+    names: Sequence[str],
+    morph: str = "",
+    forces: Sequence[str] = (),
+    sensors: Sequence[str] = (),
+    rigid: Sequence[str] = MOTIONS,
+    held: Sequence[str] = (),
+    modes: int = 10,
+    zeta: float = 0.01,
+    young: float = 68.9e9,
+    poisson: float = 0.33,
+    density: float = 2700.0,
+) -> Plant:
+    """The stage whose mesh `draw_morph` wrote to the file `morph`; hardware cost: its mass in kg.
+
+    `forces` and `sensors` are "FACE:x", y or z: a force spread evenly over a named face, the mean
+    displacement of one; none of them: all faces along z. `held` names faces that do not move; a
+    stage without floats, and of its motions x, y, z, rx, ry, rz those of `rigid` are in the model.
+    Reference: the same stage with twice as many modes.
+    """
+    if not morph:
+        raise PlantError('cad_stage needs morph = "stage.npz", relative to the case file')
+    require("skfem", "cad")
+    mesh, file = read_morph(morph), Path(morph).name
+    if sorted(names) != sorted(mesh.names):
+        raise PlantError(
+            f"{file} has the parameters {', '.join(mesh.names)}, the case {', '.join(names)}; "
+            "make them agree"
+        )
+    every = tuple(f"{face}:z" for face in mesh.faces)
+    stage = CadStage(
+        morph=mesh,
+        material=Material(young, poisson, density),
+        forces=_ports("forces", forces or every, mesh),
+        sensors=_ports("sensors", sensors or every, mesh),
+        rigid=tuple(_one_of("rigid", name, MOTIONS) for name in rigid),
+        held=tuple(_one_of("held", name, tuple(mesh.faces)) for name in held),
+        modes=modes,
+        damping_ratio=zeta,
+    )
+    return plant_of_stage(stage, names, file)
+
+
+Port = tuple[str, int]  # a face and an axis
+
+
+@dataclass(frozen=True)
+class CadStage:
+    """A morphed mesh with its material, forces, sensors and the modes of its model."""
+
+    morph: Morph
+    material: Material
+    forces: tuple[Port, ...]
+    sensors: tuple[Port, ...]
+    rigid: tuple[str, ...] = MOTIONS
+    held: tuple[str, ...] = ()
+    modes: int = 10
+    damping_ratio: float = 0.01
+
+    def mechanics(self, theta: Sequence[float], derivatives: bool = True) -> Mechanics:
+        """Rigid-body motions, then flexible modes by frequency; SI. θ in the morph's order."""
+        ports = tuple(dict.fromkeys((*self.forces, *self.sensors)))
+        found = self.modal_model(theta, ports, derivatives)
+        count = found.M.shape[0] - self.modes
+        rows = [MOTIONS.index(name) for name in self.rigid] if count else []
+        rows += range(count, count + self.modes)
+        pick = np.ix_(rows, rows)
+        drive, read = (
+            [ports.index(port) for port in group] for group in (self.forces, self.sensors)
+        )
+        F, dF = found.F[rows], found.dF[:, rows]
+        dM, dK = (item[:, rows][:, :, rows] for item in (found.dM, found.dK))
+        n = len(rows)
+        return Mechanics(
+            M=found.M[pick], D=np.zeros((n, n)), K=found.K[pick],
+            B=F[:, drive], C=F[:, read].T, damping_ratio=self.damping_ratio,
+            derivatives=(
+                dM, np.zeros_like(dM), dK, dF[:, :, drive], dF[:, :, read].transpose(0, 2, 1),
+            ),
+        )  # fmt: skip
+
+    def modal_model(
+        self, theta: Sequence[float], ports: Sequence[Port], derivatives: bool
+    ) -> Reduced:
+        """All motions and modes, driven and read at `ports`."""
+        body = Body(self.morph.points(theta), self.morph.tets, self.material)
+        velocities = self.morph.velocities(theta)[: None if derivatives else 0]
+        count = len(body.places)
+        F = np.zeros((3 * count, len(ports)))
+        dF = np.zeros((len(velocities), 3 * count, len(ports)))
+        for k, (face, axis) in enumerate(ports):
+            block = slice(axis * count, (axis + 1) * count)
+            F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
+        held = np.zeros((3, count), dtype=bool)
+        for face in self.held:
+            held[:, body.on(self.morph.faces[face])] = True
+        return reduced(body, velocities, F, dF, self.modes, held.ravel())
+
+    def frequencies(self, theta: Sequence[float]) -> Array:
+        """Of the flexible modes, in Hz."""
+        found = self.modal_model(theta, self.sensors, False)
+        return np.sqrt(np.diag(found.K)[-self.modes :]) / (2.0 * np.pi)
+
+    def mass(self, theta: Sequence[float] | Array) -> float:
+        """In kg."""
+        return float(
+            self.material.density * volumes(self.morph.points(theta), self.morph.tets).sum()
+        )
+
+    def mass_slope(self, theta: Sequence[float] | Array) -> Array:
+        """∂mass/∂θ, (p,)."""
+        first = self.morph.points(theta)[self.morph.tets]
+        edges = first[:, 1:] - first[:, :1]
+        moved = self.morph.velocities(theta)[:, self.morph.tets]
+        steps = moved[:, :, 1:] - moved[:, :, :1]
+        a, b, c = edges.transpose(1, 0, 2)
+        sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+        return self.material.density * np.einsum("ptij,tij->p", steps, sides) / 6.0
+
+
+def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh") -> Plant:
+    """The stage as the plant that the design loop asks for, θ in the order of `names`."""
+    morph = stage.morph
+    place = [list(names).index(name) for name in morph.names]  # of the morph's θ in the case's
+    back = [morph.names.index(name) for name in names]
+    middle, half = 0.5 * (morph.lower + morph.upper), 0.5 * (morph.upper - morph.lower)
+
+    def evaluator(variant: CadStage, derivatives: bool) -> Evaluator:
+        return Evaluator(variant, tuple(place), tuple(back), derivatives)
+
+    # in units of the box, so that CasADi's differences of the slope have a fitting step
+    mass = VectorCallback(
+        "mass", len(names), 1,
+        lambda unit: np.array([stage.mass(middle + half * unit)]),
+        lambda unit: (half * stage.mass_slope(middle + half * unit))[None],
+        hessians=True,
+    )  # fmt: skip
+    theta = ca.MX.sym("theta", len(names))
+    own = ca.vertcat(*(theta[i] for i in place))
+    evaluate = evaluator(stage, True)
+    evaluate.keep = mass  # CasADi holds no reference to it
+    notes = (
+        f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
+        f"{morph.error:.1e} m of the drawing where that was looked at; its first "
+        f"{stage.modes} flexible modes",
+    )
+    return Plant(
+        names=tuple(names),
+        constraint_names=(),
+        evaluate=evaluate,
+        hardware=ca.Function("hardware", [theta], [mass((own - middle) / half), ca.MX(0, 1)]),
+        outputs=len(stage.sensors),
+        inputs=len(stage.forces),
+        references={"twice as many modes": evaluator(replace(stage, modes=2 * stage.modes), False)},
+        exact_hessian=False,
+        values=evaluator(stage, False),
+        notes=lambda theta: notes,
+        domain=(morph.lower[back], morph.upper[back]),
+    )
+
+
+class Evaluator:
+    """θ in the case's order -> Mechanics, with or without derivatives, the last ones remembered."""
+
+    keep: object = None
+
+    def __init__(
+        self, stage: CadStage, place: tuple[int, ...], back: tuple[int, ...], derivatives: bool
+    ) -> None:
+        self.stage, self.place, self.back = stage, place, back
+        self.derivatives = derivatives
+        self._read = lru_cache(maxsize=REMEMBERED)(self._evaluate)
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        return self._read(tuple(float(theta[i]) for i in self.place))
+
+    def _evaluate(self, theta: tuple[float, ...]) -> Mechanics:
+        found = self.stage.mechanics(theta, self.derivatives)
+        if not self.derivatives:
+            return found
+        M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
+        return replace(found, derivatives=(M, D, K, B, C))
+
+
+def _ports(key: str, texts: Sequence[str], morph: Morph) -> tuple[Port, ...]:
+    found = []
+    for text in texts:
+        face, _, axis = str(text).rpartition(":")
+        if axis not in ("x", "y", "z"):
+            raise PlantError(f'{key}: {text!r} has no direction; write "FACE:z", or x or y')
+        found.append((_one_of(key, face, tuple(morph.faces)), "xyz".index(axis)))
+    return tuple(found)
+
+
+def _one_of(key: str, name: str, known: tuple[str, ...]) -> str:
+    if name not in known:
+        raise PlantError(f"{key}: {name!r} is none of {', '.join(known)}; correct it")
+    return name
