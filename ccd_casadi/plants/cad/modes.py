@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.plants.cad.elements import Body
-from ccd_casadi.plants.rib_stage.solver import (
+from ccd_casadi.plants.eigenpairs import (
     build_pencil,
     build_resolvent,
     flexible_modes,

@@ -11,16 +11,16 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import qr
 
-from ccd_casadi.plants.rib_stage.assembly import Assembler, Sector, build_assembler, build_sector
-from ccd_casadi.plants.rib_stage.geometry import Geometry, Material, Point, PointMass
-from ccd_casadi.plants.rib_stage.mesh import MeshOrder, build_mesh
-from ccd_casadi.plants.rib_stage.solver import (
+from ccd_casadi.plants.eigenpairs import (
     Pencil,
     build_pencil,
     build_resolvent,
     flexible_modes,
     orthonormal,
 )
+from ccd_casadi.plants.rib_stage.assembly import Assembler, Sector, build_assembler, build_sector
+from ccd_casadi.plants.rib_stage.geometry import Geometry, Material, Point, PointMass
+from ccd_casadi.plants.rib_stage.mesh import MeshOrder, build_mesh
 from ccd_casadi.plants.rib_stage.symmetry import (
     ALL,
     AS,

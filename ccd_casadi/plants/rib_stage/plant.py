@@ -6,13 +6,13 @@ from functools import partial
 
 import casadi as ca
 
+from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.fixed import WithFixed
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.rib_stage import nearby
 from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
 from ccd_casadi.plants.rib_stage.mesh import COARSE, FINE, MeshOrder
 from ccd_casadi.plants.rib_stage.model import RibStage
-from ccd_casadi.plants.rib_stage.solver import StageError
 from ccd_casadi.plants.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.support.process_pool import Pool
 
