@@ -41,7 +41,10 @@ def check_figures(plant: ScaledPlant, weights: Weights, per_decade: int) -> None
 
     grid = dense_grid(system, design.controller, per_decade=per_decade)
     assert figures.bandwidth == pytest.approx(first_crossing(gain, grid, LEVEL), rel=1e-8)
-    assert figures.sensitivity_low == pytest.approx(float(gain(OMEGA_LOW)[0]), rel=1e-8)
+    # read off the controller's Schur form, whose backward error is normwise (4.6e-8 was seen)
+    backward = np.finfo(float).eps * np.linalg.norm(design.controller.A) / OMEGA_LOW
+    low = float(gain(OMEGA_LOW)[0])
+    assert figures.sensitivity_low == pytest.approx(low, rel=1e-8 + 30.0 * backward)
     top, at = highest(gain, grid)
     assert figures.sensitivity_peak == pytest.approx(top, rel=1e-8)
     # its place: the root of the slope, taken from differences of the response
