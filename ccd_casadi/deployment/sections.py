@@ -121,9 +121,9 @@ def _polished(K: StateSpace, zero: complex) -> complex:
     """A zero of K(s) = C (s - A)⁻¹ B + D by Newton's method, steps that help and are short only."""
 
     def at(s: complex) -> tuple[complex, complex]:
-        inverse = np.linalg.inv(s * np.eye(len(K.A)) - K.A)
-        x = inverse @ K.B
-        return complex((K.C @ x + K.D)[0, 0]), complex(-(K.C @ inverse @ x)[0, 0])
+        matrix = s * np.eye(len(K.A)) - K.A
+        x = np.linalg.solve(matrix, K.B)  # an inverse would lose digits where A is badly scaled
+        return complex((K.C @ x + K.D)[0, 0]), complex(-(K.C @ np.linalg.solve(matrix, x))[0, 0])
 
     value, slope = at(zero)
     for _ in range(STEPS):
