@@ -29,8 +29,9 @@ import psutil
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.sampling.cluster import Cluster
-from ccd_casadi.sampling.sampler import CHUNK, design_unit, inner_unit
+from ccd_casadi.sampling.sampler import CHUNK
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.sampling.units import design_unit, inner_unit
 from ccd_casadi.support.process_pool import Pool, Workers
 
 ROOT = Path(__file__).parent.parent

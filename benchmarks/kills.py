@@ -47,15 +47,15 @@ import numpy as np
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.sampler import Truth
+from ccd_casadi.sampling.sampler import Sampler
 
 if __name__ == "__main__":
     problem = problem_of(load_case({str(CASE)!r}))
     with SampleStore(sys.argv[1] + "/samples.sqlite") as store, Workers(2) as workers:
-        truth = Truth(problem, store, workers)
+        sampler = Sampler(problem, store, workers)
         rng = np.random.default_rng(0)
-        truth.bandwidths(rng.uniform(55.0, 70.0, (30, 2)))
-        truth.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (40, 4)))
+        sampler.bandwidths(rng.uniform(55.0, 70.0, (30, 2)))
+        sampler.quantities(rng.uniform([55, 55, 5, 5.1], [70, 70, 9, 8.7], (40, 4)))
 """
 
 

@@ -69,7 +69,7 @@ GROUPS = (
         interpreted=False,
     ),
     Group(
-        ("ccd_casadi/sampling/store.py", "ccd_casadi/sampling/sampler.py"),
+        tuple(f"ccd_casadi/sampling/{n}.py" for n in ("store", "samples", "units", "sampler")),
         ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
         "not killed and not ctrl_c",
         interpreted=False,

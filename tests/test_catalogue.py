@@ -129,37 +129,75 @@ class Found:
     problem: CoDesignProblem | None = None
 
 
-@few(max_examples=60)
-@given(st.integers(0, 2**31))
-def test_the_best_listed_values_are_found_where_nodes_are_solved_globally(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+class OneSampler(SimpleNamespace):
+    """What the search asks of a Sampler."""
+
+    syntheses = 0
+
+    def of(self, other: CoDesignProblem) -> "OneSampler":
+        return OneSampler(problem=other)
+
+
+def two_lists(rng: np.random.Generator) -> CoDesignProblem:
     lists = {
         name: tuple(sorted(rng.choice(np.arange(55.0, 71.0), rng.integers(2, 6), False).tolist()))
         for name in ("m1", "m2")
     }
-    own = problem(
+    return problem(
         names=("m1", "m2", "m3"), units=("kg",) * 3, start=(60.0,) * 3,
         lower=(lists["m1"][0], lists["m2"][0], 50.0),
         upper=(lists["m1"][-1], lists["m2"][-1], 80.0),
         listed=tuple(lists.items()),
     )  # fmt: skip
-    solve = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
 
-    class OneSampler(SimpleNamespace):
-        syntheses = 0
 
-        def of(self, other: CoDesignProblem) -> "OneSampler":
-            return OneSampler(problem=other)
-
-    best = best_of_lists(OneSampler(problem=own), solve)  # type: ignore[arg-type]
-    every = [
-        solve(OneSampler(problem=restricted(own, {"m1": (a,), "m2": (b,)}))).result["objective"]
-        for a, b in itertools.product(*lists.values())
+def all_listed(own: CoDesignProblem, solve: Any) -> list[Found]:
+    """Every combination by itself."""
+    names = [name for name, _ in own.listed]
+    every = itertools.product(*(values for _, values in own.listed))
+    return [
+        solve(
+            OneSampler(problem=restricted(own, {n: (v,) for n, v in zip(names, row, strict=True)}))
+        )
+        for row in every
     ]
+
+
+@few(max_examples=60)
+@given(st.integers(0, 2**31))
+def test_the_best_listed_values_are_found_where_nodes_are_solved_globally(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    own = two_lists(rng)
+    solve = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
+    best = best_of_lists(OneSampler(problem=own), solve)  # type: ignore[arg-type]
+    every = [item.result["objective"] for item in all_listed(own, solve)]
     assert best.result["objective"] == pytest.approx(min(every), rel=1e-6, abs=1e-9)
     found = best.result["listed"]
-    assert all(value in lists[name] for name, value in found["chosen"].items())
-    assert found["solved"] <= 4 * len(every) + 1
+    assert all(value in dict(own.listed)[name] for name, value in found["chosen"].items())
+    whole = [tuple(map(tuple, node["lists"].values())) for node in found["nodes"]]
+    assert len(whole) == len(set(whole))  # nothing is solved twice
+
+
+@few(max_examples=30)
+@given(st.integers(0, 2**31))
+def test_a_design_that_is_not_verified_cuts_no_verified_one(seed: int) -> None:
+    """However low its J is: it is that of a design which breaks a bound."""
+    rng = np.random.default_rng(seed)
+    own = two_lists(rng)
+    convex = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
+    bad = rng.choice(dict(own.listed)["m1"])
+
+    def solve(sampler: Any) -> Found:
+        found = convex(sampler)
+        if sampler.problem.source.held.get("m1") == bad:
+            return Found(found.result | {"status": "not_verified", "objective": -1e9})
+        return found
+
+    best = best_of_lists(OneSampler(problem=own), solve)  # type: ignore[arg-type]
+    verified = [i.result for i in all_listed(own, solve) if i.result["status"] == "verified"]
+    assert best.result["status"] == "verified"
+    least = min(item["objective"] for item in verified)
+    assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.insight import main as insight_main
 from ccd_casadi.robustness import main as robustness_main
-from ccd_casadi.sampling.sampler import BandwidthSample
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import synthesise

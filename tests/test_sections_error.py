@@ -21,7 +21,7 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
 from ccd_casadi.inner_problem.sections_problem import Uncertainty
-from ccd_casadi.sampling.sampler import BandwidthSample
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 

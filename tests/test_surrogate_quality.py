@@ -14,7 +14,7 @@ from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
-from ccd_casadi.sampling.sampler import quantity_sample
+from ccd_casadi.sampling.samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, Roughness, design, errors, fit
 

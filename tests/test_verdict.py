@@ -33,7 +33,7 @@ from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting import verdict as shown
-from ccd_casadi.sampling.sampler import BandwidthSample
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from ccd_casadi.synthesis.statics import Statics

@@ -92,7 +92,7 @@ def best_of_lists(sampler: Sampler, solve: Callable[[Sampler], Solution]) -> Sol
         elif node.objective < _least(best):
             theta = found.result["theta"]
             open_ += [(child, node.objective) for child in _children(problem, lists, theta)]
-        elif best is None:  # nothing was found with all of them free: listed values may do
+        elif np.isinf(_least(best)):  # none was found between the values: on them may be one
             open_ += [(child, -np.inf) for child in _halves(lists)]
         else:
             cut += 1
@@ -110,9 +110,11 @@ def best_of_lists(sampler: Sampler, solve: Callable[[Sampler], Solution]) -> Sol
 
 
 def _least(best: Solution | None) -> float:
-    """The J from which on a node is cut."""
-    J = np.inf if best is None else float(best.result.get("objective", np.inf))
-    return J - NO_BETTER * abs(J) if np.isfinite(J) else np.inf
+    """The J from which on a node is cut: a design that is not verified cuts nothing."""
+    if best is None or best.result["status"] != "verified":
+        return np.inf
+    J = float(best.result["objective"])
+    return J - NO_BETTER * abs(J)
 
 
 def _children(problem: CoDesignProblem, lists: Lists, theta: Mapping[str, float]) -> list[Lists]:
@@ -133,7 +135,9 @@ def _children(problem: CoDesignProblem, lists: Lists, theta: Mapping[str, float]
     high = tuple(v for v in lists[name] if v > middle)
     parts: list[Lists] = [{name: part} for part in ((low, high) if value in high else (high, low))]
     if on_values:
-        parts += [{name: (value,)}, {item: (nearest[item],) for item in several}]
+        if len(several) > 1:
+            parts.append({name: (value,)})
+        parts.append({item: (nearest[item],) for item in several})
     return [lists | part for part in parts if all(part.values())]
 
 

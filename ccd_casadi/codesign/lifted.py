@@ -21,7 +21,8 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
-from ccd_casadi.sampling.sampler import QuantitySample, Sampler
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
 

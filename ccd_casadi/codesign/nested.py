@@ -20,7 +20,8 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design, fit, to_casadi
 

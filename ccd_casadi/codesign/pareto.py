@@ -24,7 +24,8 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, design, to_casadi

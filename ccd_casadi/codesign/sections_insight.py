@@ -21,7 +21,8 @@ from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, design, to_casadi

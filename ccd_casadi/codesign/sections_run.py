@@ -42,7 +42,8 @@ from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_p
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import BandwidthSample, Sampler
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool

@@ -7,7 +7,7 @@ import numpy as np
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.sampler import QuantitySample
+from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

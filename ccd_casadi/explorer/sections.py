@@ -23,8 +23,8 @@ from ccd_casadi.inner_problem.sections_bandwidth import (
     with_range,
 )
 from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.sampling.sampler import sections_unit
 from ccd_casadi.sampling.store import Sample, problem_hash, sample_key
+from ccd_casadi.sampling.units import sections_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome
 

@@ -116,7 +116,7 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
          f"at most {number(answer['sensitivity_peak_between_lines'])}"),
         ("|S| at ω_low", number(answer["sensitivity_low"]),
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
-        ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} um/N", "the largest |GS|"),
+        ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),
         ("Largest |KS|", f"{number(answer['KS_max'], 4)} N/m", ""),
     ]  # fmt: skip
     names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",

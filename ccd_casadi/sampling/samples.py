@@ -1,0 +1,141 @@
+"""Samples as the surrogates take them, and as rows of the store."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.sampling.store import Sample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures
+
+
+@dataclass(frozen=True)
+class BandwidthSample:
+    """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
+
+    An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
+    `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
+    """
+
+    theta: tuple[float, ...]
+    bandwidth: float
+    gradient: tuple[float, ...]
+    omega_S: float
+    omega_T: float
+    active: tuple[str, ...]
+    shortfall: str
+    violation: float
+    syntheses: int
+    kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
+    error: float | None = None
+
+    @property
+    def value(self) -> float:
+        """What J counts: the error where the inner problem is of that, else ω_b*."""
+        return self.bandwidth if self.error is None else self.error
+
+    @property
+    def feasible(self) -> bool:
+        """Whether a certified design meets the constraints at θ."""
+        return bool(np.isfinite(self.bandwidth))
+
+
+@dataclass(frozen=True)
+class QuantitySample:
+    """Values and their derivatives (…, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
+
+    As `Sensitivities` has them: ω_b, ln of the bounded figures, γ_opt last.
+    `peak_frequency` is where S is largest, rad/s; NaN where it is not known.
+    """
+
+    x: tuple[float, ...]
+    values: Array
+    gradients: Array
+    certified: bool
+    peak_frequency: float = float("nan")
+
+
+def sample_of(
+    key: str,
+    theta: tuple[float, ...],
+    figures: DesignFigures,
+    seconds: float,
+    design: Sensitivities | None = None,
+) -> Sample:
+    """One synthesis as a row of the store, with derivatives where `design` has them."""
+    gradients = None
+    if design is not None:
+        whole = np.hstack([design.to_theta, design.to_break_frequencies])
+        gradients = tuple(float(v) for v in whole.ravel())
+    certificate = figures.certificate
+    return Sample(
+        key=key,
+        theta=theta,
+        omega_S=figures.omega_S,
+        omega_T=figures.omega_T,
+        outcome=figures.outcome.name.lower(),
+        reason=figures.outcome.value,
+        gamma_opt=figures.gamma_opt,
+        gamma_lower_bound=figures.gamma_lower_bound,
+        gamma=figures.gamma,
+        bandwidth=figures.bandwidth,
+        sensitivity_peak=figures.sensitivity_peak,
+        sensitivity_peak_frequency=figures.sensitivity_peak_frequency,
+        sensitivity_low=figures.sensitivity_low,
+        max_real_pole=certificate.max_real_pole,
+        norm=certificate.norm,
+        norm_bound=certificate.norm_bound,
+        certified=figures.certified,
+        seconds=seconds,
+        gradients=gradients,
+        compliance=figures.compliance,
+    )
+
+
+def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample:
+    """What was stored of a unit of work. Raises KeyError, TypeError or ValueError if damaged."""
+    feasible = payload["bandwidth"] is not None
+    nan = float("nan")
+    gradient = payload["gradient"] or [None] * len(theta)
+    active, shortfall = payload["active"], payload["shortfall"]
+    kappa, error = payload.get("kappa"), payload.get("error")
+    sized = ("bandwidth",) if kappa is not None else ("bandwidth", "omega_S", "omega_T")
+    positive = [payload[key] for key in sized] if feasible else []
+    violation, syntheses = payload["violation"], payload["syntheses"]
+    if (
+        len(gradient) != len(theta)
+        or not all(v is None or type(v) is float for v in gradient)
+        or not all(type(v) is float and 0.0 < v < np.inf for v in positive)
+        or not (violation is None or type(violation) is float)
+        or not all(isinstance(word, str) for word in [shortfall, *active])
+        or type(syntheses) is not int
+        or not all(type(v) is float for v in kappa or ())
+        or not (error is None or (type(error) is float and error > 0.0))
+    ):
+        raise ValueError("a stored result holds what none is made of")
+    return BandwidthSample(
+        theta=theta,
+        bandwidth=payload["bandwidth"] if feasible else nan,
+        gradient=tuple(nan if v is None else v for v in gradient),
+        omega_S=payload["omega_S"] if feasible and kappa is None else nan,
+        omega_T=payload["omega_T"] if feasible and kappa is None else nan,
+        active=tuple(active),
+        shortfall=shortfall,
+        violation=np.inf if violation is None else violation,
+        syntheses=syntheses,
+        kappa=tuple(kappa or ()),
+        error=error,
+    )
+
+
+def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerProblem) -> QuantitySample:
+    """A row with derivatives as values at x, of the figures that `inner` bounds."""
+    assert sample.gradients is not None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bounded = np.log([getattr(sample, name) for name, _ in inner.bounds.values()])
+        values = np.array([sample.bandwidth, *bounded, sample.gamma_opt])
+    gradients = np.array(sample.gradients).reshape(len(values), len(x))
+    where = sample.sensitivity_peak_frequency
+    return QuantitySample(x, values, gradients, sample.certified, where)

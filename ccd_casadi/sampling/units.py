@@ -1,0 +1,127 @@
+"""Units of work: what a worker computes at once, as rows of the store and a result.
+
+One θ's inner problem, or a chunk of single designs at (θ, ω_S, ω_T).
+"""
+
+from collections.abc import Sequence
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.inner_problem.envelope import bandwidth_gradient
+from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
+from ccd_casadi.sampling.samples import sample_of
+from ccd_casadi.sampling.store import Sample, sample_key
+from ccd_casadi.support.arrays import Array
+
+
+def inner_unit(
+    task: tuple[CoDesignProblem, str, str, tuple[float, ...]],
+) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
+    """Solve the inner problem at one θ; every synthesis becomes a row."""
+    problem, problem_key, key, theta = task
+    if problem.sections is not None:
+        return sections_unit(problem, key, theta)
+    began = perf_counter()
+    result = true_inner(problem, theta)
+    each = (perf_counter() - began) / max(result.syntheses, 1)
+    rows, payload = unit_of(problem_key, theta, result, problem.inner, each)
+    return rows, (key, theta, payload)
+
+
+def unit_of(
+    problem_key: str,
+    theta: tuple[float, ...],
+    result: InnerResult,
+    inner: InnerProblem,
+    each: float,
+) -> tuple[list[Sample], dict]:
+    """Rows and payload of one θ's inner problem; `each` synthesis took so many seconds."""
+    rows = {}
+    for figures in result.rows:
+        row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
+        rows[row_key] = sample_of(row_key, theta, figures, each)
+    optimum = result.optimum
+    payload = {
+        "bandwidth": None if optimum is None else optimum.figures.bandwidth,
+        "gradient": None
+        if optimum is None
+        else [_number(v) for v in bandwidth_gradient(optimum, result.active, tuple(inner.bounds))],
+        "omega_S": None if optimum is None else optimum.figures.omega_S,
+        "omega_T": None if optimum is None else optimum.figures.omega_T,
+        "active": list(result.active),
+        "shortfall": result.shortfall,
+        "violation": _number(result.violation),
+        "syntheses": len(rows),
+    }
+    return list(rows.values()), payload
+
+
+def sections_unit(
+    problem: CoDesignProblem, key: str, theta: tuple[float, ...]
+) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
+    """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
+    value = sections_value(problem, theta)
+    design, judged = value.design, value.design.certificate
+    worst = None if judged is None or not judged.worst else max(judged.worst.values())
+    peaks = [] if judged is None else [plant for plant in judged.plants if plant.stable]
+    highest = max(peaks, key=lambda plant: plant.S_peak, default=None)
+    row = Sample(
+        key=key,
+        theta=theta,
+        omega_S=0.0,
+        omega_T=0.0,
+        outcome=design.outcome.name.lower(),
+        reason=design.words,
+        gamma_opt=np.nan,
+        gamma_lower_bound=np.nan,
+        gamma=np.nan,
+        bandwidth=value.bandwidth,
+        sensitivity_peak=np.nan if highest is None else highest.S_peak,
+        sensitivity_peak_frequency=np.nan if highest is None else highest.S_peak_frequency,
+        sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
+        max_real_pole=np.nan,
+        norm=np.nan if worst is None else worst,
+        norm_bound=1.0,
+        certified=value.feasible,
+        seconds=design.seconds,
+    )
+    payload = {
+        "bandwidth": _number(value.bandwidth),
+        "gradient": [_number(v) for v in value.gradient] if value.feasible else None,
+        "kappa": [float(v) for v in design.kappa] if value.feasible else [],
+        "error": _number(value.error),
+        "active": sorted(name for name, mu in design.multipliers.items() if mu > 0.0),
+        "shortfall": "" if value.feasible else design.words,
+        "violation": _number(np.log(max(design.short.values()))) if design.short else None,
+        "syntheses": value.syntheses,
+    }
+    return [row], (key, theta, payload)
+
+
+def design_unit(
+    task: tuple[CoDesignProblem, list[tuple[str, tuple[float, ...]]]],
+) -> tuple[list[Sample], None]:
+    """Synthesise and differentiate a chunk of points (key, x)."""
+    problem, points = task
+    samples = []
+    for key, x in points:
+        began = perf_counter()
+        design = true_design(problem, x[:-2], *frequencies(problem, x))
+        samples.append(sample_of(key, x[:-2], design.figures, perf_counter() - began, design))
+    return samples, None
+
+
+def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
+    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
+    inner = problem.inner
+    return (
+        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
+        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
+    )
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
