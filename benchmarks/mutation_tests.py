@@ -71,7 +71,7 @@ GROUPS = (
     Group(
         tuple(f"ccd_casadi/sampling/{n}.py" for n in ("store", "samples", "units", "sampler")),
         ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
-        "not killed and not ctrl_c",
+        "",
         interpreted=False,
     ),
 )  # fmt: skip

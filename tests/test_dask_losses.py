@@ -17,7 +17,8 @@ import pytest
 from busy import HANGS
 from dask_processes import Processes, both_workers
 from helpers import problem
-from test_sampling import command, rows, started, table, wait_for_rows
+from test_interruptions import command, rows, started, wait_for_rows
+from test_sampling import table
 
 from ccd_casadi import solve
 from ccd_casadi.sampling.cluster import Cluster

@@ -1,28 +1,21 @@
 """What comes from a colleague executes nothing but the plant function it names, and on request not
-even that; nothing is stored or read as code; no name in a file leads out of the run folder."""
+even that; no name in a file leads out of the run folder."""
 
-import ast
 import importlib
 import importlib.util
 import json
 import os
 import pickle
 import py_compile
-import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
+from test_sources import SOURCES
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.inner import main as inner
 from ccd_casadi.inner_problem.problem import _own_plant, plant_of
-from ccd_casadi.reporting.cursor import SCRIPT
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import permit_user_code, time_limit
@@ -30,28 +23,6 @@ from surrogates import SurrogateFileError, load
 from surrogates.truth import TruthError, opener_of
 
 ROOT = Path(__file__).parent.parent
-SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
-# Pipes between the processes of one run.
-LIVE = {
-    "ccd_casadi/support/process_pool.py",
-    "ccd_casadi/sampling/cluster.py",
-    "ccd_casadi/support/deadline.py",
-}
-# They import by names that sources spell out: optional packages, what a command needs, names.
-# Processes of this Python with a module of the package; the person's C compiler on our own C code.
-PROCESSES = {
-    ("ccd_casadi/deployment/fmu.py", "subprocess.run"),
-    ("ccd_casadi/kernels/compilation.py", "subprocess.Popen"),
-    ("ccd_casadi/explorer/background.py", "subprocess.Popen"),
-}
-BY_NAME = {
-    "ccd_casadi/support/optional_packages.py",
-    "ccd_casadi/support/command_line.py",
-    "ccd_casadi/kernels/compilation.py",
-    "ccd_casadi/kernels/compiled.py",
-    "ccd_casadi/__init__.py",
-    "ccd_casadi/__main__.py",
-}
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()
@@ -242,56 +213,6 @@ def test_a_plant_too_large_for_memory_is_refused(trap: Path, matrices: str, word
         problem_of(load_case(trap))
 
 
-# ---- no code in data -----------------------------------------------------------------------------
-
-
-def calls(path: Path) -> Iterator[tuple[str, ast.Call]]:
-    """Every call in a source file by its dotted name."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Call):
-            yield ast.unparse(node.func), node
-
-
-FORBIDDEN = {
-    "eval", "exec", "compile", "__import__", "importlib.import_module", "import_module",
-    "os.system", "os.popen", "marshal.loads", "marshal.load", "shelve.open", "yaml.load",
-    "joblib.load", "dill.loads", "cloudpickle.loads", "cloudpickle.load", "np.fromfile",
-    "pickle.load", "ca.Function.load", "ca.Function.deserialize", "ca.external", "ca.Importer",
-    "ctypes.CDLL", "runpy.run_path", "subprocess.run", "subprocess.Popen",
-}  # fmt: skip
-
-
-def test_no_source_reads_code_from_data() -> None:
-    seen = []
-    for path in SOURCES:
-        name = path.relative_to(ROOT).as_posix()
-        for called, node in calls(path):
-            seen.append(called)
-            if (
-                not (name in BY_NAME and called == "import_module")
-                and (name, called) not in PROCESSES
-            ):
-                assert called not in FORBIDDEN, f"{name}:{node.lineno}: {called}"
-            if (
-                called == "require" and name != "ccd_casadi/synthesis/backends/registry.py"
-            ):  # its constants
-                assert isinstance(node.args[0], ast.Constant), f"{name}:{node.lineno}"
-            for keyword in node.keywords:
-                if keyword.arg in ("allow_pickle", "shell"):
-                    assert ast.unparse(keyword.value) == "False", f"{name}:{node.lineno}"
-            if called.startswith("pickle."):
-                assert name in LIVE, f"{name}:{node.lineno}: {called}"
-    assert "json.loads" in seen, "the scan sees calls"
-
-
-def test_plant_files_are_loaded_where_permission_is_asked() -> None:
-    loading = {p.relative_to(ROOT).as_posix() for p in SOURCES if "exec_module" in p.read_text()}
-    assert loading == {"ccd_casadi/inner_problem/problem.py"}
-    text = (ROOT / "ccd_casadi" / "inner_problem" / "problem.py").read_text()
-    assert text.count("exec_module") == 1
-    assert "require_user_code(" in text
-
-
 # ---- names that lead out of the folder -----------------------------------------------------------
 
 
@@ -317,105 +238,3 @@ def test_a_surrogate_file_of_another_kind_is_not_built(tmp_path: Path) -> None:
         path.write_text(json.dumps({"schema": "surrogates/2", "surrogates": [record], "extra": {}}))
         with pytest.raises(SurrogateFileError):
             load(path)
-
-
-# ---- pages --------------------------------------------------------------------------------------
-
-HOSTILE = "kg</td></pre><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\\\frac$ {0} %s"
-PLANT = """
-import casadi as ca
-
-def f(theta, note, table):
-    m = theta["m"]
-    return {
-        "mass": ca.diag(ca.vertcat(m, 20.0)), "stiffness": 2e7 * ca.DM([[1, -1], [-1, 1]]),
-        "damping_ratio": 0.02, "input": ca.DM([1, 0]), "output": ca.DM([[1, 0]]),
-        "hardware_cost": m, "constraints": {note: m - 19.0},
-    }
-"""
-
-
-class Page(HTMLParser):
-    """Elements and attributes of a page, for what would run or fetch something."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.active: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for key, value in attrs:
-            page_or_place = re.fullmatch(r"#.*|(\.\./)?[\w%-]+(/[\w%-]+)?\.html", str(value))
-            if key.startswith("on") or (key in ("src", "href") and page_or_place is None):
-                self.active.append(f"{tag} {key}={value}")
-        if tag in ("script", "img", "iframe", "object", "link", "embed", "form", "base"):
-            self.active.append(tag)
-
-
-@pytest.fixture(scope="module")
-def hostile_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with markup in every text that a case may hold, and in the name of its folder."""
-    place = tmp_path_factory.mktemp("hostile") / "<img src=x onerror=alert(3)> & b"
-    place.mkdir()
-    (place / "plant.py").write_text(PLANT)
-    text = (ROOT / "runs" / "two_mass.toml").read_text()
-    quoted = json.dumps(HOSTILE)
-    head = f'[plant]\nfunction = "plant.py:f"\nnote = {quoted}\ntable = [{quoted}]\n'
-    theta = f"[theta.m]\nlower = 10.0\nupper = 20.0\nunit = {quoted}\n"
-    quick = "\n[sampling]\nlifted_points = 12\n[outer]\nstarts = 2\nmax_refinements = 1\n"
-    case = place / "<b>case.toml"
-    rest = text[text.index("[objective]") :].replace("S_max = 1.75", "S_max = 1.9")
-    case.write_text(f"# {HOSTILE}\n{head}{theta}{rest}{quick}")
-    words = ["--out", str(place / "run"), "--quiet", "--workers", "1", "--formulation", "lifted"]
-    assert solve([str(case), *words]) in (0, 4)
-    return place / "run"
-
-
-def pages_are_inert(folder: Path, least: int) -> None:
-    pages = sorted(folder.rglob("*.html"))
-    assert len(pages) >= least
-    for page in pages:
-        text = page.read_text()
-        assert Page(text.replace(f"<script>{SCRIPT}</script>", "")).active == [], page.name
-        assert "<script>alert" not in text
-    assert any("&lt;script&gt;alert(1)" in page.read_text() for page in pages), "shown as text"
-
-
-def test_reports_show_markup_as_text(hostile_run: Path) -> None:
-    pages_are_inert(hostile_run, 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["insight", "deploy.__main__", "robustness.__main__", "compare"])
-def test_every_other_report_shows_markup_as_text(
-    hostile_run: Path, tmp_path: Path, name: str
-) -> None:
-    module = importlib.import_module(f"ccd_casadi.{name}")
-    more = {"insight": ["--points", "2"]}.get(name, [])
-    given = hostile_run / "case.toml" if name == "compare" else hostile_run
-    words = [str(given), "--out", str(tmp_path / "<i>out"), "--quiet", "--workers", "1", *more]
-    assert module.main(words) in (0, 4)
-    pages_are_inert(tmp_path, 1)
-
-
-# ---- dependencies --------------------------------------------------------------------------------
-
-
-def test_every_dependency_is_pinned_to_one_version() -> None:
-    for name in ("requirements.lock", "requirements-test.lock"):
-        lines = (ROOT / name).read_text().splitlines()
-        for line in lines:
-            if line and not line.startswith(("#", "-r ")):
-                package, _, version = line.partition("==")
-                assert version, f"{name}: {line}"
-                assert package.strip() == package
-                assert np.all([c.isalnum() or c in "-_.+" for c in package + version]), line
-
-
-def test_what_is_installed_fits_together() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pip", "--disable-pip-version-check", "check"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
