@@ -16,6 +16,7 @@ from ccd_casadi.fixed_structure import (
     certify,
     synthesise_sections,
 )
+from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
@@ -27,7 +28,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, scale_state_space
 from ccd_casadi.synthesis.closed_loop import measure, responses
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.
@@ -312,3 +313,25 @@ def test_shifted_plants_are_those_of_the_robust_set() -> None:
     modal = modal_plant(system, SUSPENSION, Perturbation(-0.02))
     np.testing.assert_allclose(uncertain(resonance_shift=0.02).plant(np.array([-0.02])).A,
                                scale_plant(modal, WEIGHTS.M_K).A)  # fmt: skip
+
+
+@pytest.mark.parametrize("sampling", [None, Sampling(2000.0, 100.0)])
+def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
+    sampling: Sampling | None,
+) -> None:
+    """Its poles stay on the axis, and rounding, which coordinates change, takes no side of it."""
+    rng = np.random.default_rng(5)
+    modes = [(2.0, 0.7, 1.0), (60.0, 0.0, 0.0)]  # Hz, damping, driven
+    A, B = np.zeros((4, 4)), np.zeros((4, 1))
+    for i, (hz, zeta, driven) in enumerate(modes):
+        w, k = HZ * hz, 2 * i
+        A[k : k + 2, k : k + 2], B[k + 1] = [[0.0, 1.0], [-w * w, -2.0 * zeta * w]], driven
+    C = np.array([[1.0, 0.0, 1.0, 0.0]])
+    K = StateSpace(np.array([[-300.0]]), np.array([[1.0]]), np.array([[2e4]]), np.zeros((1, 1)))
+    bounds = Bounds(S_max=3.0, S_low=0.9, omega_low=HZ, shape=None)
+    alone = scale_state_space(StateSpace(A[:2, :2], B[:2], C[:, :2], np.zeros((1, 1))), 1.0)
+    assert judged(alone, K, bounds, sampling, False).stable
+    for _ in range(20):
+        T = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+        turned = StateSpace(T @ A @ T.T, T @ B, C @ T.T, np.zeros((1, 1)))
+        assert not judged(scale_state_space(turned, 1.0), K, bounds, sampling, False).stable
