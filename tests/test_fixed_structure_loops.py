@@ -16,6 +16,7 @@ from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess, constraints, evaluate, to_theta
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
+from ccd_casadi.fixed_structure.peak_search import closed_on_zero
 from ccd_casadi.fixed_structure.starts import at_random
 from ccd_casadi.fixed_structure.structure import (
     response,
@@ -253,3 +254,23 @@ def test_grid_points_that_rounding_parts_count_as_one() -> None:
     grid = frequency_grid([pair], None, 1.0, 100.0, 0.0)
     assert (np.diff(grid) > 1e-10 * grid[1:]).all()
     assert np.abs(grid - 100.0).min() < 1e-9
+
+
+@pytest.mark.parametrize("power", [3, 9, 21])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_peak_is_closed_in_on_however_flat_one_side_of_it_is(power: int, mirrored: bool) -> None:
+    """A slope of 1e-4 at one end and of 1 at the other: false position alone stays at its end.
+
+    The search took such a point for the peak of T, and the judge refused its best controller.
+    """
+    least = 1e-4
+
+    def slope(x: np.ndarray, of: np.ndarray) -> np.ndarray:
+        return mirror * (least - (mirror * x) ** power)
+
+    mirror = -1.0 if mirrored else 1.0
+    ends = np.exp(mirror * np.array([0.0, 1.0]))
+    top, closed = closed_on_zero(slope, ends[:1], np.exp([min(0.0, mirror)]),
+                                 np.exp([max(0.0, mirror)]))  # fmt: skip
+    assert closed.all()
+    assert mirror * np.log(top) == pytest.approx(least ** (1.0 / power), abs=1e-6)

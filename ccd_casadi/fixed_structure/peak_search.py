@@ -17,7 +17,9 @@ from ccd_casadi.support.arrays import Array
 
 AROUND_THE_KINK = np.array([0.97, 0.99, 0.997, 1.0, 1.003, 1.01, 1.03])
 APART = 1e-8  # relative: grid points that are closer count as one
-CLOSINGS = 9  # of a peak's bracket by false position; the error is squared, so is its effect
+CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
+FLAT = 1e-9  # slope at a maximum
+NARROW = 1e-6  # of its first width: a bracket that is left alone, as at a kink
 
 
 def frequency_grid(
@@ -57,6 +59,8 @@ def closed_on_zero(
 ) -> tuple[Array, np.ndarray]:
     """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
 
+    A bracket that two steps do not halve is cut in the middle: where the slope is tiny at one end
+    and large at the other, as with two maxima about to part, false position alone creeps.
     `slope` takes logarithms and the indices of the brackets that they are in. Where a bracket's
     slopes do not change sign (an end) the start stays; second: where they do.
     """
@@ -70,14 +74,19 @@ def closed_on_zero(
     a, fa, b, fb = middle.copy(), f.copy(), other, g
     inside = (fa * fb < 0.0) & np.isfinite(fa) & np.isfinite(fb)
     left = np.flatnonzero(inside)
+    before, wider = np.full((2, len(start)), np.inf)  # widths one and two steps ago
+    narrow = NARROW * np.abs(b - a)
     for _ in range(CLOSINGS):
         if not len(left):
             break
         A, FA, B, FB = a[left], fa[left], b[left], fb[left]
-        x = B - FB * (B - A) / (FB - FA)
+        width = np.abs(B - A)
+        creeping = width > 0.5 * wider[left]
+        wider[left], before[left] = before[left], width
+        x = np.where(creeping, 0.5 * (A + B), B - FB * (B - A) / (FB - FA))
         fx = slope(x, left)
         opposite = fx * FB < 0.0
         a[left], fa[left] = np.where(opposite, B, A), np.where(opposite, FB, 0.5 * FA)
         b[left], fb[left] = x, fx
-        left = left[np.abs(fx) >= 1e-9]
+        left = left[(np.abs(fx) >= FLAT) & (np.abs(b - a) > narrow)[left]]
     return np.exp(np.where(inside, b, middle)), inside
