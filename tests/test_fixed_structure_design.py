@@ -21,7 +21,8 @@ from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept
+from ccd_casadi.fixed_structure.race import distinct, run_race
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -335,3 +336,34 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
         T = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         turned = StateSpace(T @ A @ T.T, T @ B, C @ T.T, np.zeros((1, 1)))
         assert not judged(scale_state_space(turned, 1.0), K, bounds, sampling, False).stable
+
+
+def test_a_redrawn_controller_differs_from_its_end_in_one_section() -> None:
+    structure = Structure(lead=1, biquads=2, roll_off=2)
+    problem = problem_for([plant()], structure, EASY)
+    rng = np.random.default_rng(3)
+    ends = list(at_random(problem, np.array([0.1, 0.3]), rng))
+    names = [" ".join(name.split()[:2]) for name in structure.names]
+    sections = ({"biquad 1"}, {"biquad 2"}, {"lead 1", "roll-off 1"})
+    fresh = redrawn(problem, ends, 60, rng)
+    moved = [
+        {name for name, was, now in zip(names, ends[i % 2], kappa, strict=True) if was != now}
+        for i, kappa in enumerate(fresh)
+    ]
+    assert all(any(change <= section for section in sections) for change in moved)
+    assert {frozenset(change) for change in moved} == set(map(frozenset, sections))
+    assert not len(redrawn(problem_for([plant()], Structure(lead=0, biquads=0, roll_off=0), EASY),
+                           [np.zeros(2)], 5, rng))  # fmt: skip
+
+
+def test_what_is_redrawn_never_loses_what_was_found() -> None:
+    """A race with the ends of another in its field ends with the best of both."""
+    problem = problem_for([plant()], Structure(biquads=0), EASY)
+    rng = np.random.default_rng(1)
+    pool = kept(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]
+    first = run_race(problem, pool, lambda words: None)
+    fresh = kept(problem, redrawn(problem, distinct(first, 2), 24, rng))[:3]
+    again = run_race(problem, fresh, lambda words: None, before=first)
+    assert again[0].merit >= first[0].merit
+    assert not any(runner.running for runner in again)
+    assert len(distinct(again, 5)) == len({tuple(kappa) for kappa in distinct(again, 5)})

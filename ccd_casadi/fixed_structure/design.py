@@ -21,8 +21,15 @@ from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
-from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race
-from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept
+from ccd_casadi.fixed_structure.race import (
+    LocalOptimum,
+    Runner,
+    distinct,
+    finished,
+    local_optima,
+    run_race,
+)
+from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept, redrawn
 from ccd_casadi.fixed_structure.structure import Kind, Structure
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
@@ -32,6 +39,8 @@ from ccd_casadi.support.process_pool import Pool
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
+REDRAWS = 2  # races from the best ends, one section of each drawn anew
+REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is raced
 LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
@@ -170,6 +179,9 @@ def synthesise_sections(
     if not len(pool):
         return failed(SectionsOutcome.NO_STABLE_START)
     runners = run_race(problem, pool, tell, workers)
+    for _ in range(0 if only_initial else REDRAWS):
+        fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)
+        runners = run_race(problem, fresh, tell, workers, runners)
     evaluations = sum(runner.evaluations for runner in runners)
     ends = finished(runners)
     best: SectionsDesign | None = None
@@ -267,6 +279,14 @@ def _pool(problem: Problem, starts: int, rng: np.random.Generator) -> Array:
             return np.concatenate([near, far[chosen]])
         low, high = 0.03 * low, low
     return np.zeros((0, len(problem.structure.names)))
+
+
+def _redrawn(
+    problem: Problem, runners: Sequence[Runner], count: int, rng: np.random.Generator
+) -> Array:
+    """Those of the best ends with one section drawn anew that are stable and miss least."""
+    fresh = redrawn(problem, distinct(runners, REDRAWN), POOL // 2 * count, rng)
+    return _nearest(problem, kept(problem, fresh), count)
 
 
 def _nearest(problem: Problem, kappa: Array, count: int) -> Array:

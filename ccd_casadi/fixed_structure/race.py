@@ -63,9 +63,14 @@ def run_race(
     pool: Array,
     tell: Callable[[str], None],
     workers: Pool | None = None,
+    before: Sequence[Runner] = (),
 ) -> list[Runner]:
-    """All searches from the starts `pool` (N, n), the best first."""
-    field = [Runner(started(problem, kappa)) for kappa in pool]
+    """All searches from the starts `pool` (N, n), the best first.
+
+    Those of races `before` are in the field too: they climb no more, but have to be overtaken.
+    """
+    field = [replace(runner, running=False) for runner in before]
+    field += [Runner(started(problem, kappa)) for kappa in pool]
     scale = problem.plants.omega_0 / (2.0 * np.pi)
     for turn, steps in enumerate(ROUNDS):
         running = [runner for runner in field if runner.running]
@@ -91,6 +96,16 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
 def finished(runners: Sequence[Runner]) -> list[Runner]:
     """Those whose steps no longer help, and the best; the best first."""
     return [runner for i, runner in enumerate(runners) if runner.done or i < LAST]
+
+
+def distinct(runners: Sequence[Runner], count: int) -> list[Array]:
+    """κ of the best `count` ends of unequal bandwidth, those outside the bounds last."""
+    ordered = sorted(finished(runners), key=lambda runner: -runner.merit)
+    found: list[Runner] = []
+    for runner in ordered:
+        if all(abs(runner.point.tau - other.point.tau) > SAME for other in found):
+            found.append(runner)
+    return [runner.point.kappa for runner in found[:count]]
 
 
 def local_optima(problem: LoopProblem, ends: Sequence[Runner]) -> tuple[LocalOptimum, ...]:

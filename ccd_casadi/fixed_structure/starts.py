@@ -6,6 +6,8 @@ notches at the plants' resonances (`by_rules`) or anywhere (`at_random`). Only t
 closed loop of the set is stable with are kept, as eigenvalues say, for hundreds at once.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -71,6 +73,27 @@ def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> 
             values[f"biquad {i + 1} poles damping"] = np.exp(rng.uniform(np.log(0.05), 0.0))
         found.append(_kappa(problem, values))
     return with_crossover(problem, np.array(found), crossovers)
+
+
+def redrawn(problem: Problem, ends: Sequence[Array], count: int, rng: np.random.Generator) -> Array:
+    """(N, n) controllers like those at which searches ended, with one section drawn anew.
+
+    A section is a biquad, or leads and roll-off together.
+    """
+    names = problem.structure.names
+    sections = [
+        [name.startswith(f"biquad {i}") for name in names]
+        for i in range(1, problem.structure.biquads + 1)
+    ]
+    sections.append([name.startswith(("lead", "roll-off")) for name in names])
+    sections = [section for section in sections if any(section)]
+    if not sections:
+        return np.zeros((0, len(names)))
+    crossovers = np.exp(rng.uniform(np.log(0.05), 0.0, count))
+    drawn = at_random(problem, crossovers, rng)
+    chosen = np.array(sections)[rng.integers(len(sections), size=count)]
+    like = np.array(ends)[np.arange(count) % len(ends)]
+    return np.where(chosen, drawn, like)
 
 
 def kept(problem: Problem, kappa: Array, chunk: int = 256) -> Array:
