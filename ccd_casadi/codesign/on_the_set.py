@@ -18,6 +18,7 @@ from ccd_casadi.support.units import HZ
 
 ON_THE_SET = Path(__file__).with_name("rib_stage_on_the_set.json")
 OPEN = 1e-3  # relative: past a bound by more, worst plants are left that the design does not know
+APART = " (apart)"
 ALL, NONE = 0.85, 0.15  # shares of a published gain from which it counts as kept, and as lost
 LABELS = {
     "sequential": "the sequential stage",
@@ -149,12 +150,13 @@ def sentences(stages: Sequence[Stage]) -> list[str]:
     if corners:
         names = ", ".join(stage.label for stage in corners)
         found.append(
-            f"Marked (corners), {names}: certified at the ends of the modes' range; a search of "
+            f"Marked (corners), {names}: certified on the plants of the design; a last search of "
             f"the box finds plants that pass a bound by up to "
             f"{100.0 * max(stage.excess for stage in corners):.1f} %, so that the bandwidth is "
-            "a little less on all of the set. Marked (apart): each channel "
-            "on its own."
+            "a little less on all of the set."
         )
+    if any(_mark(stage) == APART for stage in stages):
+        found.append(f"Marked{APART}: each channel on its own.")
     return [*found, _left(stages, first)]
 
 
@@ -185,7 +187,7 @@ def _left(stages: Sequence[Stage], first: Stage) -> str:
 def _mark(stage: Stage) -> str:
     """What a bandwidth on the set leaves open."""
     if stage.apart:
-        return " (apart)"
+        return APART
     return " (corners)" if stage.excess > OPEN else ""
 
 

@@ -44,7 +44,7 @@ def _left(problem: CoDesignProblem) -> str:
     note = (
         "Nominal: mixed sensitivity on the model alone, at stages that were kept, not those of "
         "this run. On the set: sections on every plant of runs/rib_stage_built.toml, see "
-        "docs/rib_stage.md; (apart): each channel on its own."
+        "docs/rib_stage.md."
     )
     words = "\n".join(paragraph(text) for text in (*sentences(stages), note))
     return f'{words}\n<div class="scroll">{shown}</div>'
