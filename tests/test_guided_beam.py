@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmark_scripts import benchmark
+from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign.sections_direct import polish_sections
@@ -15,6 +16,7 @@ from ccd_casadi.codesign.sections_truth import TrueBandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, prepared, sections_value
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
@@ -44,6 +46,16 @@ def test_the_rule_has_its_gain_at_the_bandwidth() -> None:
     at = guided_beam.response(K, np.array([w]))[0]
     assert abs(at) == pytest.approx(1.1 * mass * w**2, rel=1e-9)
     assert sorted(np.linalg.eigvals(K.A).real) == pytest.approx([-5.0 * w, -3.0 * w, 0.0], abs=1e-6)
+
+
+def test_a_double_pole_does_not_spoil_the_judge() -> None:
+    """The co-design's lead and roll-off end with equal poles."""
+    a = 3000.0
+    K = StateSpace(*tf2ss([1.0, 2.0, 5.0], np.polymul([1.0, 0.0], [1.0, 2.0 * a, a**2])))
+    s = 1j * np.geomspace(0.1, 1e6, 200)
+    expected = (s**2 + 2.0 * s + 5.0) / (s * (s + a) ** 2)
+    found = benchmark("guided_beam").response(K, s.imag)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
