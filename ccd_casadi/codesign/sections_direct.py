@@ -59,8 +59,8 @@ def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> Formul
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, OuterSolution | None]:
     """From a design nearly optimal to the best θ that is found near it on the true problem.
 
-    By pieces (`bundle`), which know kinks, where the residual is large; then by IPOPT where J has
-    one gradient and that is not yet zero to `STATIONARY`.
+    By pieces (`bundle`), which know kinks; by IPOPT where J has one gradient and that is not yet
+    zero to what it is known to.
     """
     problem = sampler.problem
     lower, upper = box(problem)
@@ -69,9 +69,9 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, Ou
     truth = TrueBandwidth(sampler, "polishing")
     candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
     best = min(candidates, key=lambda s: objective(problem, s))
-    if sections_kkt(problem, best).stationarity > SMOOTH:
+    if sections_kkt(problem, best).stationarity > STATIONARY:
         best = _by_pieces(truth, best)
-    if sections_kkt(problem, best).stationarity <= STATIONARY or _on_a_kink(problem, best):
+    if sections_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
         return best, None
     program = nested_program(problem, truth)
     program = type(program)(**{**vars(program), "exact_hessian": False})

@@ -72,7 +72,9 @@ def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
     """What holds θ, and what the controller, with what loosening it would gain."""
     over_theta = binding(problem, {**result, "active": []})
-    mu = result["controller"]["multipliers"]
+    mu, kink = result["controller"]["multipliers"], result["kkt"].get("kink")
+    if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
+        mu = kink["multipliers"]
     gain = "lower the RMS error" if sections_of_problem(problem).of_error else "raise ω_b"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S below ω_b", "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
