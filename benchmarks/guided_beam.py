@@ -1,6 +1,6 @@
 """The PID rule of Delissen, van Keulen and Langelaar (2023) beside a free PID, on guided beams.
 
-    python benchmarks/guided_beam.py [GUIDE_MM TIP_MM]...
+    python benchmarks/guided_beam.py [GUIDE_MM TIP_MM]... [--grid N]
 
 Their controller has one parameter, the bandwidth w (rad/s) that is wished for, with the mass m:
 
@@ -8,10 +8,12 @@ Their controller has one parameter, the bandwidth w (rad/s) that is wished for, 
 
 w is raised here until the loop is unstable or |1 + L| < 0.5. Ours has the same structure, its five
 parameters free. Both are judged alike, by eigenvalues and |S| on a dense grid; ω_b is the first -3
-dB of S.
+dB of S. `--grid` asks instead for ω_b* on N x N pairs of heights, as the co-design does: the five
+best of those that the volume allows.
 """
 
-import sys
+import argparse
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +21,20 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.fixed_structure import synthesise_sections
-from ccd_casadi.inner_problem.problem import scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
+from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
+from ccd_casadi.inner_problem.sections_plant_set import (
+    bounds_of,
+    sections_of_problem,
+    structure_of,
+)
+from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.plants.scaling import StateSpace
 
 CASE = Path(__file__).resolve().parent.parent / "examples" / "guided_beam" / "case.toml"
 HZ = 2.0 * np.pi
-BEAMS = ((0.03, 0.03), (0.045, 0.015), (0.055, 0.005))
+# The last is where the co-design ends.
+BEAMS = ((0.03, 0.03), (0.045, 0.015), (0.055, 0.005), (0.0547227, 0.0052773))
 
 
 def judged(G: StateSpace, K: StateSpace) -> tuple[bool, float, float]:
@@ -36,11 +45,16 @@ def judged(G: StateSpace, K: StateSpace) -> tuple[bool, float, float]:
     omega = np.concatenate([HZ * np.geomspace(0.1, 1e6, 20000), near.ravel()])
     omega = np.unique(omega[omega > HZ * 0.1])
     S = np.abs(1.0 / (1.0 + response(G, omega) * response(K, omega)))
-    over = omega[np.argmax(S * np.sqrt(2.0) > 1.0)]
-    return bool((poles.real < 0.0).all()), float(S.max()), float(over) / HZ
+    over = int(np.argmax(S * np.sqrt(2.0) > 1.0))
+    first = np.interp(np.sqrt(0.5), S[over - 1 : over + 1], omega[over - 1 : over + 1])
+    return bool((poles.real < 0.0).all()), float(S.max()), float(first) / HZ
 
 
 def response(system: StateSpace, omega: np.ndarray) -> np.ndarray:
+    """C (jω - A)⁻¹ B + D; a controller's poles may be equal, those of the beam's modes are not."""
+    if len(system.A) <= 3:
+        shifted = 1j * omega[:, None, None] * np.eye(len(system.A)) - system.A
+        return (system.C @ np.linalg.solve(shifted, system.B + 0j))[:, 0, 0] + system.D[0, 0]
     values, V = np.linalg.eig(system.A)
     terms = (system.C @ V)[0] * np.linalg.solve(V, system.B + 0j)[:, 0]
     return (terms / (1j * omega[:, None] - values)).sum(1) + system.D[0, 0]
@@ -52,8 +66,23 @@ def their_pid(w: float, mass: float) -> StateSpace:
     return StateSpace(*tf2ss(above, np.polymul([1.0, 3.0 * w, 0.0], [1.0, 5.0 * w])))
 
 
+def look(count: int) -> None:
+    """ω_b* on a grid over the box of both heights."""
+    problem = prepared(problem_of(load_case(CASE)))[0]
+    axes = [np.linspace(low, high, count) for low, high in zip(*box(problem), strict=True)]
+    found = []
+    for theta in product(*axes):
+        if (constraint_values(plant_of(problem), theta) <= 1e-9).all():
+            value = sections_value(problem, theta)
+            found.append((value.bandwidth / HZ if value.feasible else 0.0, theta))
+    print(f"{len(found)} beams, {sum(width == 0.0 for width, _ in found)} without a design")
+    for width, (guide, tip) in sorted(found, reverse=True)[:5]:
+        print(f"{1e3 * guide:8.2f} {1e3 * tip:7.2f} {width:9.2f} Hz")
+
+
 def main(beams: list[tuple[float, float]]) -> None:
-    problem = problem_of(load_case(CASE))
+    problem = with_range(problem_of(load_case(CASE)))  # of K's roots, as the co-design has it
+    frequencies = sections_of_problem(problem).frequencies
     print(
         "guide mm  tip mm   mass kg   |  rule: w Hz    -3 dB Hz  max|S| | free PID: -3 dB  max|S|"
     )
@@ -76,7 +105,9 @@ def main(beams: list[tuple[float, float]]) -> None:
             middle = np.sqrt(low * high)
             low, high = (middle, high) if fits(middle) else (low, middle)
         _, peak, width = judged(G, their_pid(low, mass))
-        made = synthesise_sections([plant], structure_of(problem), bounds_of(problem), seed=0)
+        made = synthesise_sections(
+            [plant], structure_of(problem), bounds_of(problem), seed=0, frequencies=frequencies
+        )
         assert made.controller is not None
         stable, own_peak, own_width = judged(G, made.controller)
         assert stable
@@ -85,5 +116,12 @@ def main(beams: list[tuple[float, float]]) -> None:
 
 
 if __name__ == "__main__":
-    given = [1e-3 * float(x) for x in sys.argv[1:]]
-    main(list(zip(given[::2], given[1::2], strict=True)) or list(BEAMS))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("heights", type=float, nargs="*", metavar="MM")
+    parser.add_argument("--grid", type=int, metavar="N")
+    given = parser.parse_args()
+    mm = [1e-3 * height for height in given.heights]
+    if given.grid:
+        look(given.grid)
+    else:
+        main(list(zip(mm[::2], mm[1::2], strict=True)) or list(BEAMS))

@@ -51,11 +51,11 @@ def command(options: argparse.Namespace) -> ExitCode:
                 sampler, own=theta, points=options.points, tolerance=tolerance, seed=options.seed
             )
             sample = sampler.bandwidths(theta, "the run's own design")[0]
-            made = sections_value(done.problem, done.theta).design
-            responses = sections_responses(done.problem, sample, made)
+            found = sections_value(done.problem, done.theta)
+            responses = sections_responses(done.problem, sample, found)
     seconds = perf_counter() - began
-    found = insight_dict(done, front, responses)
-    write_json(folder / "insight.json", found | {"seed": options.seed, "seconds": seconds})
+    told = insight_dict(done, front, responses)
+    write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})
     verified = [point for point in front.points if point.verified]
     if not options.quiet:
         efficient = sum(point.efficient for point in verified)

@@ -117,7 +117,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "
-        "theta, "
+        f"theta{'' if result['kkt'].get('kink') is None else ' and controller, at a kink of J'}, "
         f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
         + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
         f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",

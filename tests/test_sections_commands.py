@@ -169,7 +169,7 @@ def test_responses_against_differences(folder: Path) -> None:
     sample = BandwidthSample(
         run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
     )
-    found = sections_responses(run.problem, sample, made.design)
+    found = sections_responses(run.problem, sample, made)
     by_name = {item.parameter: item for item in found.responses}
     h = 1e-3
     ends = []

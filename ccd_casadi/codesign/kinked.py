@@ -16,6 +16,7 @@ import numpy as np
 
 from ccd_casadi.codesign.kkt import OTHER_PEAK, lagrangian_parts, other_peaks
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.quasi_newton import damped_bfgs
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import hardware_cost
@@ -202,7 +203,7 @@ def _solver(n: int, m: int) -> ca.Function:
 
 
 def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
-    """Powell's damped BFGS update with the change of the Lagrangian's gradient."""
+    """H with the change of the Lagrangian's gradient."""
     s = there.z - here.z
     after = there.gradient.copy()
     for value, tag in zip(mu, here.tags, strict=True):
@@ -211,15 +212,7 @@ def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
             return H  # the peak is gone: there is no difference to learn from
         if value > 0.0:
             after += value * there.jacobian[row]
-    y = after - here.gradient - here.jacobian.T @ mu
-    Hs = H @ s
-    curvature = float(s @ Hs)
-    if curvature <= 1e-16 * float(np.trace(H)):
-        return H
-    if s @ y < 0.2 * curvature:
-        share = 0.8 * curvature / (curvature - float(s @ y))
-        y = share * y + (1.0 - share) * Hs
-    return H - np.outer(Hs, Hs) / curvature + np.outer(y, y) / float(s @ y)
+    return damped_bfgs(H, s, after - here.gradient - here.jacobian.T @ mu)
 
 
 def _same(tag: tuple[str, float, int], there: _Point) -> int | None:

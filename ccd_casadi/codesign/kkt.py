@@ -37,6 +37,27 @@ OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
 
 
 @dataclass(frozen=True)
+class Kink:
+    """What is known of a design where J of θ has more than one gradient.
+
+    one_gradient: the residual with that of one side alone. slopes: of J to the two sides of each of
+    some orthogonal directions, all that the active bounds leave; differences of true values, per
+    share of the box, over ‖∇J‖∞; NaN where there is no design. multipliers: of the bounds on the
+    loop by kind, change of ln of the inner value per ln of a bound.
+    """
+
+    one_gradient: float
+    slopes: tuple[tuple[float, float], ...]
+    multipliers: dict[str, float]
+
+    @property
+    def least_slope(self) -> float:
+        """The least of the slopes that are known; NaN where none is."""
+        known = [slope for pair in self.slopes for slope in pair if np.isfinite(slope)]
+        return min(known, default=float("nan"))
+
+
+@dataclass(frozen=True)
 class KktCertificate:
     """Residuals of the true optimality conditions at a verified design.
 
@@ -44,6 +65,7 @@ class KktCertificate:
     (share of the box). complementarity: largest |μ g| over ‖∇J‖∞. multipliers: per name, change
     of J per unit of g, or per unit box of a bound. second_order: least eigenvalue of the reduced
     Hessian of the Lagrangian over ‖∇J‖∞, inf at a vertex, None where it was not computed.
+    kink: of sections, where one gradient of J is not all that there are.
     """
 
     stationarity: float
@@ -53,6 +75,7 @@ class KktCertificate:
     active: tuple[str, ...]
     second_order: float | None
     objective_gradient: tuple[float, ...]
+    kink: Kink | None = None
 
 
 def kkt_certificate(

@@ -198,7 +198,7 @@ def verdict_of(
             error=error,
             tolerance=tolerance,
             left_out=None if at is None else abs(at[0]) / (figures.bandwidth / HZ),
-            left_out_hz=None if at is None else abs(at[0]),
+            left_out_size=None if at is None else abs(at[0]),
             sigmas=None if at is None else at[1],
             extrapolates=quality[0].extrapolates if quality else (),
             surrogate=bool(outcome.surrogates),

@@ -22,7 +22,6 @@ from ccd_casadi.codesign.lifted import OUTPUTS, Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import (
-    clean,
     controller_dict,
     infeasible_dict,
     predicted_bandwidth,
@@ -33,7 +32,7 @@ from ccd_casadi.codesign.sections_result import beside_dict, sections_controller
 from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
-from ccd_casadi.codesign.surrogate_quality import quality_dict, surrogate_quality
+from ccd_casadi.codesign.surrogate_quality import surrogate_quality
 from ccd_casadi.codesign.verdict import KKT_LEVEL
 from ccd_casadi.codesign.verify import VerifiedDesign, verify
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
@@ -249,18 +248,17 @@ def solution_of_sections(
     spent: dict[str, Any] = {"syntheses": found.syntheses, "seconds": seconds, "seed": seed}
     if found.verified is None:
         return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
-    result = sections_result(
-        problem, name, found.outcome, found.verified, tolerance=tolerance, **spent
-    )
     verified = found.verified
+    theta = np.array(verified.theta)
+    of_error = sections_of_problem(problem).of_error
+    quality = surrogate_quality(found.outcome.surrogates, theta, seed, of_error=of_error)
+    result = sections_result(
+        problem, name, found.outcome, verified, tolerance=tolerance, quality=quality, **spent
+    )
     with Progress(1, "full order beside it", quiet=quiet) as bar:
         beside = full_order_beside(verified.problem, verified.theta, verified.design)
         bar.advance()
     result["full_order"] = beside_dict(beside)
-    theta = np.array(verified.theta)
-    of_error = sections_of_problem(problem).of_error
-    quality = surrogate_quality(found.outcome.surrogates, theta, seed, of_error=of_error)
-    result["surrogate_quality"] = clean(quality_dict(quality))
     return Solution(result, found.outcome, None, quality, sections=found.verified)
 
 

@@ -6,7 +6,7 @@ IPOPT walks it on a Gaussian process of ω_b*(θ) with its envelope gradients; t
 run's anchors answers at every θ, and teaches the process until both agree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import casadi as ca
 import numpy as np
@@ -15,10 +15,10 @@ from ccd_casadi.codesign.nested import fit_bandwidth
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, nested_program
 from ccd_casadi.codesign.pareto import FLAT, STARTS, Front, efficient, ends_of, front_point, walk
 from ccd_casadi.codesign.post_optimal import WEAK, PostOptimal, Response
-from ccd_casadi.codesign.sections_truth import sections_kkt
+from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.stored import stored_thetas
-from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -94,18 +94,20 @@ def _learnt(
 
 
 def sections_responses(
-    problem: CoDesignProblem, sample: BandwidthSample, made: SectionsDesign
+    problem: CoDesignProblem, sample: BandwidthSample, found: SectionsValue
 ) -> PostOptimal:
     """Derivatives of the optimum to w1, w2, the bounds on the loop, λ <= 0 and the bounds of θ.
 
         dJ*/dp = ∂L/∂p,   with the bounds on the loop dω_b*/dp = ω_b μ/p
 
     How θ and ω_b move is given where the bounds on θ and λ alone determine θ (a vertex); elsewhere
-    it takes second derivatives of ω_b*, which are not known.
+    it takes second derivatives of ω_b*, which are not known. At a kink of ω_b* the multipliers μ
+    are those of θ and controller together.
     """
     theta, names = np.array(sample.theta), problem.names
     plant, width = plant_of(problem), np.subtract(problem.upper, problem.lower)
-    kkt = sections_kkt(problem, sample)
+    kkt = sections_kkt(problem, sample, envelope=found.envelope)
+    loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
     size = float(np.abs(kkt.objective_gradient).max())
     strong = [name for name in kkt.active if kkt.multipliers.get(name, 0.0) > WEAK * size]
     bound = [name for name in strong if name not in plant.constraint_names]
@@ -127,29 +129,31 @@ def sections_responses(
         cost = 0.0 if i is None else float(slope_f[i])
         return Response(name, value, J, bandwidth, cost, moved, ())
 
-    found = [
+    answers = [
         response("w1", problem.w1, hardware_cost(plant, theta), 0.0),
         response("w2", problem.w2, sample.bandwidth, 0.0),
     ]
-    for name, value, mu in _loop_bounds(problem, made):
+    for name, value, mu in _loop_bounds(problem, loop):
         rate = sample.bandwidth * mu / value
-        found.append(response(name, value, problem.w2 * rate, rate))
+        answers.append(response(name, value, problem.w2 * rate, rate))
     for name in plant.constraint_names:
-        found.append(response(f"{name} <= 0", 0.0, -kkt.multipliers.get(name, 0.0), 0.0))
+        answers.append(response(f"{name} <= 0", 0.0, -kkt.multipliers.get(name, 0.0), 0.0))
     for i, name in enumerate(names):
         ends = (("lower", problem.lower[i], 1.0), ("upper", problem.upper[i], -1.0))
         for end, value, sign in ends:
             label = f"{name} {end}"
             mu = kkt.multipliers.get(label, 0.0)
             rate, which = (sample.gradient[i], i) if label in strong else (0.0, None)
-            found.append(response(label, value, sign * mu / width[i], rate, which))
+            answers.append(response(label, value, sign * mu / width[i], rate, which))
     weak = tuple(name for name in kkt.active if name not in strong)
-    return PostOptimal(tuple(found), kkt, weak, vertex)
+    return PostOptimal(tuple(answers), kkt, weak, vertex)
 
 
-def _loop_bounds(problem: CoDesignProblem, made: SectionsDesign) -> list[tuple[str, float, float]]:
+def _loop_bounds(
+    problem: CoDesignProblem, mu: Mapping[str, float]
+) -> list[tuple[str, float, float]]:
     """Bounds on the loop that the case gives: name, value, and d ln ω_b/d ln of it."""
-    sections, mu = sections_of_problem(problem), made.multipliers
+    sections = sections_of_problem(problem)
     rows = [
         ("S_max", problem.inner.S_max, mu.get("S_MAX", 0.0)),
         ("S_low", problem.inner.S_low, mu.get("S_LOW", 0.0)),

@@ -18,6 +18,7 @@ from ccd_casadi.codesign.result import (
 )
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.sections_verdict import sections_verdict
+from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -26,6 +27,7 @@ from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.units import HZ
+from surrogates import Quality
 
 BINDS = {
     "S_MAX": "S_max",
@@ -147,6 +149,7 @@ def sections_result(
     syntheses: int,
     seconds: float,
     seed: int,
+    quality: tuple[Quality, ...] = (),
 ) -> dict[str, Any]:
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     made = verified.design
@@ -162,8 +165,9 @@ def sections_result(
         "robust": verified.wide.passed and not verified.proof.refuted,
     }
     verdict = sections_verdict(
-        verified, constraints=checks["constraints"], error=error, tolerance=tolerance
-    )
+        verified, constraints=checks["constraints"], error=error, tolerance=tolerance,
+        surrogate=bool(outcome.surrogates), quality=quality,
+    )  # fmt: skip
     checks["optimality"] = verdict.optimal.state is not State.FAILED
     failed = [name for name, passed in checks.items() if not passed]
     words = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
@@ -211,6 +215,7 @@ def sections_result(
     }
     assert made.controller is not None
     result |= budget_entry(verified.problem, verified.theta, made.controller)
+    result["surrogate_quality"] = quality_dict(quality)
     return clean(result)
 
 

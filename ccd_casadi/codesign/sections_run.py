@@ -17,15 +17,13 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
-from ccd_casadi.codesign.sections_truth import (
-    TrueBandwidth,
-    objective,
-    polish_sections,
-    sections_kkt,
-    solve_direct_sections,
-)
+from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
+from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
+from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import (
@@ -121,6 +119,7 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
             return SectionsRun(outcome, None, spent + asked.syntheses)
+        sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
         spent += 1
         if not (end.better or end.members) or rounds == AGAIN:
@@ -128,6 +127,8 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
         spent += asked.syntheses
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
         problem = joined(problem, kappa, end.members)
+    if not isinstance(formulation, Direct):
+        outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
     sampler.trace.extend(asked.trace)
     return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent + asked.syntheses)
 
@@ -144,10 +145,12 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
 
 @dataclass(frozen=True)
 class _End:
-    """The polished θ with its design, a race there, the worst plant, and those to add."""
+    """The polished θ with its design and that one's gradients, a race there, the worst plant, and
+    those to add."""
 
     best: BandwidthSample
     design: SectionsDesign
+    envelope: Envelope | None
     raced: Raced
     worst: Excess
     members: tuple[Member, ...]
@@ -168,10 +171,40 @@ class _End:
 def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
     best, _ = polish_sections(asked, theta)
-    design = sections_value(problem, best.theta).design
+    found = sections_value(problem, best.theta)
     raced = _raced(asked.store, problem, best.theta, quiet, asked.workers)
-    worst, members = worst_members(problem, best.theta, design, 0, _teller("at the end", quiet))
-    return _End(best, design, raced, worst, members)
+    tell = _teller("at the end", quiet)
+    worst, members = worst_members(problem, best.theta, found.design, 0, tell)
+    return _End(best, found.design, found.envelope, raced, worst, members)
+
+
+def _foreseen(
+    asked: Sampler,
+    formulation: Nested | Lifted,
+    seed: int,
+    outcome: FormulationResult,
+    end: _End,
+    sampled: Array,
+) -> tuple[FormulationResult, _End]:
+    """Where the surrogate misses the polished design it learns it, and goes on from there."""
+    error = abs(_predicted(outcome, end.best) / end.best.value - 1.0)
+    if error <= formulation.tolerance or len(outcome.iterates) > formulation.max_refinements:
+        return outcome, end
+    thetas = np.unique(np.vstack([sampled, end.best.theta]), axis=0)
+    found = _nested(asked, formulation, seed, Surrogates((), thetas, ()))
+    if found.x is None:
+        return outcome, end
+    theta = found.x[: len(asked.problem.names)]
+    if not np.array_equal(theta, end.best.theta):
+        end = _end(asked, theta)
+    return replace(found, iterates=(*outcome.iterates, *found.iterates)), end
+
+
+def _predicted(outcome: FormulationResult, sample: BandwidthSample) -> float:
+    """What the surrogate says at a sample; the sample's own value where there is none."""
+    if not outcome.surrogates:
+        return sample.value
+    return float(outcome.surrogates[0].predict(np.array(sample.theta)[None, :])[0])
 
 
 def _verified(
@@ -181,23 +214,20 @@ def _verified(
     assert made.controller is not None
     worst = end.worst
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-    predicted = best.value
-    if outcome.surrogates:
-        predicted = float(outcome.surrogates[0].predict(np.array(best.theta)[None, :])[0])
     return VerifiedSections(
         problem=problem,
         theta=best.theta,
         design=made,
         objective=objective(problem, best),
         hardware_cost=hardware_cost(plant_of(problem), best.theta),
-        kkt=sections_kkt(problem, best, TrueBandwidth(asked, "certificate")),
+        kkt=sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope),
         race_gap=float(max(end.gap, 0.0)),
         raced=end.raced,
         wide=wide,
         checked=checked,
         proof=proof_of(problem, best.theta, made),
         worst=worst,
-        predicted=predicted,
+        predicted=_predicted(outcome, best),
         value=best.value,
         rounds=rounds,
     )
@@ -208,13 +238,19 @@ def _formulated(
 ) -> FormulationResult:
     if isinstance(formulation, Direct):
         return solve_direct_sections(asked, formulation.starts, seed=seed)
+    return _nested(asked, formulation, seed)
+
+
+def _nested(
+    asked: Sampler, formulation: Nested | Lifted, seed: int, given: Surrogates | None = None
+) -> FormulationResult:
     if isinstance(formulation, Nested):
-        return solve_nested(asked, formulation, seed=seed)
+        return solve_nested(asked, formulation, seed=seed, given=given)
     # The constituents ω_S and ω_T do not exist here: what is lifted are the exact gradients.
     points = formulation.points or 6 * len(asked.problem.names)
     options = Nested("sobol", points, formulation.starts, formulation.tolerance,
                      formulation.max_refinements, formulation.kernel)  # fmt: skip
-    return solve_nested(asked, options, seed=seed, gradients=True)
+    return solve_nested(asked, options, seed=seed, given=given, gradients=True)
 
 
 def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:

@@ -1,4 +1,4 @@
-"""The outer problem on the true ω_b*(θ) of a fixed structure: direct, polish, KKT certificate.
+"""J and λ of the outer problem on the true ω_b*(θ) of a fixed structure.
 
     min  w1 f(θ) + w2 ω_b*(θ)   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0
 
@@ -7,32 +7,17 @@ or w1 f(θ) + w2 e*(θ), w2 > 0, where the inner problem minimises the RMS error
 Every evaluation is a design that the judge confirms, with its envelope gradient, or NaN.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import null_space
-from scipy.optimize import nnls
 
-from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import ACTIVE, STEP, KktCertificate
-from ccd_casadi.codesign.outer_problem import (
-    OuterFailure,
-    OuterSolution,
-    nested_program,
-    solve_program,
-)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from surrogates import design
-
-STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
-PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
-SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
 
 
 class TrueBandwidth(VectorCallback):
@@ -69,130 +54,30 @@ def objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     return problem.w1 * cost + problem.w2 * sample.value
 
 
-def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
-    """IPOPT on the true ω_b*(θ) from the case's start and a Sobol set of starts."""
-    problem = sampler.problem
+@dataclass(frozen=True)
+class Hardware:
+    """w1 ∇f (n,), λ (m,) and ∇λ (m, n) at θ, per share of the box."""
+
+    cost_gradient: Array
+    constraints: Array
+    slopes: Array
+
+
+def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
+    """What θ costs and may not, to first order."""
     lower, upper = box(problem)
-    points = np.array(problem.start)[None, :]
-    if starts > 1:
-        points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
-    truth = TrueBandwidth(sampler, "direct")
-    good = [p for p in points if truth.at(p).feasible and np.isfinite(truth.at(p).gradient).all()]
-    if not good:
-        message = f"none of {len(points)} starting designs is certified"
-        return FormulationResult(None, None, (), (), None, False, message)
-    program = nested_program(problem, truth)
-    program = type(program)(**{**vars(program), "exact_hessian": False})
-    try:
-        solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
-    except OuterFailure as error:
-        best = min((truth.at(p) for p in good), key=lambda s: objective(problem, s))
-        if not np.isfinite(objective(problem, best)):
-            return FormulationResult(None, None, (), (), None, False, str(error))
-        return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
-    best = min(truth.known.values(), key=lambda s: objective(problem, s))
-    return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
-
-
-def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, OuterSolution | None]:
-    """From a design nearly optimal to the best θ that IPOPT finds on the true problem near it."""
-    problem = sampler.problem
-    lower, upper = box(problem)
-    near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
-    near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
-    truth = TrueBandwidth(sampler, "polishing")
-    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
-    best = min(candidates, key=lambda s: objective(problem, s))
-    if sections_kkt(problem, best).stationarity <= STATIONARY:
-        return best, None
-    program = nested_program(problem, truth)
-    program = type(program)(**{**vars(program), "exact_hessian": False})
-    solution: OuterSolution | None = None
-    try:
-        solution = solve_program(
-            program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED
-        )
-    except OuterFailure:
-        pass
-    return min(truth.known.values(), key=lambda s: objective(problem, s)), solution
-
-
-def sections_kkt(
-    problem: CoDesignProblem, sample: BandwidthSample, truth: TrueBandwidth | None = None
-) -> KktCertificate:
-    """First-order residuals over θ at a sample; the second-order check where `truth` may ask."""
-    plant = plant_of(problem)
-    lower, upper = box(problem)
+    symbol = ca.MX.sym("theta", len(lower))
+    f, lam = plant_of(problem).hardware(symbol)
+    wanted = [ca.jacobian(f, symbol), lam, ca.jacobian(lam, symbol)]
+    df, values, dlam = map(np.array, ca.Function("hardware", [symbol], wanted)(theta))
     width = upper - lower
-    theta = np.array(sample.theta)
-    symbol = ca.MX.sym("theta", theta.size)
-    f, lam = plant.hardware(symbol)
-    slopes = ca.Function("slopes", [symbol], [ca.jacobian(f, symbol), ca.jacobian(lam, symbol)])
-    dlam = np.array(slopes(theta)[1])
-
-    def gradient_at(point: BandwidthSample) -> Array:
-        own = np.array(slopes(np.array(point.theta))[0]).ravel()
-        return (problem.w1 * own + problem.w2 * np.array(point.gradient)) * width
-
-    gradient = gradient_at(sample)
-    values = constraint_values(plant, theta)
-    rows, labels, slack = [], [], []
-    for value, row, name in zip(values, dlam.reshape(-1, theta.size), plant.constraint_names,
-                                strict=True):  # fmt: skip
-        if value >= -ACTIVE:
-            rows.append(row * width)
-            labels.append(name)
-            slack.append(value)
-    for i, name in enumerate(problem.names):
-        gaps = ((theta[i] - lower[i]) / width[i], (upper[i] - theta[i]) / width[i])
-        for end, gap, sign in zip(("lower", "upper"), gaps, (-1.0, 1.0), strict=True):
-            if gap <= ACTIVE:
-                rows.append(sign * np.eye(theta.size)[i])
-                labels.append(f"{name} {end}")
-                slack.append(-gap)
-    if not np.isfinite(gradient).all():
-        return KktCertificate(np.inf, 0.0, np.inf, {}, tuple(labels), None, tuple(gradient))
-    size = max(float(np.abs(gradient).max()), 1e-300)
-    A = np.array(rows).reshape(-1, theta.size)
-    mu = nnls(A.T, -gradient)[0] if rows else np.zeros(0)
-    residual = gradient + A.T @ mu
-    Z = null_space(A[mu > 0.0]) if (mu > 0.0).any() else np.eye(theta.size)
-    second: float | None = np.inf if Z.shape[1] == 0 else None
-    if second is None and truth is not None:
-        second = _second(problem, truth, theta, Z, size, gradient_at)
-    primal = max(0.0, *(-np.minimum(theta - lower, upper - theta) / width), *values, 0.0)
-    return KktCertificate(
-        stationarity=float(np.abs(residual).max()) / size,
-        primal=float(primal),
-        complementarity=float(np.abs(mu * np.array(slack)).max(initial=0.0)) / size,
-        multipliers={name: float(value) for name, value in zip(labels, mu, strict=True)},
-        active=tuple(labels),
-        second_order=second,
-        objective_gradient=tuple(map(float, gradient)),
+    return Hardware(
+        problem.w1 * df.ravel() * width, values.ravel(), dlam.reshape(-1, len(lower)) * width
     )
 
 
-def _second(
-    problem: CoDesignProblem,
-    truth: TrueBandwidth,
-    theta: Array,
-    Z: Array,
-    size: float,
-    gradient_at: Callable[[BandwidthSample], Array],
-) -> float | None:
-    """Least eigenvalue of Zᵀ∇²J Z by differences of true gradients; λ's own curvature is left out.
-
-    None where a neighbour is outside the box or has no gradient.
-    """
+def objective_gradient(problem: CoDesignProblem, sample: BandwidthSample) -> Array:
+    """∇J (n,) per share of the box; of one side, where ω_b* has a kink."""
     lower, upper = box(problem)
-    columns = []
-    for direction in Z.T:
-        ends = [theta + sign * 10.0 * STEP * direction * (upper - lower) for sign in (1.0, -1.0)]
-        if any((end < lower).any() or (end > upper).any() for end in ends):
-            return None
-        slopes = [gradient_at(truth.at(end)) for end in ends]
-        columns.append((slopes[0] - slopes[1]) / (20.0 * STEP))
-    H = Z.T @ np.array(columns).T
-    if not np.isfinite(H).all():
-        return None
-    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+    own = hardware_at(problem, np.array(sample.theta)).cost_gradient
+    return own + problem.w2 * np.array(sample.gradient) * (upper - lower)

@@ -1,24 +1,36 @@
 """The five lines of the verdict on a controller of fixed structure; see `verdict`."""
 
 import math
+from collections.abc import Sequence
 
+from ccd_casadi.codesign.kkt import Kink
 from ccd_casadi.codesign.sections_run import VerifiedSections
-from ccd_casadi.codesign.verdict import Line, State, Verdict
+from ccd_casadi.codesign.verdict import Line, State, Verdict, predicted
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.support.units import HZ
+from surrogates import Quality
 
 # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3.
 KKT_LEVEL = 1e-2
 
 
 def sections_verdict(
-    verified: VerifiedSections, *, constraints: bool, error: float, tolerance: float
+    verified: VerifiedSections,
+    *,
+    constraints: bool,
+    error: float,
+    tolerance: float,
+    surrogate: bool,
+    quality: Sequence[Quality] = (),
 ) -> Verdict:
-    """`constraints`: λ(θ) <= 0; `error`: of the predicted bandwidth, relative."""
+    """`constraints`: λ(θ) <= 0; `error`: of the predicted bandwidth or RMS error, relative.
+
+    `surrogate`: whether one predicted it, `quality` what that says of itself.
+    """
     return Verdict(
         certified=_certified(verified, constraints),
         optimal=_optimal(verified, tolerance),
-        predicted=_predicted(verified, error, tolerance),
+        predicted=_predicted(verified, error, tolerance, surrogate, quality),
         survives=_survives(verified),
         deployable=_deployable(verified),
     )
@@ -64,17 +76,64 @@ def _optimal(verified: VerifiedSections, tolerance: float) -> Line:
     if residual > KKT_LEVEL:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {KKT_LEVEL:g}"
         return Line(State.FAILED, f"{words}; {known}", figures)
-    return Line(State.PASSED, f"KKT residual {residual:.1e} over theta; {known}", figures)
+    kink = verified.kkt.kink
+    if kink is None:
+        return Line(State.PASSED, f"KKT residual {residual:.1e} over theta; {known}", figures)
+    figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
+    if kink.least_slope < -KKT_LEVEL:
+        words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
+        return Line(State.FAILED, f"{words}; {known}", figures)
+    words = (
+        f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
+        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; true J "
+        f"{_sides(kink)}; {known}"
+    )
+    asked = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
+    return Line(State.PASSED if asked else State.WARNED, words, figures)
+
+
+def _sides(kink: Kink) -> str:
+    """What true values beside a kink say, in words."""
+    if not kink.slopes:
+        return "was not asked beside it: bounds alone hold theta"
+    found = [slope for pair in kink.slopes for slope in pair]
+    known = sum(map(math.isfinite, found))
+    if not known:
+        return "is not known beside it"
+    if len(found) == 2 and known == 2:
+        words = f"grows by {found[0]:.2g} and {found[1]:.2g} of its gradient on the two sides"
+        return f"{words} of the one direction that is left"
+    return (
+        f"grows by at least {kink.least_slope:.2g} of its gradient on {known} of {len(found)} "
+        f"sides of {len(kink.slopes)} directions"
+    )
 
 
 def _of_error(verified: VerifiedSections) -> bool:
     return sections_of_problem(verified.problem).of_error
 
 
-def _predicted(verified: VerifiedSections, error: float, tolerance: float) -> Line:
-    state = State.PASSED if error <= tolerance else State.FAILED
-    what = "RMS error" if _of_error(verified) else "bandwidth"
-    return Line(state, f"{what} predicted to {error:.1e}", {"error": error, "tolerance": tolerance})
+def _predicted(
+    verified: VerifiedSections,
+    error: float,
+    tolerance: float,
+    surrogate: bool,
+    quality: Sequence[Quality],
+) -> Line:
+    at = quality[0].at_point if quality else None
+    of, value = ("bandwidth", "Hz"), verified.value / HZ
+    if _of_error(verified):
+        of, value = ("RMS error", "nm"), 1e9 * verified.value
+    return predicted(
+        error=error,
+        tolerance=tolerance,
+        left_out=None if at is None else abs(at[0]) / value,
+        left_out_size=None if at is None else abs(at[0]),
+        sigmas=None if at is None else at[1],
+        extrapolates=quality[0].extrapolates if quality else (),
+        surrogate=surrogate,
+        of=of,
+    )
 
 
 def _survives(verified: VerifiedSections) -> Line:

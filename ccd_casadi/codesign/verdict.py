@@ -161,33 +161,37 @@ def predicted(
     error: float,
     tolerance: float,
     left_out: float | None = None,
-    left_out_hz: float | None = None,
+    left_out_size: float | None = None,
     sigmas: float | None = None,
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
+    of: tuple[str, str] = ("bandwidth", "Hz"),
 ) -> Line:
     """Surrogate against truth at the design.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` shows
-    nothing: `left_out` (relative) is the error there without it, `sigmas` in deviations.
+    nothing: `left_out` (relative) is the error there without it, `left_out_size` the same in the
+    unit of what is predicted, `of`, and `sigmas` in deviations.
     """
+    what, unit = of
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if not surrogate:
         return Line(State.PASSED, "nothing was predicted: IPOPT worked on the truth", figures)
     if left_out is not None:
-        figures |= {"left_out": left_out, "left_out_hz": left_out_hz, "left_out_sigmas": sigmas}
+        size = f"left_out_{unit.lower()}"
+        figures |= {"left_out": left_out, size: left_out_size, "left_out_sigmas": sigmas}
     if not error <= tolerance:
         words = f"prediction and truth differ by {100 * error:.2g} %, more than {tolerance:.0e}"
         return Line(State.FAILED, words, figures)
     if left_out is None:
-        words = f"bandwidth predicted to {error:.1e}"
+        words = f"{what} predicted to {error:.1e}"
         if extrapolates:
             words += f"; the surrogate extrapolates there: {extrapolates[0]}"
             return Line(State.WARNED, words, figures)
         return Line(State.PASSED, words, figures)
     words = (
-        f"the optimum is a training sample; left out, its bandwidth is missed by "
-        f"{left_out_hz:.2g} Hz ({100 * left_out:.2g} %"
+        f"the optimum is a training sample; left out, its {what} is missed by "
+        f"{left_out_size:.2g} {unit} ({100 * left_out:.2g} %"
         + (f", {sigmas:.1f} sigma)" if sigmas is not None else ")")
     )
     if left_out <= tolerance or (sigmas is not None and sigmas <= SIGMAS and left_out <= 0.01):

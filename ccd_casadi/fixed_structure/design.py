@@ -20,7 +20,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem, Problem
-from ccd_casadi.fixed_structure.optimality import log_bandwidth_gradient, optimality
+from ccd_casadi.fixed_structure.optimality import Envelope, log_bandwidth_envelope, optimality
 from ccd_casadi.fixed_structure.race import (
     LocalOptimum,
     Runner,
@@ -206,6 +206,24 @@ def synthesise_sections(
     return best
 
 
+def bandwidth_envelope(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    sampling: Sampling | None = None,
+) -> Envelope | None:
+    """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
+
+    None where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    """
+    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
+    kappa = in_problem_units(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
+    envelope = log_bandwidth_envelope(problem, kappa, found)
+    return None if envelope is None else envelope.times(design.bandwidth)
+
+
 def bandwidth_and_gradient(
     plants: Sequence[ScaledPlant],
     bounds: Bounds,
@@ -214,14 +232,11 @@ def bandwidth_and_gradient(
 ) -> tuple[float, Array]:
     """ω_b* in rad/s and dω_b*/dθ at a design that is optimal on these plants (envelope theorem).
 
-    The gradient is NaN where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    Of one side where ω_b* has a kink; NaN where the point is not stationary to 1e-3.
     """
-    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
-    kappa = in_problem_units(problem, design.kappa)
-    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
-    slope = log_bandwidth_gradient(problem, kappa, found)
-    return design.bandwidth, design.bandwidth * slope
+    envelope = bandwidth_envelope(plants, bounds, design, sampling)
+    unknown = np.full(len(plants[0].dA), np.nan)
+    return design.bandwidth, unknown if envelope is None else envelope.gradient
 
 
 def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:

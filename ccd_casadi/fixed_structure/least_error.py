@@ -36,7 +36,8 @@ from ccd_casadi.fixed_structure.design import (
 )
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, Problem
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Problem
+from ccd_casadi.fixed_structure.optimality import Envelope, names_of
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -102,15 +103,14 @@ class LeastError:
     """A design with its RMS error in m over the set, and that of the controller it began with.
 
     `design.multipliers`: change of ln e per ln of a bound; `design.kkt_residual` is over ‖∇ ln e‖.
-    `gradient` (n_θ,) is de*/dθ where the plants carry derivatives, NaN where the end is not
-    stationary.
+    `envelope` has de*/dθ where the plants carry derivatives; None where the end is not stationary.
     """
 
     design: SectionsDesign
     error: float
     first_error: float
     steps: int
-    gradient: Array
+    envelope: Envelope | None
 
 
 def least_error(
@@ -145,8 +145,7 @@ def least_error(
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
     first = float(np.exp(goal.at(design.kappa)[0]))
-    unknown = np.full(len(plants[0].dA), np.nan)
-    best = LeastError(design, first, first, 0, unknown)
+    best = LeastError(design, first, first, 0, None)
     steps = 0
     slower = max(SLOWER * design.bandwidth, least_bandwidth)
     given = [(slower, tuple(map(float, item))) for item in initial]
@@ -160,16 +159,18 @@ def least_error(
             continue
         end, count = descend(model, start, problem.box, floor, REWARD, problem.margin)
         steps += count
-        made, active, mu = _judged(problem, plants, sampling, end, design, floor)
+        made, active, conditions = _judged(problem, plants, sampling, end, design, floor)
         error = float(np.exp(end.value))
         tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
              f"{made.words}")  # fmt: skip
         if made.certified and error < best.error:
-            slope = unknown
+            envelope = None
             if made.kkt_residual <= RESIDUAL:
-                own_slope = goal.to_theta(made.kappa, plants)
-                slope = error * (own_slope + mu @ to_theta(problem, end.kappa, active))
-            best = replace(best, design=made, error=error, gradient=slope)
+                direct = goal.to_theta(made.kappa, plants)
+                slopes = to_theta(problem, end.kappa, active)
+                names = names_of(active)
+                envelope = Envelope(names, direct, slopes, *conditions).times(error)
+            best = replace(best, design=made, error=error, envelope=envelope)
     return replace(best, steps=steps)
 
 
@@ -207,8 +208,10 @@ def _judged(
     end: Point,
     design: SectionsDesign,
     floor: float,
-) -> tuple[SectionsDesign, Constraints, Array]:
-    """The end as a design: certified by the judge, with residual and multipliers; what binds."""
+) -> tuple[SectionsDesign, Constraints, tuple[Array, Array, Array]]:
+    """The end as a design: certified by the judge, with residual and multipliers; what binds; and
+    the conditions of optimality as rows, goal and μ, rowsᵀ μ = goal.
+    """
     structure, P = problem.structure, problem.plants
     kappa = structure.in_units(end.kappa, P.omega_0, P.force)
     controller = state_space(structure, kappa)
@@ -229,9 +232,8 @@ def _judged(
     mu = nnls(matrix, goal, maxiter=100 * matrix.shape[1])[0] if matrix.shape[1] else np.zeros(0)
     residual = float(np.abs(matrix @ mu - goal).max() / np.abs(goal).max())
     multipliers: dict[str, float] = {}
-    for code, value in zip(active.curve, mu, strict=False):
+    for word, value in zip(names_of(active), mu, strict=False):
         if value > 0.0:
-            word = Curve(int(code)).name
             multipliers[word] = multipliers.get(word, 0.0) + float(value)
     count = len(active.v)
     ends = tuple((*item, float(v)) for item, v in zip(names, mu[count:], strict=False))
@@ -250,4 +252,4 @@ def _judged(
         kkt_residual=residual,
         short={},
     )
-    return made, active, mu[:count]
+    return made, active, (matrix.T, goal, mu)

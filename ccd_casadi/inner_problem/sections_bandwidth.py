@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign, bandwidth_and_gradient
+from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.channel_design import synthesise
-from ccd_casadi.fixed_structure.design import Progress, SectionsOutcome
+from ccd_casadi.fixed_structure.design import Progress, SectionsOutcome, bandwidth_envelope
 from ccd_casadi.fixed_structure.least_error import least_error
+from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
@@ -47,7 +48,8 @@ class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
     Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
-    that of the design. `syntheses`: climbs from anchors and races that it took.
+    that of the design. `syntheses`: climbs from anchors and races that it took. At a kink of the
+    value the gradient is that of one side, and `envelope` has the others.
     """
 
     theta: tuple[float, ...]
@@ -56,6 +58,7 @@ class SectionsValue:
     design: SectionsDesign
     syntheses: int
     error: float = float("nan")
+    envelope: Envelope | None = None
 
     @property
     def feasible(self) -> bool:
@@ -94,15 +97,16 @@ def valued(
 ) -> SectionsValue:
     """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least error."""
     point = tuple(float(v) for v in theta)
-    bandwidth, error, gradient = np.nan, np.nan, np.full(len(point), np.nan)
+    error, envelope = np.nan, None
     if made.certified and sections_of_problem(problem).of_error:
-        made, error, gradient = _least_error(problem, plants, made)
-        bandwidth = made.bandwidth if made.certified else np.nan
+        made, error, envelope = _least_error(problem, plants, made)
     elif made.certified:
         sampling = sections_of_problem(problem).sampling
-        bandwidth, gradient = bandwidth_and_gradient(plants, bounds_of(problem), made, sampling)
+        envelope = bandwidth_envelope(plants, bounds_of(problem), made, sampling)
+    bandwidth = made.bandwidth if made.certified else np.nan
+    gradient = np.full(len(point), np.nan) if envelope is None else envelope.gradient
     slope = tuple(map(float, gradient))
-    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error))
+    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error), envelope)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
@@ -125,20 +129,20 @@ def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
 
 def _least_error(
     problem: CoDesignProblem, plants: Sequence[ScaledPlant], made: SectionsDesign
-) -> tuple[SectionsDesign, float, Array]:
-    """The design of least RMS error, that in m, and its gradient to θ."""
+) -> tuple[SectionsDesign, float, Envelope | None]:
+    """The design of least RMS error, that in m, and its gradients to θ."""
     sections, bounds = sections_of_problem(problem), bounds_of(problem)
     assert problem.budget is not None
     made = too_slow(problem, made)
     if not made.certified:
-        return made, np.nan, np.full(len(problem.names), np.nan)
+        return made, np.nan, None
     started = with_sections(problem, anchors=sections.error_anchors)
     found = least_error(
         plants, bounds, made, problem.budget, sampling=sections.sampling,
         least_bandwidth=sections.bandwidth_least,
         initial=warm_starts(started, structure_of(problem), plants, bounds),
     )  # fmt: skip
-    return found.design, found.error, found.gradient
+    return found.design, found.error, found.envelope
 
 
 def race(

@@ -1,0 +1,119 @@
+"""IPOPT on the true ω_b*(θ) of a fixed structure, and a polish that passes its kinks."""
+
+import numpy as np
+
+from ccd_casadi.codesign.bundle import Local, descend
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.outer_problem import (
+    OuterFailure,
+    OuterSolution,
+    nested_program,
+    solve_program,
+)
+from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
+from ccd_casadi.codesign.sections_truth import (
+    TrueBandwidth,
+    hardware_at,
+    objective,
+    objective_gradient,
+)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from surrogates import design
+
+STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
+PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
+SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
+LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
+STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
+
+
+def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
+    """IPOPT on the true ω_b*(θ) from the case's start and a Sobol set of starts."""
+    problem = sampler.problem
+    lower, upper = box(problem)
+    points = np.array(problem.start)[None, :]
+    if starts > 1:
+        points = np.vstack([points, design("sobol", lower, upper, starts - 1, seed)])
+    truth = TrueBandwidth(sampler, "direct")
+    good = [p for p in points if truth.at(p).feasible and np.isfinite(truth.at(p).gradient).all()]
+    if not good:
+        message = f"none of {len(points)} starting designs is certified"
+        return FormulationResult(None, None, (), (), None, False, message)
+    program = nested_program(problem, truth)
+    program = type(program)(**{**vars(program), "exact_hessian": False})
+    try:
+        solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
+    except OuterFailure as error:
+        best = min((truth.at(p) for p in good), key=lambda s: objective(problem, s))
+        if not np.isfinite(objective(problem, best)):
+            return FormulationResult(None, None, (), (), None, False, str(error))
+        return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
+    best = min(truth.known.values(), key=lambda s: objective(problem, s))
+    return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
+
+
+def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, OuterSolution | None]:
+    """From a design nearly optimal to the best θ that is found near it on the true problem.
+
+    By pieces (`bundle`), which know kinks; by IPOPT where J has one gradient and that is not yet
+    zero to what it is known to.
+    """
+    problem = sampler.problem
+    lower, upper = box(problem)
+    near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
+    near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
+    truth = TrueBandwidth(sampler, "polishing")
+    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
+    best = min(candidates, key=lambda s: objective(problem, s))
+    if sections_kkt(problem, best).stationarity > STATIONARY:
+        best = _by_pieces(truth, best)
+    if sections_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
+        return best, None
+    program = nested_program(problem, truth)
+    program = type(program)(**{**vars(program), "exact_hessian": False})
+    solution: OuterSolution | None = None
+    try:
+        solution = solve_program(
+            program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED
+        )
+    except OuterFailure:
+        pass
+    return min(truth.known.values(), key=lambda s: objective(problem, s)), solution
+
+
+def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
+    """Whether a sample is optimal to first order by the gradients of several sides of it."""
+    envelope = sections_value(problem, best.theta).envelope
+    found = sections_kkt(problem, best, envelope=envelope)
+    return found.kink is not None and found.stationarity <= SMOOTH
+
+
+def _by_pieces(truth: TrueBandwidth, best: BandwidthSample) -> BandwidthSample:
+    """From a sample, and what was asked for near it, to where the pieces of J promise no more."""
+    problem = truth.sampler.problem
+    lower, upper = box(problem)
+    width = upper - lower
+
+    def at(z: Array) -> Local | None:
+        return local(truth.at(np.clip(lower + width * z, lower, upper)))
+
+    def local(sample: BandwidthSample) -> Local | None:
+        J, gradient = objective(problem, sample), objective_gradient(problem, sample)
+        if not (np.isfinite(J) and np.isfinite(gradient).all()):
+            return None
+        return Local((np.array(sample.theta) - lower) / width, J, gradient)
+
+    def constraints(z: Array) -> tuple[Array, Array]:
+        found = hardware_at(problem, lower + width * z)
+        return found.constraints, found.slopes
+
+    start = local(best)
+    if start is None:
+        return best
+    others = [found for found in map(local, truth.known.values()) if found is not None]
+    descend(at, start, others, constraints, steps=STEPS * len(lower), settled=LEVEL)
+    return min(truth.known.values(), key=lambda sample: objective(problem, sample))
