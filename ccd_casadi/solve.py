@@ -94,6 +94,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.reporting.verdict import terminal_lines
+    from ccd_casadi.support.units import counted
 
     residual = result["kkt"]["stationarity"]
     certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
@@ -109,11 +110,11 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
         f"compliance    {result['compliance_words']}",
         f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
-        f"{certificate['plants']} plants: {certificate['norm']:.7g} of a bound at most, poles left "
-        f"of {certificate['max_real_pole']:.4g} 1/s",
-        f"robust        {'passed' if robust['passed'] else 'FAILED'} on {robust['plants']} plants "
-        f"of the box; the worst that was searched: {100.0 * robust['worst_excess']:+.3g} % of a "
-        "bound",
+        f"{counted(certificate['plants'], 'plant')}: {certificate['norm']:.7g} of a bound at most, "
+        f"poles left of {certificate['max_real_pole']:.4g} 1/s",
+        f"robust        {'passed' if robust['passed'] else 'FAILED'} on "
+        f"{counted(robust['plants'], 'plant')} of the box; the worst that was searched: "
+        f"{100.0 * robust['worst_excess']:+.3g} % of a bound",
         *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "

@@ -7,7 +7,7 @@ from ccd_casadi.codesign.kkt import Kink
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.verdict import Line, State, Verdict, predicted
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, counted
 from surrogates import Quality
 
 # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3.
@@ -145,7 +145,7 @@ def _survives(verified: VerifiedSections) -> Line:
         "proof": proof.outcome.name.lower(),
         "proven": proof.levels,
     }
-    where = f"{verified.checked} plants of the box that [robust] names"
+    where = f"{counted(verified.checked, 'plant')} of the box that [robust] names"
     if not wide.passed:
         return Line(State.FAILED, f"on {where}: {wide.words}", figures)
     if proof.refuted:

@@ -26,6 +26,7 @@ from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced, transmission_zeros
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.units import counted
 from ccd_casadi.synthesis.norms import hinf_norm
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
@@ -109,7 +110,7 @@ def certify(
     elif lost:
         words = f"the peak of S on plant {lost[0]} is not confirmed by the level test"
     else:
-        words = f"stable and within every bound on {len(found)} plants"
+        words = f"stable and within every bound on {counted(len(found), 'plant')}"
     passed = not broken and not lost and bandwidth > 0.0
     return Certificate(passed, bandwidth, tuple(found), worst, words)
 

@@ -17,7 +17,7 @@ from ccd_casadi.reporting.sections_loops import Loops, gain_panels
 from ccd_casadi.reporting.signals import Moved, signals_of
 from ccd_casadi.reporting.svg import GREEN, GREY
 from ccd_casadi.robust.demands import Demands
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.classical_margins import classical_margins
 from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
@@ -85,8 +85,8 @@ def glance_of_sections(
     assert certificate is not None
     count, S_max = len(loops.S), problem.inner.S_max
     words = (
-        f"The machine at this design, and its loop on {count} plants of the set (blue: the model; "
-        f"band, green: the others). S stays below S_max = {S_max:g}"
+        f"The machine at this design, and its loop on {counted(count, 'plant')} of the set (blue: "
+        f"the model; band, green: the others). S stays below S_max = {S_max:g}"
     )
     tables = [Table(("Hz", "largest |S|"), tuple(
         (float(loops.hz[i]), float(np.abs(loops.S[:, i]).max()))

@@ -19,7 +19,7 @@ from ccd_casadi.reporting.loops import forbidden
 from ccd_casadi.reporting.page import Table, figure_html, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
     from ccd_casadi.codesign.sections_run import VerifiedSections
@@ -158,7 +158,7 @@ def gains_html(
             for i in sorted(set(rows))
         ),
     )  # fmt: skip
-    return figure_html(svg, f"The band spans {len(loops.S)} plants of the set.", table)
+    return figure_html(svg, f"The band spans {counted(len(loops.S), 'plant')} of the set.", table)
 
 
 def force_step_html(verified: "VerifiedSections") -> str:
@@ -184,5 +184,6 @@ def force_step_html(verified: "VerifiedSections") -> str:
     table = Table(("ms", "µm model", "µm least", "µm largest"), tuple(
         (1e3 * float(t[i]), float(y[0, i]), float(y[:, i].min()), float(y[:, i].max()))
         for i in rows))  # fmt: skip
-    words = f"A force of 1 N at the actuator moves {len(y)} plants of the set, until they rest."
+    moved = counted(len(y), "plant")
+    words = f"A force of 1 N at the actuator moves {moved} of the set, until they rest."
     return figure_html(svg, words, table)

@@ -19,7 +19,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.sections_loops import force_step_html, gains_html, loops_of
 from ccd_casadi.reporting.sections_move import move_html, move_panels
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
     from ccd_casadi.codesign.run import Solution
@@ -27,15 +27,21 @@ if TYPE_CHECKING:
 
 def sections_conclusion(result: dict[str, Any]) -> str:
     """One sentence with the key numbers."""
-    certificate, robust = result["certificate"], result["robust"]
     verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
     return (
         f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}: a "
         f"controller of order {result['controller']['order']} with a bandwidth of "
-        f"{number(result['bandwidth_hz'])} Hz on each of {certificate['plants']} plants, judged "
-        f"again on {robust['plants']} plants of the box, at a hardware cost of "
+        f"{number(result['bandwidth_hz'])} Hz on {_plants(result)}, at a hardware cost of "
         f"{cost_words(result)} (J = {number(result['objective'], 6)})."
     )
+
+
+def _plants(result: dict[str, Any]) -> str:
+    designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
+    if designed == judged == 1:
+        return "the model, the only plant of its set"
+    again = counted(judged, "plant")
+    return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
 def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Section]:
@@ -97,6 +103,7 @@ def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         return "none found" if value is None else f"{number(value, 4)} Hz"
 
     count = result["certificate"]["plants"]
+    whole = f"{counted(count, 'plant')} of the set"
     rows = [
         ("the model alone", "sampled" if sampled else "continuous",
          "–" if sampled else hz(model["bandwidth_hz"]), hz(found["sections_on_model_hz"])),
@@ -104,10 +111,10 @@ def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     if sampled:
         rows.insert(0, ("the model alone", "continuous", hz(model["bandwidth_hz"]), "–"))
         with_set = "–" if on_set is None else hz(on_set["bandwidth_hz"])
-        rows.append((f"{count} plants of the set", "continuous", with_set,
+        rows.append((whole, "continuous", with_set,
                      hz(found["sections_continuous_hz"])))  # fmt: skip
     own = "–" if sampled or on_set is None else hz(on_set["bandwidth_hz"])
-    rows.append((f"{count} plants of the set", "sampled" if sampled else "continuous", own,
+    rows.append((whole, "sampled" if sampled else "continuous", own,
                  hz(result["bandwidth_hz"])))  # fmt: skip
     head = ("designed for", "loop", "mixed sensitivity, full order", "sections")
     words = [f"Full order on the model: {_judged_words(model)}"]
@@ -134,7 +141,7 @@ def _judged_words(full: Mapping[str, Any]) -> str:
     if full["bandwidth_hz"] is None:
         return f"{full['words']}."
     words = f"{number(full['bandwidth_hz'], 4)} Hz, order {full['order']}, "
-    words += f"{full['words']}; judged on the {full['plants']} plants of the set it is "
+    words += f"{full['words']}; judged on {counted(full['plants'], 'plant')} of the set it is "
     if full["unstable"]:
         words += f"unstable on {full['unstable']}"
     else:
@@ -150,7 +157,8 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     runs = "continuous" if sampling is None else (
         f"{number(sampling.rate_hz)} Hz, {number(sampling.delay_us)} µs from measurement to force"
     )  # fmt: skip
-    worst = f"largest of {robust['plants']} plants of the box"
+    on = counted(certificate["plants"], "plant")
+    worst = f"largest of {counted(robust['plants'], 'plant')} of the box"
     kkt = r["kkt"]["stationarity"]
     of_error = sections_of_problem(problem).of_error
     predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
@@ -174,8 +182,8 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
          r["compliance_words"]),
         ("Largest |KS|", f"{number(r['KS_max'], 4)} N/m", ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
-         f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {certificate['plants']} "
-         f"plants, at most {number(certificate['norm'], 6)} of a bound"),
+         f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
+         f"at most {number(certificate['norm'], 6)} of a bound"),
         ("Over the box", "passed" if robust["passed"] else "FAILED",
          f"{robust['words']}; the worst that was searched is {100 * robust['worst_excess']:+.2g} % "
          f"of a bound; {r['proof']['words']}"),
@@ -183,7 +191,7 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),
         ("A full race at this θ", optima or "–",
-         f"local optima (searches); {r['rounds']} rounds of the outer problem"),
+         f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Units: SI inside, and the one factor that is everywhere."""
+"""Units and numbers in words: SI inside, and the one factor that is everywhere."""
 
 import math
 
@@ -17,3 +17,12 @@ def metres(value: float, digits: int = 3) -> str:
         if abs(value) * factor >= 1.0:
             return f"{factor * value:.{digits}g} {unit}"
     return f"{1e9 * value:.{digits}g} nm"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things.
+
+    >>> counted(1, "plant"), counted(5, "plant")
+    ('1 plant', '5 plants')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
