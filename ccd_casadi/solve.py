@@ -141,7 +141,8 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
-    from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
+    from ccd_casadi.cases.diagnosis import diagnose, first_seen
+    from ccd_casadi.cases.findings import Severity, Topic
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import SHIPPED

@@ -11,7 +11,8 @@ from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget, error_budget
 from ccd_casadi.cases.checks import closest, shown
-from ccd_casadi.cases.diagnosis import Severity, diagnose
+from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import (
     check_kind,
     disturbance_of,
@@ -27,8 +28,9 @@ from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import DATA, SHIPPED
-from ccd_casadi.support.errors import PlantError, UserError, described, one_line
+from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.units import HZ
+from surrogates.options import one_line
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.channels import Channel, split
 from ccd_casadi.deployment.discretise import (
@@ -40,6 +39,7 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 

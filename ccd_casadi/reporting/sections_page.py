@@ -22,7 +22,7 @@ from ccd_casadi.reporting.sections_move import move_html, move_panels
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.codesign.solution import Solution
 
 
 def sections_conclusion(result: dict[str, Any]) -> str:
