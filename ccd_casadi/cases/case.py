@@ -45,6 +45,16 @@ _ORDERED_WEIGHTS = (
     ("A_S", "M_S", "W_S asks for more at low frequency"),
     ("A_u", "A_l", "W_T asks for a roll-off"),
 )
+# What is one number for all channels, and where those of single channels go.
+_OF_THE_WHOLE = {
+    ("inner", "S_max"),
+    ("controller", "weighted_level"),
+    *(("weights", item.name) for item in fields(SECTIONS["weights"])),
+}
+_PER_CHANNEL = (
+    "give one number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
+    '[controller.channel.NAME] with controller.structure = "sections"'
+)
 
 
 def load_case(path: str | Path) -> Case:
@@ -157,6 +167,8 @@ def section_of(
                 raise fail(f"{name}.{key}", "is missing; add it")
             continue
         wrong = item.metadata["check"](table[key])
+        if wrong is not None and isinstance(table[key], list) and (name, key) in _OF_THE_WHOLE:
+            wrong = f"is {shown(table[key])}; {_PER_CHANNEL}"
         if wrong is not None:
             raise fail(f"{name}.{key}", wrong)
         value = table[key]

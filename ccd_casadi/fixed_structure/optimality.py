@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
+from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.figures import to_theta
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.support.arrays import Array
 
@@ -24,10 +25,12 @@ class Optimality:
     """What binds, its multipliers (change of ln ω_b per ln of a bound), the residual over ‖∇τ‖,
     and by how much a bound is passed (logarithm).
 
-    `ends` are the parameters at an end of their box, as (name, "lower" or "upper", multiplier).
+    `kinds` names the bound of each that is active; `ends` are the parameters at an end of their
+    box, as (name, "lower" or "upper", multiplier).
     """
 
     active: Constraints
+    kinds: tuple[str, ...]
     multipliers: Array
     ends: tuple[tuple[str, str, float], ...]
     residual: float
@@ -36,9 +39,8 @@ class Optimality:
     def named(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
         found: dict[str, float] = {}
-        for code, mu in zip(self.active.curve, self.multipliers, strict=True):
+        for name, mu in zip(self.kinds, self.multipliers, strict=True):
             if mu > 0.0:
-                name = Curve(int(code)).name
                 found[name] = found.get(name, 0.0) + float(mu)
         return found
 
@@ -59,12 +61,13 @@ def optimality(problem: LoopProblem, point: Point) -> Optimality:
     matrix = np.concatenate(columns).T
     goal = np.eye(n + 1)[n]
     if matrix.shape[1] == 0:
-        return Optimality(active, np.zeros(0), (), 1.0, point.assessment.violation)
+        return Optimality(active, (), np.zeros(0), (), 1.0, point.assessment.violation)
     mu, _ = nnls(matrix, goal, maxiter=100 * matrix.shape[1])
     residual = float(np.abs(matrix @ mu - goal).max())
     count = len(active.v)
     found = tuple((*end, float(value)) for end, value in zip(ends, mu[count:], strict=True))
-    return Optimality(active, mu[:count], found, residual, point.assessment.violation)
+    kinds = tuple(kinds_of_rows(problem, active))
+    return Optimality(active, kinds, mu[:count], found, residual, point.assessment.violation)
 
 
 def log_bandwidth_gradient(problem: LoopProblem, kappa: Array, found: Optimality) -> Array:
