@@ -1,19 +1,23 @@
 """The beam of the examples: one axis tighter than the other, as docs and README tell it."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccd_casadi.cases.case import parse_case, problem_of
 from ccd_casadi.codesign.sections_result import active_of, design_dict
+from ccd_casadi.codesign.sections_truth import sections_kkt
 from ccd_casadi.deployment.as_designed import _require_own_bounds
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.sections_bandwidth import prepared
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value
 from ccd_casadi.inner_problem.sections_words import channel_words
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.errors import UserError
 
 ROOT = Path(__file__).parent.parent
@@ -58,6 +62,31 @@ def test_the_table_of_the_docs(
         assert "(S_max 1.5)" in channel_words(own)
         assert "(at least 1.25 omega_b)" in channel_words(own)
         assert ("S_max of channel tilt" in active_of(made)) == bool(plants)
+
+
+def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
+    """ω_b*(h) is the least of two: an optimum at their kink is seen to be one."""
+    problem = prepared(problem_of(parse_case(case(), CASE)))[0]
+
+    def sample(h: float) -> BandwidthSample:
+        value = sections_value(problem, (h,))
+        return BandwidthSample((h,), value.bandwidth, value.gradient, np.nan, np.nan, (), "", 0.0,
+                               1, channels=value.channels)  # fmt: skip
+
+    h = 0.01992
+    (lift, down), (tilt, up) = sample(h).channels
+    step = (lift - tilt) / (up[0] - down[0])
+    assert 0.0 < step < 1e-4
+    kink, beside = sample(h + step), sample(h + step + 1e-5)
+    (at_lift, _), (at_tilt, slope) = kink.channels
+    assert at_lift == pytest.approx(at_tilt, rel=1e-5)
+    assert at_tilt - tilt == pytest.approx(slope[0] * step, rel=1e-3)  # the gradient is the slope
+    assert kink.bandwidth == pytest.approx(min(at_lift, at_tilt), rel=1e-6)
+    assert sections_kkt(problem, kink).stationarity < 1e-6
+    assert sections_kkt(problem, replace(kink, channels=())).stationarity == 1.0
+    assert sections_kkt(problem, beside).stationarity == 1.0
+    dearer = replace(problem, w1=1e3 * problem.w1)  # no balance of the two makes up for that
+    assert sections_kkt(dearer, kink).stationarity > 0.9
 
 
 def test_what_is_judged_as_designed_is_deployed_as_designed() -> None:

@@ -2,12 +2,15 @@
 
     min  w1 f(θ) + w2 ω_b*(θ)   s.t.  θ_min <= θ <= θ_max,  λ(θ) <= 0
 
-or w1 f(θ) + w2 e*(θ), w2 > 0, where the inner problem minimises the RMS error e in m.
+or w1 f(θ) + w2 e*(θ), w2 > 0, where the inner problem minimises the RMS error e in m. Where
+channels are designed on their own ω_b* is the least of theirs, and an optimum may lie where two are
+equal: stationary there is a convex combination of their gradients.
 
 Every evaluation is a design that the judge confirms, with its envelope gradient, or NaN.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -32,6 +35,7 @@ from surrogates import design
 
 STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
+KINK = 1e-4  # relative: channels whose bandwidths are so close count as equal
 SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
 
 
@@ -155,21 +159,42 @@ def sections_kkt(
     size = max(float(np.abs(gradient).max()), 1e-300)
     A = np.array(rows).reshape(-1, theta.size)
     mu = nnls(A.T, -gradient)[0] if rows else np.zeros(0)
-    residual = gradient + A.T @ mu
-    Z = null_space(A[mu > 0.0]) if (mu > 0.0).any() else np.eye(theta.size)
+    residual, level, apart = gradient + A.T @ mu, np.zeros((0, theta.size)), 0.0
+    equal = [own for own in sample.channels if own[0] <= (1.0 + KINK) * sample.bandwidth]
+    if len(equal) > 1 and np.abs(residual).max() > STATIONARY * size:
+        each = np.array([gradient_at(replace(sample, gradient=slope)) for _, slope in equal])
+        share, mu = _combined(each, A, size)
+        residual = share @ each + A.T @ mu
+        held = np.array([slope for _, slope in equal])[share > 0.0] * width
+        level = held[1:] - held[0]  # along the kink these stay equal
+        past = np.array([value for value, _ in equal]) - sample.bandwidth
+        apart = float(np.abs(problem.w2 * share * past).max())
+    bound = np.vstack([A[mu > 0.0], level])
+    Z = null_space(bound) if len(bound) else np.eye(theta.size)
     second: float | None = np.inf if Z.shape[1] == 0 else None
-    if second is None and truth is not None:
+    if second is None and truth is not None and not len(level):
         second = _second(problem, truth, theta, Z, size, gradient_at)
     primal = max(0.0, *(-np.minimum(theta - lower, upper - theta) / width), *values, 0.0)
     return KktCertificate(
         stationarity=float(np.abs(residual).max()) / size,
         primal=float(primal),
-        complementarity=float(np.abs(mu * np.array(slack)).max(initial=0.0)) / size,
+        complementarity=float(np.abs(mu * np.array(slack)).max(initial=apart)) / size,
         multipliers={name: float(value) for name, value in zip(labels, mu, strict=True)},
         active=tuple(labels),
         second_order=second,
         objective_gradient=tuple(map(float, gradient)),
     )
+
+
+def _combined(gradients: Array, A: Array, size: float) -> tuple[Array, Array]:
+    """Shares α >= 0 of sum 1 and μ >= 0 with the least ‖Σ α_i ∇J_i + Aᵀμ‖."""
+    heavy = 1e4 * size  # what a row of a least-squares problem weighs that has to be met
+    columns = np.hstack([gradients.T, A.T])
+    total = heavy * (np.arange(columns.shape[1]) < len(gradients))
+    goal = np.append(np.zeros(len(columns)), heavy)
+    found = nnls(np.vstack([columns, total]), goal)[0]
+    share = found[: len(gradients)]
+    return share / share.sum(), found[len(gradients) :] / share.sum()
 
 
 def _second(

@@ -15,7 +15,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
-from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
+from ccd_casadi.fixed_structure.composite import (
+    CompositeProblem,
+    composite_problem,
+    kinds_of_rows,
+)
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
@@ -210,6 +214,35 @@ def bandwidth_and_gradient(
     found = optimality(problem, _at_the_bounds(problem, kappa, tau))
     slope = log_bandwidth_gradient(problem, kappa, found)
     return design.bandwidth, design.bandwidth * slope
+
+
+def channel_bandwidths(
+    plants: Sequence[ScaledPlant],
+    bounds: Bounds,
+    design: SectionsDesign,
+    sampling: Sampling | None = None,
+) -> tuple[tuple[float, Array], ...]:
+    """What ω_b* is the least of, in rad/s with gradients: of each channel its own over its ratio.
+
+    Of channels that nothing couples and that share no parameters; elsewhere none. Only those within
+    `LOWER_AT_MOST` of the least: where two are equal ω_b*(θ) has a kink.
+    """
+    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
+    if not isinstance(problem, CompositeProblem) or not problem.separable:
+        return ()
+    if len(problem.parts) != len(problem.structure.free):
+        return ()
+    kappa = in_problem_units(problem, design.kappa)
+    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
+    found = []
+    for part in problem.parts:
+        point = _at_the_bounds(part.problem, kappa[part.place], tau + part.lead)
+        optimum = optimality(part.problem, point)
+        slope = log_bandwidth_gradient(part.problem, point.kappa, optimum)
+        value = float(np.exp(point.tau - part.lead)) * problem.plants.omega_0
+        if np.isfinite(slope).all():
+            found.append((value, value * slope))
+    return tuple(found)
 
 
 def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:

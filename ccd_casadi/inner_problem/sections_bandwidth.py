@@ -13,7 +13,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign, bandwidth_and_gradient
 from ccd_casadi.fixed_structure.channel_design import synthesise
-from ccd_casadi.fixed_structure.design import Progress, SectionsOutcome
+from ccd_casadi.fixed_structure.design import Progress, SectionsOutcome, channel_bandwidths
 from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
@@ -46,7 +46,9 @@ class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
     Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
-    that of the design. `syntheses`: climbs from anchors and races that it took.
+    that of the design. `channels`: bandwidths of channels on their own, over their ratios, with
+    their gradients, that ω_b* is the least of and that are close to it. `syntheses`: climbs from
+    anchors and races that it took.
     """
 
     theta: tuple[float, ...]
@@ -55,6 +57,7 @@ class SectionsValue:
     design: SectionsDesign
     syntheses: int
     error: float = float("nan")
+    channels: tuple[tuple[float, tuple[float, ...]], ...] = ()
 
     @property
     def feasible(self) -> bool:
@@ -94,14 +97,17 @@ def valued(
     """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least error."""
     point = tuple(float(v) for v in theta)
     bandwidth, error, gradient = np.nan, np.nan, np.full(len(point), np.nan)
+    channels: tuple[tuple[float, Array], ...] = ()
     if made.certified and sections_of_problem(problem).of_error:
         made, error, gradient = _least_error(problem, plants, made)
         bandwidth = made.bandwidth if made.certified else np.nan
     elif made.certified:
-        sampling = sections_of_problem(problem).sampling
-        bandwidth, gradient = bandwidth_and_gradient(plants, bounds_of(problem), made, sampling)
+        loops = plants, bounds_of(problem), made, sections_of_problem(problem).sampling
+        bandwidth, gradient = bandwidth_and_gradient(*loops)
+        channels = channel_bandwidths(*loops)
     slope = tuple(map(float, gradient))
-    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error))
+    own = tuple((value, tuple(map(float, slopes))) for value, slopes in channels)
+    return SectionsValue(point, float(bandwidth), slope, made, spent, float(error), own)
 
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:

@@ -17,6 +17,7 @@ class BandwidthSample:
 
     An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
     `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
+    `channels`: values and gradients that ω_b* is the least of, where they are known.
     """
 
     theta: tuple[float, ...]
@@ -30,6 +31,7 @@ class BandwidthSample:
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
     error: float | None = None
+    channels: tuple[tuple[float, tuple[float, ...]], ...] = ()
 
     @property
     def value(self) -> float:
@@ -104,6 +106,7 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
     sized = ("bandwidth",) if kappa is not None else ("bandwidth", "omega_S", "omega_T")
     positive = [payload[key] for key in sized] if feasible else []
     violation, syntheses = payload["violation"], payload["syntheses"]
+    channels = tuple((own, tuple(slope)) for own, slope in payload.get("channels", ()))
     if (
         len(gradient) != len(theta)
         or not all(v is None or type(v) is float for v in gradient)
@@ -113,6 +116,8 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
         or type(syntheses) is not int
         or not all(type(v) is float for v in kappa or ())
         or not (error is None or (type(error) is float and error > 0.0))
+        or not all(len(slope) == len(theta) for _, slope in channels)
+        or not all(type(v) is float for own, slope in channels for v in (own, *slope))
     ):
         raise ValueError("a stored result holds what none is made of")
     return BandwidthSample(
@@ -127,6 +132,7 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
         syntheses=syntheses,
         kappa=tuple(kappa or ()),
         error=error,
+        channels=channels,
     )
 
 

@@ -93,6 +93,7 @@ def sections_unit(
         "gradient": [_number(v) for v in value.gradient] if value.feasible else None,
         "kappa": [float(v) for v in design.kappa] if value.feasible else [],
         "error": _number(value.error),
+        "channels": [[own, list(slope)] for own, slope in value.channels],
         "active": sorted(name for name, mu in design.multipliers.items() if mu > 0.0),
         "shortfall": "" if value.feasible else design.words,
         "violation": _number(np.log(max(design.short.values()))) if design.short else None,
