@@ -41,7 +41,8 @@ def case(tilt: dict[str, float] | None = None, plants: tuple[str, ...] = ()) -> 
         (None, (), "| S_max 1.5, bandwidth_ratio 1.25 (the case) | {} | {} | {} |"),
         ({"S_max": 1.5, "bandwidth_ratio": 2.5}, (),
          "| S_max 1.5, bandwidth_ratio 2.5 | {} | {} | {} |"),
-        (None, ("off_centre.toml",), '(`plants = ["off_centre.toml"]`) | {} | {} | {} |'),
+        (None, ("plants/off_centre.toml",),
+         '`plants = ["plants/off_centre.toml"]`) | {} | {} | {} |'),
     ],
 )  # fmt: skip
 def test_the_table_of_the_docs(

@@ -324,9 +324,9 @@ def test_mistakes_about_own_bounds_are_told(
 
 @pytest.mark.parametrize("key", ["inner.S_max", "weights.M_S", "controller.weighted_level"])
 def test_a_list_for_all_channels_is_refused_with_the_way(key: str) -> None:
-    """Of mixed sensitivity and of sections alike: one number, and where a channel's own goes."""
+    """Of mixed sensitivity and of sections alike: a number, and where a channel's own goes."""
     table, name = key.split(".")
     data = tomllib.loads(TWO_MASS.read_text())
     data.setdefault(table, {})[name] = [1.5, 1.7]
-    with pytest.raises(CaseError, match=rf"{key}: is \[1.5, 1.7\]; give one number.*channel.NAME"):
+    with pytest.raises(CaseError, match=rf"{key}: is \[1.5, 1.7\]; give a number.*channel.NAME"):
         parse_case(data)

@@ -52,7 +52,7 @@ _OF_THE_WHOLE = {
     *(("weights", item.name) for item in fields(SECTIONS["weights"])),
 }
 _PER_CHANNEL = (
-    "give one number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
+    "give a number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
     '[controller.channel.NAME] with controller.structure = "sections"'
 )
 
