@@ -92,7 +92,7 @@ def _gains(controller: Mapping[str, Any]) -> str:
 def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
     from ccd_casadi.codesign.budget_result import budget_lines
-    from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words
     from ccd_casadi.reporting.verdict import terminal_lines
     from ccd_casadi.support.units import counted
 
@@ -108,6 +108,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
         f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
         f"compliance    {result['compliance_words']}",
         f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
         f"{counted(certificate['plants'], 'plant')}: {certificate['norm']:.7g} of a bound at most, "
@@ -142,7 +143,8 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
-    from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose, first_seen
+    from ccd_casadi.cases.diagnosis import diagnose, first_seen
+    from ccd_casadi.cases.findings import Severity, Topic
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import SHIPPED

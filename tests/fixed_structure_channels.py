@@ -14,7 +14,8 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.decoupling import find_decoupling
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
-from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
+from ccd_casadi.fixed_structure.mimo_figures import evaluate_rows, whole_constraints
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -19,7 +19,8 @@ from helpers import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.kernels.certificate import level_test, stack_norm, weighted_loop
+from ccd_casadi.kernels.certificate import level_test, stack_norm
+from ccd_casadi.kernels.closed_loop import weighted_loop
 from ccd_casadi.kernels.design import certificate_grid
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace

@@ -1,6 +1,7 @@
 """‖GS‖∞ of full-order controllers: measured, differentiated, and a bound of the inner problem."""
 
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -131,11 +132,11 @@ def test_a_store_of_before_gains_its_column(tmp_path: Path) -> None:
     path = tmp_path / "samples.sqlite"
     with SampleStore(path):
         pass
-    with sqlite3.connect(path) as db:
+    with closing(sqlite3.connect(path)) as db, db:
         db.execute("alter table samples drop column compliance")
     with SampleStore(path) as store:
         assert store.select() == []
-    with sqlite3.connect(path) as db:
+    with closing(sqlite3.connect(path)) as db, db:
         assert "compliance" in {row[1] for row in db.execute("pragma table_info(samples)")}
 
 

@@ -16,17 +16,16 @@ from scipy.linalg import block_diag
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.channels import assemble, split
-from ccd_casadi.deployment.discretise import Discretisation
-from ccd_casadi.deployment.pipeline import Timing, deploy
+from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.reduction import Limits, Reduction, reductions, smallest
+from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure, responses
 from ccd_casadi.synthesis.interchange import read_mat
-from ccd_casadi.synthesis.synthesis import Design, synthesise
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, synthesise
 
 ROOT = Path(__file__).parent.parent
 QUICK = ["--method", "foh", "--lead", "on", "--quiet"]

@@ -13,8 +13,10 @@ from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict
-from ccd_casadi.deployment.pipeline import Deployment, Timing, deploy
+from ccd_casadi.deployment.outcome import Deployment
+from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant

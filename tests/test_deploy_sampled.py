@@ -9,14 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ccd_casadi.deployment.discretise import (
-    Conversion,
-    Discretisation,
-    Target,
-    discretise,
-    needed_rate,
-    nice_rate,
-)
+from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
 from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
     SampledFigures,
@@ -26,6 +19,7 @@ from ccd_casadi.deployment.sampled import (
     together,
 )
 from ccd_casadi.deployment.simulation import measure_sensitivity, simulate
+from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.plants.scaling import StateSpace
 
 HZ = 2.0 * np.pi

@@ -8,7 +8,8 @@ import pytest
 from scipy.integrate import quad
 
 from ccd_casadi.cases.case import CaseError, load_case, problem_of
-from ccd_casadi.cases.diagnosis import Severity, Topic, diagnose
+from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.cases.findings import Severity, Topic
 from ccd_casadi.check import main as check
 from ccd_casadi.plants.facts import Zero
 from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz

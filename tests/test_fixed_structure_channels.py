@@ -29,13 +29,15 @@ from ccd_casadi.fixed_structure.decoupling import (
 )
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
-from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, evaluate_rows, whole_constraints
+from ccd_casadi.fixed_structure.mimo_figures import evaluate_rows, whole_constraints
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.fixed_structure.peak_search import closed_on_zero
 from ccd_casadi.support.errors import PlantError
 
 SKEWED = given_decoupling(("a", "b", "c"), [[1, 0.2, 0], [0, 1, 0.1], [0.1, 0, 1]],
                           [[1, 0, 0.1], [0.1, 1, 0], [0, 0.1, 1]])  # fmt: skip
+ONE = SimpleNamespace(plants=(None,))
 
 
 def whole(problem, sampling: Sampling | None, off: float = 0.3, theta=(1.0, 1.0)) -> MatrixProblem:
@@ -189,8 +191,8 @@ def test_a_maximum_beside_a_crossing_of_singular_values_is_found(
         one, other = (top - 2e3 * (v - at) ** 2 for at, top in ((1.0, 0.0), (1.01, 0.05)))
         return {Curve.T: np.sort(np.stack([one, other], axis=-1))[..., ::-1]}
 
-    monkeypatch.setattr(mimo_figures, "_levels", levels)
-    problem = cast(MatrixProblem, SimpleNamespace(plants=SimpleNamespace(plants=(None,))))
+    monkeypatch.setattr(mimo_figures, "levels", levels)
+    problem = cast(MatrixProblem, SimpleNamespace(plants=ONE, own=SimpleNamespace(first=2)))
     # the grid's own largest sigma_1 is elsewhere; sigma_2 is largest where the two cross
     brackets = (np.full(2, Curve.T), np.array([0, 1]), np.array([1.0, 1.004]),
                 np.array([0.99, 1.0]), np.array([1.004, 1.03]))  # fmt: skip
@@ -222,8 +224,8 @@ def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
     def slope(x: np.ndarray, of: np.ndarray) -> np.ndarray:
         return (largest(np.exp(x + 1e-7)) - largest(np.exp(x - 1e-7))) / 2e-7
 
-    monkeypatch.setattr(mimo_figures, "_levels", levels)
-    problem = cast(MatrixProblem, SimpleNamespace(plants=SimpleNamespace(plants=(None,))))
+    monkeypatch.setattr(mimo_figures, "levels", levels)
+    problem = cast(MatrixProblem, SimpleNamespace(plants=ONE, own=SimpleNamespace(first=1)))
     low, start, high = (np.array([v]) for v in (0.99, 0.9985, 1.0145))
     assert largest(start) > max(largest(low), largest(high))
     assert not closed_on_zero(slope, start, low, high)[1].any()

@@ -7,8 +7,9 @@ import pytest
 from differences import slopes
 from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, loop, plant
 
-from ccd_casadi.deployment.discretise import Conversion, Discretisation, discretise
+from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian

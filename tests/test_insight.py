@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,8 +40,9 @@ def own_problem(folder: Path, cost: str) -> CoDesignProblem:
 
 
 @pytest.fixture
-def truth_of(tmp_path: Path) -> Callable[[CoDesignProblem], Sampler]:
-    return lambda problem: Sampler(problem, SampleStore(tmp_path / "samples.sqlite"), Workers(1))
+def truth_of(tmp_path: Path) -> Iterator[Callable[[CoDesignProblem], Sampler]]:
+    with SampleStore(tmp_path / "samples.sqlite") as store:
+        yield lambda problem: Sampler(problem, store, Workers(1))
 
 
 def optimum(sampler: Sampler, start: Array) -> Array:

@@ -10,7 +10,6 @@ import scipy.io
 from helpers import FlexibleCase, flexible_case
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.synthesis.closed_loop import measure
@@ -25,7 +24,7 @@ from ccd_casadi.synthesis.interchange import (
     to_control,
     write_mat,
 )
-from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
 
 OMEGA_LOW = 2.0 * np.pi
 

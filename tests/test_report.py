@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from commands import changed
 
-from ccd_casadi.cases.case import Case, load_case, problem_of
+from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.run import co_design, formulation_of
 from ccd_casadi.codesign.solution import Solution

@@ -3,7 +3,7 @@
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,7 @@ def test_a_copy_is_retrained_and_the_run_left_alone(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     installed(Camel)
-    with sqlite3.connect(camel_copy / "samples.sqlite") as database:
+    with closing(sqlite3.connect(camel_copy / "samples.sqlite")) as database, database:
         database.execute("create table t (x)")
         database.execute("insert into t values (7)")
     before = {path.name: path.read_bytes() for path in camel_copy.glob("*") if path.is_file()}
@@ -147,7 +147,7 @@ def test_a_copy_is_retrained_and_the_run_left_alone(
     assert after == before
     assert entries(out)[: len(entries(camel_copy))] == entries(camel_copy)
     assert [e["event"] for e in entries(out)][-4:] == ["start", "end", "start", "end"]
-    with sqlite3.connect(out / "samples.sqlite") as database:
+    with closing(sqlite3.connect(out / "samples.sqlite")) as database, database:
         assert database.execute("select x from t").fetchall() == [(7,)]
 
 

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +142,7 @@ def test_a_nested_run_is_retrained_over_theta(tmp_path: Path) -> None:
     words = [str(without_look(tmp_path)), "--out", str(folder), "--workers", "1", "--quiet"]
     words += ["--no-report"]
     assert solve([*words, "--surrogate", "0001"]) == 0
-    with sqlite3.connect(folder / "samples.sqlite") as database:
+    with closing(sqlite3.connect(folder / "samples.sqlite")) as database, database:
         (after,) = database.execute("select count(*) from samples").fetchone()
     assert after <= count + 200, "its thetas were found in the store"
 
@@ -196,7 +197,7 @@ def launched(folder: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def keys(folder: Path) -> list[str]:
-    with sqlite3.connect(folder / "samples.sqlite") as database:
+    with closing(sqlite3.connect(folder / "samples.sqlite")) as database, database:
         return [row[0] for row in database.execute("select key from samples")]
 
 

@@ -18,6 +18,7 @@ from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import StateSpace, scale_plant
 from ccd_casadi.reporting.robustness_page import _bandwidth_lost, conclusion, robustness_html
+from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
 from ccd_casadi.robust.perturbed import (
@@ -29,7 +30,7 @@ from ccd_casadi.robust.perturbed import (
 )
 from ccd_casadi.robust.signals import closed_loop, gains, noise
 from ccd_casadi.robust.structured import structured_bound
-from ccd_casadi.robust.study import Demands, study_dict, tried, with_structured_bound
+from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
 from ccd_casadi.robustness import main
 from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.interchange import named_controller, named_plant, to_control

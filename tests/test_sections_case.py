@@ -1,5 +1,6 @@
 """The case file of a fixed structure: its keys, its mistakes, and that today's cases stay."""
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from case_documents import TWO_MASS
 from helpers import SUSPENSION, random_plant
 
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -263,3 +264,69 @@ def test_a_channel_is_like_one_with_parameters_of_its_own(
 ) -> None:
     with pytest.raises(CaseError, match=words):
         two_axes(tmp_path, added)
+
+
+CHANNELS = ("[controller.channel.a]\noutputs = [1, 0]", "[controller.channel.b]\noutputs = [0, 2]")
+
+
+def test_bounds_of_a_channels_own(tmp_path: Path) -> None:
+    """In its unit direction, round trip, in the samples' keys; what is not tighter is none."""
+    level = "weighted_level = 8.0\n"
+    case = two_axes(
+        tmp_path, level, CHANNELS[0], CHANNELS[1], "S_max = 1.5\nM_K = 1e7\nbandwidth_ratio = 2"
+    )
+    again = tmp_path / "again.toml"
+    again.write_text(case_to_toml(case))
+    assert replace(load_case(again), path=case.path) == case
+    problem = problem_of(case)
+    first, own = bounds_of(problem).channels
+    assert not first.given
+    assert (own.name, own.output, own.force) == ("b", (0.0, 1.0), (0.0, 1.0))
+    assert (own.S_max, own.M_K, own.bandwidth_ratio) == (1.5, 1e7, 2.0)
+    lower = replace(problem, inner=replace(problem.inner, S_max=1.4))  # a slider of the explorer
+    assert bounds_of(lower).channels[1].S_max is None
+    plain = problem_of(two_axes(tmp_path, level, *CHANNELS))
+    whole = f"S_max = {case.inner.S_max}\nM_K = {case.weights.M_K}\nbandwidth_ratio = 1.0"
+    equal = problem_of(two_axes(tmp_path, level, *CHANNELS, whole))
+    assert bounds_of(equal) == bounds_of(plain)
+    assert bounds_of(plain).channels == ()
+    assert problem_hash(plain.identity()) != problem_hash(problem.identity())
+    given = plain.identity()["sections"]["channels"]  # type: ignore[index]
+    assert set(given[0]) == {"name", "structure", "outputs", "inputs"}
+
+
+def test_a_channel_like_another_has_its_bounds(tmp_path: Path) -> None:
+    case = two_axes(tmp_path, CHANNELS[0], "S_max = 1.5", CHANNELS[1], 'like = "a"')
+    rows = bounds_of(problem_of(case)).channels
+    assert [own.S_max for own in rows] == [1.5, 1.5]
+    assert rows[0].output != rows[1].output
+
+
+@pytest.mark.parametrize(
+    ("words", "added"),
+    [
+        ("b.S_max: is 1.8, above inner.S_max = 1.75", (*CHANNELS, "S_max = 1.8")),
+        ("b.S_max: is 1; give more than 1", (*CHANNELS, "S_max = 1.0")),
+        ("b.M_K: is 1e\\+09, above weights.M_K", (*CHANNELS, "M_K = 1e9")),
+        ("b.M_K: has an effect on a bounded KS only", (*CHANNELS, "M_K = 1e6")),
+        ("b.bandwidth_ratio: is 0.5; give 1 or more", (*CHANNELS, "bandwidth_ratio = 0.5")),
+        ("every one of its channels has a bandwidth_ratio",
+         (CHANNELS[0], "bandwidth_ratio = 2", CHANNELS[1], "bandwidth_ratio = 3")),
+        ("b.S_max: is given by like", (*CHANNELS, 'like = "a"\nS_max = 1.5')),
+    ],
+)  # fmt: skip
+def test_mistakes_about_own_bounds_are_told(
+    tmp_path: Path, words: str, added: tuple[str, ...]
+) -> None:
+    with pytest.raises(CaseError, match=words):
+        problem_of(two_axes(tmp_path, *added))
+
+
+@pytest.mark.parametrize("key", ["inner.S_max", "weights.M_S", "controller.weighted_level"])
+def test_a_list_for_all_channels_is_refused_with_the_way(key: str) -> None:
+    """Of mixed sensitivity and of sections alike: a number, and where a channel's own goes."""
+    table, name = key.split(".")
+    data = tomllib.loads(TWO_MASS.read_text())
+    data.setdefault(table, {})[name] = [1.5, 1.7]
+    with pytest.raises(CaseError, match=rf"{key}: is \[1.5, 1.7\]; give a number.*channel.NAME"):
+        parse_case(data)

@@ -16,7 +16,8 @@ from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
-from ccd_casadi.deployment.pipeline import Timing, deploy
+from ccd_casadi.deployment.pipeline import deploy
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, kept

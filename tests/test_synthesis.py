@@ -29,8 +29,9 @@ from hypothesis import strategies as st
 
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics, mechanics
+from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.synthesis.backends.mixed import synthesise_with
-from ccd_casadi.synthesis.synthesis import Design, Outcome, StateSpace, sweep, synthesise
+from ccd_casadi.synthesis.synthesis import Design, Outcome, sweep, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 LIMITED = (6, 22, 23, 30, 34, 47, 56)  # seeds of flexible_case that γ_jω limits

@@ -18,7 +18,7 @@ from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
-from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
 from ccd_casadi.support.errors import PlantError

@@ -11,7 +11,8 @@ from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget, error_budget
 from ccd_casadi.cases.checks import closest, shown
-from ccd_casadi.cases.diagnosis import Severity, diagnose
+from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import (
     check_kind,
     disturbance_of,
@@ -27,8 +28,9 @@ from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import DATA, SHIPPED
-from ccd_casadi.support.errors import PlantError, UserError, described, one_line
+from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.units import HZ
+from surrogates.options import one_line
 
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
@@ -42,6 +44,16 @@ class CaseError(UserError):
 _ORDERED_WEIGHTS = (
     ("A_S", "M_S", "W_S asks for more at low frequency"),
     ("A_u", "A_l", "W_T asks for a roll-off"),
+)
+# What is one number for all channels, and where those of single channels go.
+_OF_THE_WHOLE = {
+    ("inner", "S_max"),
+    ("controller", "weighted_level"),
+    *(("weights", item.name) for item in fields(SECTIONS["weights"])),
+}
+_PER_CHANNEL = (
+    "give a number, the whole loop's: S_max, M_K and bandwidth_ratio of a channel go in a table "
+    '[controller.channel.NAME] with controller.structure = "sections"'
 )
 
 
@@ -155,6 +167,8 @@ def section_of(
                 raise fail(f"{name}.{key}", "is missing; add it")
             continue
         wrong = item.metadata["check"](table[key])
+        if wrong is not None and isinstance(table[key], list) and (name, key) in _OF_THE_WHOLE:
+            wrong = f"is {shown(table[key])}; {_PER_CHANNEL}"
         if wrong is not None:
             raise fail(f"{name}.{key}", wrong)
         value = table[key]

@@ -10,9 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from ccd_casadi.cases.findings import Finding as Finding
-from ccd_casadi.cases.findings import Severity as Severity
-from ccd_casadi.cases.findings import Topic as Topic
+from ccd_casadi.cases.findings import Finding, Severity, Topic
 from ccd_casadi.cases.unit_findings import unit_findings
 from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of

@@ -9,6 +9,7 @@ from typing import Any
 from ccd_casadi.budget import Kind
 from ccd_casadi.cases.sections import (
     Case,
+    ChannelSection,
     ControllerSection,
     InnerSection,
     LoopSection,
@@ -38,6 +39,8 @@ _OF_SECTIONS = {
     "robust": ("mode_shift", "gain", "plants"),
     "inner": ("shape", "minimise", "bandwidth_least_hz"),
 }
+# What [controller.channel.NAME] bounds besides the whole loop.
+_OF_CHANNELS = ("S_max", "M_K", "bandwidth_ratio")
 _OF_H_INFINITY = {
     "robust": ("shifts", "design_at"),
     "inner": ("gamma_backoff", "sweep_points", "method"),
@@ -98,9 +101,18 @@ def check_kind(sections: Mapping[str, Any], fail: Callable[[str, str], Exception
             if own.like == name or own.like not in others or others[own.like].like is not None:
                 words = f"is {own.like!r}; name a channel with a table and parameters of its own"
                 raise fail(f"controller.channel.{name}.like", words)
-            for key in (item.name for item in fields(Structure)):
-                if getattr(own, key) is not None:
+            for key in (*(item.name for item in fields(Structure)), *_OF_CHANNELS):
+                if getattr(own, key) != getattr(ChannelSection, key, None):
                     raise fail(f"controller.channel.{name}.{key}", "is given by like; drop it")
+        for key, where in (("S_max", "inner"), ("M_K", "weights")):
+            asked, whole = getattr(own, key), getattr(sections[where], key)
+            if asked is not None and asked > whole:
+                words = f"is {asked:g}, above {where}.{key} = {whole:g}, which the whole loop keeps"
+                remedy = f"give less, or raise {where}.{key} to that of the loosest channel"
+                raise fail(f"controller.channel.{name}.{key}", f"{words}; {remedy}")
+        if own.M_K is not None and controller.weighted_level is None:
+            words = "has an effect on a bounded KS only; give controller.weighted_level, or drop it"
+            raise fail(f"controller.channel.{name}.M_K", words)
     if len(sections["robust"].plants) > MOST_PLANTS:
         raise fail("robust.plants", f"names more than {MOST_PLANTS} files; name the extreme ones")
 
@@ -187,6 +199,9 @@ def require_channels(plants: Sequence[Plant], sections: SectionsProblem) -> None
         found = [channel.name for channel in sections.channels]
         if p == 1:
             raise PlantError("has one output: drop the tables [controller.channel]")
+        if len(found) == p and all(c.bandwidth_ratio > 1.0 for c in sections.channels):
+            words = "every one of its channels has a bandwidth_ratio above 1; drop it at the"
+            raise PlantError(f"{words} slowest, whose bandwidth is ω_b")
         if given:
             channels = [(c.name, c.outputs or (), c.inputs or ()) for c in sections.channels]
             given_decoupling(*(list(part) for part in zip(*channels, strict=True)))
@@ -238,5 +253,6 @@ def _channels(controller: ControllerSection) -> tuple[ChannelProblem, ...]:
         values = {key: getattr(whose, key) for key in keys if getattr(whose, key) is not None}
         structure = Structure(**({key: getattr(controller, key) for key in keys} | values))
         inputs = own.outputs if own.inputs is None else own.inputs
-        found.append(ChannelProblem(name, structure, own.outputs, inputs, own.like))
+        bounds = {key: getattr(whose, key) for key in _OF_CHANNELS}
+        found.append(ChannelProblem(name, structure, own.outputs, inputs, own.like, **bounds))
     return tuple(found)

@@ -253,6 +253,8 @@ class ChannelSection:
     the plant's (default: as `outputs`). Either every channel gives them or none: then the channels
     are those that are found, named "1", "2", …. `like` names a channel with the same parameters, as
     tip and tilt of a square stage may have: then nothing else of the structure is given.
+
+    `S_max`, `M_K` and `bandwidth_ratio` ask more of this channel than of the whole loop.
     """
 
     outputs: tuple[float, ...] | None = _key(
@@ -274,6 +276,22 @@ class ChannelSection:
         number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
         None,
         says="instead of [controller]'s",
+    )
+    S_max: float | None = _key(
+        number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
+        None,
+        says="bound of the peak of this channel's S, tighter than [inner]'s, which the whole keeps",
+    )
+    M_K: float | None = _key(
+        POSITIVE,
+        None,
+        says="of this channel's W_KS, lower than [weights]': its force counts more",
+        unit="N/m",
+    )
+    bandwidth_ratio: float = _key(
+        number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
+        1.0,
+        says="this channel's bandwidth is at least so many times ω_b, which is the slowest one's",
     )
 
 

@@ -146,7 +146,7 @@ def _fastest(
     stable = [plant for plant in judged.plants if plant.stable]
     over: dict[str, float] = {}
     for plant in stable:
-        for name, ratio in bounds.shares(plant).items():
+        for name, ratio in (bounds.shares(plant) | bounds.channel_shares(plant.channels)).items():
             over[name] = max(over.get(name, 0.0), ratio)
     found = FullOrder(
         figures.bandwidth, len(design.controller.A), f"by {search}", len(plants),

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.stored import stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -154,11 +154,17 @@ def _loop_bounds(
 ) -> list[tuple[str, float, float]]:
     """Bounds on the loop that the case gives: name, value, and d ln ω_b/d ln of it."""
     sections = sections_of_problem(problem)
+    effort = sum(value for name, value in mu.items() if name.partition(" of ")[0] == "KS")
     rows = [
         ("S_max", problem.inner.S_max, mu.get("S_MAX", 0.0)),
         ("S_low", problem.inner.S_low, mu.get("S_LOW", 0.0)),
         ("shape", sections.shape, mu.get("SHAPE", 0.0)),
-        ("weighted_level", sections.weighted_level, mu.get("KS", 0.0) + mu.get("T", 0.0)),
+        ("weighted_level", sections.weighted_level, effort + mu.get("T", 0.0)),
         ("compliance_max", sections.compliance_max, mu.get("GS", 0.0)),
     ]
+    for own in bounds_of(problem).channels:
+        rows += [
+            (f"S_max of channel {own.name}", own.S_max, mu.get(f"S_MAX of {own.name}", 0.0)),
+            (f"M_K of channel {own.name}", own.M_K, mu.get(f"KS of {own.name}", 0.0)),
+        ]
     return [(name, float(value), m) for name, value, m in rows if value is not None]

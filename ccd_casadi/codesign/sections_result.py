@@ -20,10 +20,10 @@ from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.sections_verdict import sections_verdict
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import State, reason, verdict_dict
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.units import HZ
@@ -37,6 +37,18 @@ BINDS = {
     "T": "weighted_level of T",
     "GS": "compliance_max",
 }
+
+
+def bound_words(name: str) -> str:
+    """A kind of bound as the case has it.
+
+    >>> bound_words("S_LOW"), bound_words("S_MAX of tilt")
+    ('S_low', 'S_max of channel tilt')
+    """
+    kind, _, channel = name.partition(" of ")
+    return BINDS[kind] + (f" of channel {channel}" if channel else "")
+
+
 WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
 
 
@@ -69,6 +81,7 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
             problem.inner.omega_low / HZ,
         ),
         "KS_max": max(plant.KS for plant in judged.plants),
+        **_channel_entry(bounds_of(problem), judged),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
             "max_real_pole": grown,
@@ -94,7 +107,33 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
 
 def active_of(made: SectionsDesign) -> list[str]:
     """What binds the controller."""
-    return [word for name, word in BINDS.items() if made.multipliers.get(name, 0.0) > 1e-6]
+    order = list(BINDS)
+    names = [name for name, mu in made.multipliers.items() if mu > 1e-6]
+    names = [name for name in names if name.partition(" of ")[0] in BINDS]
+    kinds = sorted(names, key=lambda name: (order.index(name.partition(" of ")[0]), name))
+    return [bound_words(name) for name in kinds]
+
+
+def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
+    """`channel_bounds`: what channels keep for themselves, the worst of the judge's plants."""
+    found = []
+    for i, own in enumerate(bounds.channels):
+        rows = [plant.channels[i] for plant in judged.plants if plant.channels]
+        if not own.given or not rows:
+            continue
+        top = max(rows, key=lambda row: row.S_peak)
+        entry = {
+            "name": own.name,
+            "sensitivity_peak": top.S_peak,
+            "sensitivity_peak_hz": top.S_peak_frequency / HZ,
+            "S_max": own.S_max,
+            "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
+            "bandwidth_ratio": own.bandwidth_ratio,
+        }
+        if own.M_K is not None:
+            entry |= {"M_K": own.M_K, "weighted_KS": max(row.weighted_KS for row in rows)}
+        found.append(entry)
+    return {"channel_bounds": found} if found else {}
 
 
 def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str, Any]:

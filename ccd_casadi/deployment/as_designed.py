@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.channels import Channel, split
 from ccd_casadi.deployment.discretise import (
@@ -32,14 +31,15 @@ from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction
 from ccd_casadi.deployment.robust_set import WorstFirst, section_members
 from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.timing import Discretisation, Timing
-from ccd_casadi.fixed_structure import Structure
+from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
-from ccd_casadi.inner_problem.sections_plant_set import structure_of
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 
@@ -58,6 +58,7 @@ def deploy_as_designed(
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
     G, designed = run.plant.plant_si(), sections.sampling
+    _require_own_bounds(run, designed, timing)
     orders = _channels(run)
     limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
     tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
@@ -120,6 +121,20 @@ def deploy_as_designed(
         plants.nominal, realisation, sampled, measured, checked, simulated, unverified(run),
         statics_of(run, realisation.system), compliance, sections.compliance_max,
     )  # fmt: skip
+
+
+def _require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timing) -> None:
+    """Raise UserError where single channels have bounds that a loop other than that designed may
+    pass: figures of sampled loops here are of the whole."""
+    if not any(own.given for own in bounds_of(run.problem).channels):
+        return
+    words = f"{run.folder}: channels have bounds of their own, which are judged as designed alone"
+    if designed is None:
+        raise UserError(f"{words}; give loop.rate_hz in the case, solve it and deploy that")
+    asked = timing.delay_at(timing.rate_hz or designed.rate_hz)
+    default = timing.delay is None and timing.delay_samples == Timing.delay_samples
+    if timing.rate_hz not in (None, designed.rate_hz) or not (default or asked == designed.delay):
+        raise UserError(f"{words}; leave out the rate and the delay, which are then the case's")
 
 
 def _channels(run: FinishedRun) -> tuple[ChannelOrders, ...]:

@@ -13,7 +13,7 @@ from ccd_casadi.deployment.sampled import (
     sampled_plant,
     sensitivity_loop,
 )
-from ccd_casadi.deployment.timing import Discretisation as Discretisation
+from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.plants.scaling import StateSpace
 
 SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.as_designed import deploy_as_designed
 from ccd_casadi.deployment.channels import Channel, assemble, split
@@ -20,12 +19,13 @@ from ccd_casadi.deployment.rate_choice import ChannelLoops, choose, conversions_
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
-from ccd_casadi.deployment.timing import Timing as Timing
+from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.compliance import compliance_of
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 # A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
 # where any change passes them a little), S_low, 99 % of ω_b, and no gain more than twice the bound

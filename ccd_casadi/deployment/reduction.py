@@ -24,13 +24,12 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh, solve_continuous_are, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
-from ccd_casadi.codesign.closer_models import UNBOUNDED
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.synthesis import DesignFigures
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 from ccd_casadi.synthesis.weights import Weights
 
 NEGLIGIBLE = 1e-9  # of the largest closed-loop Hankel value: a state under it is none

@@ -1,6 +1,8 @@
 """The page on the loopback address: one port, a token in the path, nothing from outside."""
 
+import asyncio
 import secrets
+import warnings
 import webbrowser
 from pathlib import Path
 
@@ -19,6 +21,16 @@ HOST = "127.0.0.1"
 TEMPLATE = Path(__file__).with_name("page.html")
 
 
+def _require_event_loop() -> None:
+    """Make a current one where there is none: Bokeh takes it, and Python makes it no longer."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # that it will not, from 3.12 on
+        try:
+            asyncio.get_event_loop()
+        except RuntimeError:
+            asyncio.set_event_loop(asyncio.new_event_loop())
+
+
 class Explorer:
     """Serves a session until `stop`; `url` has the token, without which every path is refused."""
 
@@ -27,6 +39,7 @@ class Explorer:
         self.background = Background(workers, user_code)
         self._pages: list[Page] = []
         self._workers = workers
+        _require_event_loop()
         token = secrets.token_urlsafe(16)
         # a page from here may not link to a file of the disk
         solved = {"path": str(session.folder.resolve())}

@@ -1,6 +1,7 @@
 """Controllers of fixed structure for sets of plants, continuous or sampled."""
 
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
+from ccd_casadi.fixed_structure.bounds import ChannelBounds as ChannelBounds
 from ccd_casadi.fixed_structure.certificate import Certificate as Certificate
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise as synthesise

@@ -1,9 +1,40 @@
 """What a loop has to keep on every plant of a set."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import log
 from typing import Protocol
 
 from ccd_casadi.synthesis.weights import Weights
+
+
+@dataclass(frozen=True)
+class ChannelBounds:
+    """What one channel keeps besides the whole loop; None, or a ratio of 1: nothing of its own.
+
+    `output` u makes its error uᵀe of the plant's, `force` w its force wᵀf. For references of
+    length 1 in any direction, with ω_i = bandwidth_ratio ω_b,
+
+        ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ <= min(1, shape ω/ω_i)/√2 for ω <= ω_i
+        |W_KS| ‖wᵀKS‖ <= weighted_level,   W_KS with this M_K, N/m
+    """
+
+    name: str
+    output: tuple[float, ...]
+    force: tuple[float, ...]
+    S_max: float | None = None
+    bandwidth_ratio: float = 1.0
+    M_K: float | None = None
+
+    @property
+    def lead(self) -> float:
+        """ln of the channel's bandwidth over ω_b."""
+        return log(self.bandwidth_ratio)
+
+    @property
+    def given(self) -> bool:
+        """Whether there is any bound of its own."""
+        return (self.S_max, self.M_K, self.bandwidth_ratio) != (None, None, 1.0)
 
 
 @dataclass(frozen=True)
@@ -15,7 +46,8 @@ class Bounds:
         |W_KS KS|, |W_T T| <= weighted_level        with W_KS, W_T of `weights`
         |GS| <= compliance_max                      m/N
 
-    Without an integrator S does not fall to zero: the shape then counts from ω_low on.
+    Without an integrator S does not fall to zero: the shape then counts from ω_low on. `channels`:
+    empty, or tighter bounds for each channel, in the order of the structure.
     """
 
     S_max: float
@@ -25,6 +57,7 @@ class Bounds:
     weighted_level: float | None = None
     weights: Weights | None = None
     compliance_max: float | None = None
+    channels: tuple[ChannelBounds, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.S_max > 1.0:
@@ -35,6 +68,48 @@ class Bounds:
             raise ValueError(f"shape is {self.shape}; below 1 no loop reaches -3 dB at ω_b")
         if self.weighted_level is not None and self.weights is None:
             raise ValueError("weighted_level needs the weights that KS and T are weighted with")
+        for own in self.channels:
+            if own.S_max is not None and not 1.0 < own.S_max <= self.S_max:
+                words = f"S_max of channel {own.name} is {own.S_max}"
+                raise ValueError(f"{words}; give more than 1, at most that of the whole")
+            if own.bandwidth_ratio < 1.0:
+                words = f"bandwidth_ratio of channel {own.name} is {own.bandwidth_ratio}"
+                raise ValueError(f"{words}; give 1 or more: ω_b is that of the slowest")
+            if own.M_K is not None and self.weighted_level is None:
+                raise ValueError(f"M_K of channel {own.name} needs a weighted_level")
+            if own.M_K is not None and self.weights and not 0.0 < own.M_K <= self.weights.M_K:
+                words = f"M_K of channel {own.name} is {own.M_K}"
+                raise ValueError(f"{words}; give more than 0, at most that of the weights")
+
+    def of_channel(self, number: int) -> "Bounds":
+        """What a channel keeps that nothing couples to the others, its own bandwidth for ω_b."""
+        if not self.channels:
+            return self
+        own = self.channels[number]
+        weights = self.weights
+        if weights is not None and own.M_K is not None:
+            weights = replace(weights, M_K=own.M_K)
+        peak = self.S_max if own.S_max is None else own.S_max
+        return replace(self, S_max=peak, weights=weights, channels=())
+
+    def lead(self, number: int) -> float:
+        """ln of a channel's bandwidth over ω_b."""
+        return self.channels[number].lead if self.channels else 0.0
+
+    def looser(self, by: float) -> "Bounds":
+        """Every bound but the shape times 1 + by."""
+
+        def times(value: float | None) -> float | None:
+            return None if value is None else value * (1.0 + by)
+
+        return replace(
+            self,
+            S_max=self.S_max * (1.0 + by),
+            S_low=self.S_low * (1.0 + by),
+            weighted_level=times(self.weighted_level),
+            compliance_max=times(self.compliance_max),
+            channels=tuple(replace(own, S_max=times(own.S_max)) for own in self.channels),
+        )
 
     def shares(self, found: "Peaks") -> dict[str, float]:
         """Every bound's figure over the bound; above 1 where it is not met."""
@@ -46,16 +121,31 @@ class Bounds:
             shares["GS"] = found.GS / self.compliance_max
         return shares
 
+    def channel_shares(self, found: Sequence["ChannelPeaks"]) -> dict[str, float]:
+        """The same of the channels' own bounds; `found` as `channels` are."""
+        shares = {}
+        for own, figures in zip(self.channels, found, strict=True):
+            if own.S_max is not None:
+                shares[f"S_max of {own.name}"] = figures.S_peak / own.S_max
+            if own.M_K is not None and self.weighted_level is not None:
+                shares[f"KS of {own.name}"] = figures.weighted_KS / self.weighted_level
+        return shares
 
-class Peaks(Protocol):
-    """What is held against bounds: the largest values over frequency, S_low at ω_low."""
+
+class ChannelPeaks(Protocol):
+    """What is held against a channel's own bounds: the largest values over frequency."""
 
     @property
     def S_peak(self) -> float: ...
     @property
-    def S_low(self) -> float: ...
-    @property
     def weighted_KS(self) -> float: ...
+
+
+class Peaks(ChannelPeaks, Protocol):
+    """What is held against bounds: the largest values over frequency, S_low at ω_low."""
+
+    @property
+    def S_low(self) -> float: ...
     @property
     def weighted_T(self) -> float: ...
     @property

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.certificate_curves import (
     Responses,
     crossing_and_bandwidth,
@@ -35,13 +35,29 @@ REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures'
 
 
 @dataclass(frozen=True)
+class ChannelFigures:
+    """One channel's row of S, uᵀS, as `PlantFigures` has the whole; NaN without bounds of its own.
+
+    `bandwidth`: the largest ω_i that the shape allows it. `weighted_KS` is of its row of KS, with
+    its own M_K, where that is bounded.
+    """
+
+    name: str
+    S_peak: float
+    S_peak_frequency: float
+    bandwidth: float
+    weighted_KS: float
+
+
+@dataclass(frozen=True)
 class PlantFigures:
     """One plant's loop in SI. Frequencies in rad/s; KS in N/m, GS in m/N; NaN where unstable.
 
     `stability`: the largest real part of a pole in 1/s, sampled the spectral radius less 1.
     `crossing`: the first -3 dB of S. `bandwidth`: the largest ω_b that the shape allows.
     `static_compliance` is GS towards 0 Hz, 0 with an integrator; `low_compliance` at ω_low.
-    `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peak by a Hamiltonian.
+    `weighted_KS` and `weighted_T` are NaN without weights. `confirmed`: S's peaks by Hamiltonians.
+    `channels`: as those of the bounds.
     """
 
     stable: bool
@@ -59,6 +75,7 @@ class PlantFigures:
     static_compliance: float
     low_compliance: float
     confirmed: bool
+    channels: tuple[ChannelFigures, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,8 +100,8 @@ def certify(
 ) -> Certificate:
     """Judge an SI controller (e in, u out) on plants against the bounds, σ_max of each matrix.
 
-    `integrator`: the shape counts from 0 on, else from ω_low. ω_b is the least of all plants. The
-    plants are spread over `workers`.
+    Of channels with bounds of their own the rows besides. `integrator`: the shape counts from 0 on,
+    else from ω_low. ω_b is the least of all plants. The plants are spread over `workers`.
     """
     tasks = [
         (i, (plant, controller, bounds, sampling, integrator)) for i, plant in enumerate(plants)
@@ -98,7 +115,8 @@ def certify(
     bandwidth = float(np.min([figures.bandwidth for figures in found]))
     worst: dict[str, float] = {}
     for figures in found:
-        for name, ratio in bounds.shares(figures).items():
+        shares = bounds.shares(figures) | bounds.channel_shares(figures.channels)
+        for name, ratio in shares.items():
             worst[name] = max(worst.get(name, 0.0), ratio)
     broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in worst.items()
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
@@ -152,8 +170,15 @@ def judged(
     values, low = table.at(grid), table.at(np.array([bounds.omega_low]))
     tops = peaks(table, grid, values)
     top, at = tops["S"]
-    norm = _norm(S, sampling)
+    norm = _norm(S, table.period)
     crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], bounds, integrator)
+    rows, confirmed = [], abs(norm / top - 1.0) <= CONFIRMED
+    for own in bounds.channels:
+        figures, certain = _row(own, S, table, grid, values, tops, integrator)
+        rows.append(figures)
+        confirmed = confirmed and certain
+        if own.bandwidth_ratio > 1.0:
+            bandwidth = min(bandwidth, figures.bandwidth / own.bandwidth_ratio)
     weighted = [tops[name][0] if name in tops else np.nan for name in ("weighted KS", "weighted T")]
     return PlantFigures(
         stable=True,
@@ -171,8 +196,32 @@ def judged(
         # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
         static_compliance=0.0 if integrator else float(table.at(REST * grid[:1])["GS"][0]),
         low_compliance=float(low["GS"][0]),
-        confirmed=abs(norm / top - 1.0) <= CONFIRMED,
+        confirmed=confirmed,
+        channels=tuple(rows),
     )
+
+
+def _row(
+    own: ChannelBounds,
+    S: StateSpace,
+    table: Responses,
+    grid: Array,
+    values: dict[str, Array],
+    tops: dict[str, tuple[float, float]],
+    integrator: bool,
+) -> tuple[ChannelFigures, bool]:
+    """The figures of one channel's row, and whether its peak is confirmed."""
+    nan, curve = np.nan, f"S of {own.name}"
+    if not own.given:
+        return ChannelFigures(own.name, nan, nan, nan, nan), True
+    u, (top, at) = np.array([own.output]), tops[curve]
+    norm = _norm(StateSpace(S.A, S.B, u @ S.C, u @ S.D), table.period)
+    _, bandwidth = crossing_and_bandwidth(
+        table, grid, values[curve], table.bounds, integrator, curve
+    )
+    weighted = tops.get(f"weighted KS of {own.name}", (nan, nan))[0]
+    figures = ChannelFigures(own.name, max(top, norm), at, bandwidth, weighted)
+    return figures, abs(norm / top - 1.0) <= CONFIRMED
 
 
 def _rounding(A: Array) -> float:
@@ -228,9 +277,9 @@ def _tustin(K: StateSpace, period: float) -> StateSpace:
     return StateSpace(inverse @ (one + half * K.A), period * inverse @ K.B, C, K.D + half * C @ K.B)
 
 
-def _norm(S: StateSpace, sampling: Sampling | None) -> float:
+def _norm(S: StateSpace, period: float | None) -> float:
     """‖S‖∞ by Hamiltonian matrices; of a sampled loop with z = (1 + w)/(1 - w)."""
-    if sampling is None:
+    if period is None:
         return hinf_norm(S)[0]
     inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
     root = np.sqrt(2.0)

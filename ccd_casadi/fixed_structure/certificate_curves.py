@@ -48,9 +48,16 @@ class Responses:
             "T": _gain(g @ k @ S),
             "GS": _gain(S @ free),
         }
-        if self.bounds.weights is not None:
-            _, W_KS, W_T = np.abs(self.bounds.weights.responses(omega))
+        weights = self.bounds.weights
+        if weights is not None:
+            _, W_KS, W_T = np.abs(weights.responses(omega))
             found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
+        for own in self.bounds.channels:
+            if own.given:
+                found[f"S of {own.name}"] = _length(own.output, S)
+            if own.M_K is not None and weights is not None:
+                W = weights.M_K / own.M_K * W_KS
+                found[f"weighted KS of {own.name}"] = W * _length(own.force, k @ S)
         return found
 
 
@@ -65,6 +72,11 @@ def _gain(M: np.ndarray) -> Array:
     if M.shape[-2:] == (1, 1):
         return np.abs(M[..., 0, 0])
     return np.asarray(np.linalg.svd(M, compute_uv=False)[..., 0])
+
+
+def _length(row: Sequence[float], M: np.ndarray) -> Array:
+    """‖rᵀM‖ of a row r and matrices (..., p, m)."""
+    return np.asarray(np.linalg.norm(np.array(row) @ M, axis=-1))
 
 
 def frequency_grid(
@@ -146,14 +158,22 @@ def _zoomed(
 
 
 def crossing_and_bandwidth(
-    table: Responses, grid: Array, S: Array, bounds: Bounds, integrator: bool
+    table: Responses,
+    grid: Array,
+    S: Array,
+    bounds: Bounds,
+    integrator: bool,
+    curve: str = "S",
 ) -> tuple[float, float]:
-    """The first ω with |S| = 1/√2, and the largest ω_b that keeps the shape below it."""
+    """The first ω with |S| = 1/√2, and the largest ω_b that keeps the shape below it.
+
+    `curve` names what S is of the table's.
+    """
     # A peak between two points of the grid may pass -3 dB where both stay below.
     inner = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
     inner = inner[(S[inner] <= HALF_POWER) & (S[inner] > 0.9 * HALF_POWER)]
     if len(inner):
-        points, peaks, i = _zoomed(lambda x: table.at(x.ravel())["S"].reshape(x.shape),
+        points, peaks, i = _zoomed(lambda x: table.at(x.ravel())[curve].reshape(x.shape),
                                    grid[inner - 1], grid[inner + 1])  # fmt: skip
         grid = np.concatenate([grid, points[np.arange(len(i)), i]])
         grid, order = np.unique(grid, return_index=True)
@@ -164,7 +184,7 @@ def crossing_and_bandwidth(
     low, high = float(grid[above[0] - 1]), float(grid[above[0]])
     for _ in range(SECTIONS):
         points = np.linspace(low, high, 11)
-        first = int(np.argmax(table.at(points)["S"][1:] > HALF_POWER))
+        first = int(np.argmax(table.at(points)[curve][1:] > HALF_POWER))
         low, high = float(points[first]), float(points[first + 1])
     if bounds.shape is None:
         return low, low
@@ -176,7 +196,7 @@ def crossing_and_bandwidth(
 
     def room(x: Array) -> Array:
         counted = x if integrator else np.maximum(x, bounds.omega_low)
-        return np.asarray(shape * counted * HALF_POWER / table.at(x)["S"])
+        return np.asarray(shape * counted * HALF_POWER / table.at(x)[curve])
 
     value = room(omega)
     inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1

@@ -1,10 +1,11 @@
 """The largest bandwidth of a controller with a fixed structure for each of its channels.
 
 Where every plant falls apart in the channels' coordinates each channel is designed on its own, and
-ω_b is the least of theirs. Where channels are coupled the same designs, on the diagonal of every
-plant, are where the search on the whole loop starts, with ever tighter bounds on the channels
-until together they hold every plant stable. Where actuators share sensors (fewer outputs than
-channels) it starts from random controllers that are stable together (`actuator_starts`).
+ω_b is the least of theirs, each over its `bandwidth_ratio`. Where channels are coupled the same
+designs, on the diagonal of every plant, are where the search on the whole loop starts, with ever
+tighter bounds on the channels until together they hold every plant stable. Where actuators share
+sensors (fewer outputs than channels) it starts from random controllers that are stable together
+(`actuator_starts`).
 """
 
 from collections.abc import Sequence
@@ -81,15 +82,20 @@ def synthesise(
     alike = [in_units_of(plant, plants[0]) for plant in plants]
     span = span_of(problem)
 
-    def channels(limits: Bounds, before: Sequence[SectionsDesign] = ()) -> list[SectionsDesign]:
+    def channels(
+        share: float | None = None, before: Sequence[SectionsDesign] = ()
+    ) -> list[SectionsDesign]:
         """A design for each channel, on its entry of every plant; one for all that are alike.
 
-        One for those that share their parameters too, on the entries of all of them.
-
-        Climbs from `before`, the same with wider limits, if it is given.
+        One for those that share their parameters too, on the entries of all of them. With a share
+        of the room that its S_max leaves above 1. Climbs from `before`, the same with wider limits,
+        if it is given.
         """
         found: list[SectionsDesign] = []
         own_plants: list[list[ScaledPlant]] = []
+        own_limits = [bounds.of_channel(i) for i in range(len(structure.structures))]
+        if share is not None:
+            own_limits = [replace(one, S_max=1.0 + share * (one.S_max - 1.0)) for one in own_limits]
         for i, own in enumerate(structure.structures):
             members = [channel_plant(plant, structure.decoupling, i) for plant in alike]
             if structure.owner(i) != i:
@@ -106,7 +112,8 @@ def synthesise(
             if again:
                 begins = [before[i].kappa]
             own_plants.append(members)
-            same = [j for j in range(i) if structure.structures[j] == own
+            same = [j for j in range(i)
+                    if structure.structures[j] == own and own_limits[j] == own_limits[i]
                     and answer_alike(members, own_plants[j])]  # fmt: skip
             if same and (not begins or again):
                 found.append(found[same[0]])
@@ -114,7 +121,7 @@ def synthesise(
             name = structure.decoupling.names[i]
             found.append(
                 synthesise_sections(
-                    members, own, limits, sampling=sampling, starts=starts, seed=seed,
+                    members, own, own_limits[i], sampling=sampling, starts=starts, seed=seed,
                     initial=begins, only_initial=only_initial or again, frequencies=span,
                     workers=workers,
                     progress=lambda words, name=name: tell(f"channel {name}: {words}"),  # type: ignore[misc]
@@ -123,7 +130,7 @@ def synthesise(
         return found
 
     if problem.separable:
-        made = channels(bounds)
+        made = channels()
         short = [(name, one) for name, one in zip(structure.decoupling.names, made, strict=True)
                  if not one.certified]  # fmt: skip
         if short:
@@ -143,8 +150,7 @@ def synthesise(
     elif not field or not only_initial:
         before: list[SectionsDesign] = []
         for share in TIGHTENED:
-            limits = replace(bounds, S_max=1.0 + share * (bounds.S_max - 1.0))
-            before = channels(limits, before)
+            before = channels(share, before)
             stack = _stacked(problem, before)
             evaluations += 1
             fresh = [] if stack is None else _stable(problem, [stack])
@@ -189,7 +195,8 @@ def _joined(
     """The channels' designs as one, with the bandwidth of the slowest."""
     kappa = np.concatenate([made[i].kappa for i in problem.structure.free])
     inside = in_problem_units(problem, kappa)
-    slowest = min(one.bandwidth for one in made)
+    leads = (problem.bounds.lead(i) for i in range(len(made)))
+    slowest = min(one.bandwidth / np.exp(lead) for one, lead in zip(made, leads, strict=True))
     tau = float(np.log(slowest / problem.plants.omega_0))
     point = Point(inside, tau, assess(problem, inside, tau))
     optima = (LocalOptimum(slowest, 1, tuple(map(float, kappa))),)

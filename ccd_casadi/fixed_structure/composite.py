@@ -1,8 +1,9 @@
 """The problem of a controller with several channels, made of parts.
 
 Plants that fall apart in the channels' coordinates are one SISO problem for each channel, whose
-bounds are the whole's: the singular values of S, KS, T and GS are the channels' moduli. Plants
-whose channels are coupled are bounded as a whole (`mimo_figures`). All parts share ω_b.
+bounds are the whole's, or its own where they are tighter: the singular values of S, KS, T and GS
+are the channels' moduli. Plants whose channels are coupled are bounded as a whole
+(`mimo_figures`). All parts share ω_b, a channel's own bandwidth is in proportion.
 """
 
 from collections.abc import Sequence
@@ -20,12 +21,13 @@ from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
+    Curve,
     LoopProblem,
     Problem,
     plant_of_row,
 )
 from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
-from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, loop_matrices
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, loop_matrices
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -39,12 +41,15 @@ ALIKE = 1e-9  # relative: responses of channels that are one problem
 class Part:
     """A problem on some of the parameters (`place` of κ) and some of the plants (`members`).
 
-    Parameters that channels share stand in `place` as often as the problem has them.
+    Parameters that channels share stand in `place` as often as the problem has them. `channel`: the
+    number of the one that it is of, None of all; `lead`: ln of that one's bandwidth over ω_b.
     """
 
     problem: LoopProblem
     place: np.ndarray
     members: np.ndarray
+    channel: int | None = None
+    lead: float = 0.0
 
     def spread(self, count: int) -> Array:
         """(k, count): the problem's parameters from all."""
@@ -69,7 +74,8 @@ class CompositeProblem(LoopProblem):
 
     def rows_of(self, number: int) -> tuple[int, int]:
         """The range of numbers of rows of a part."""
-        sizes = [len(part.members) * len(self.structure.structures) for part in self.parts]
+        each = len(self.structure.structures) + len(self.bounds.channels)
+        sizes = [len(part.members) * each for part in self.parts]
         start = int(np.sum(sizes[:number], dtype=int))
         return start, start + sizes[number]
 
@@ -117,10 +123,12 @@ def composite_problem(
         for i, own in enumerate(structure.structures):
             place = np.arange(len(box[0]))[structure.slices[i]]
             singles.append([channel_plant(alike[j], structure.decoupling, i) for j in members])
-            if structure.owner(i) != i and answer_alike(singles[structure.owner(i)], singles[i]):
+            limits, lead, owner = bounds.of_channel(i), bounds.lead(i), structure.owner(i)
+            alike_bounds = limits == bounds.of_channel(owner) and lead == bounds.lead(owner)
+            if owner != i and alike_bounds and answer_alike(singles[owner], singles[i]):
                 continue
-            problem = Problem(plant_set(singles[i], sampling), own, bounds, box[:, place], margin)
-            parts.append(Part(problem, place, members))
+            problem = Problem(plant_set(singles[i], sampling), own, limits, box[:, place], margin)
+            parts.append(Part(problem, place, members, i, lead))
     if len(together):
         matrices = matrix_plant_set([alike[j] for j in together], structure.decoupling, sampling)
         place = structure.places
@@ -140,7 +148,8 @@ def _(
     **depths: float,
 ) -> Assessment:
     found = [
-        assess(part.problem, kappa[part.place], tau, each=each, **depths) for part in problem.parts
+        assess(part.problem, kappa[part.place], tau + part.lead, each=each, **depths)
+        for part in problem.parts
     ]
     widest = sum(one.poles.shape[1] for one in found)
     poles = np.full((problem.count, widest), NOT_THERE, complex)
@@ -184,7 +193,8 @@ def _(problem: CompositeProblem, kappa: Array, tau: float, rows: Constraints) ->
     for part, at, own in problem.split(rows):
         spread = np.zeros((len(part.place) + 1, n + 1))
         spread[:-1, :-1], spread[-1, -1] = part.spread(n), 1.0
-        out[at] = spread.T @ hessians(part.problem, kappa[part.place], tau, own) @ spread
+        inner = hessians(part.problem, kappa[part.place], tau + part.lead, own)
+        out[at] = spread.T @ inner @ spread
     return out
 
 
@@ -198,6 +208,26 @@ def answer_alike(a: Sequence[ScaledPlant], b: Sequence[ScaledPlant]) -> bool:
     v = np.tile(v, len(a))
     one, other = first.responses(which, v)[0], second.responses(which, v)[0]
     return bool((np.abs(one - other) <= ALIKE * np.abs(one)).all())
+
+
+def kinds_of_rows(problem: LoopProblem, found: Constraints) -> list[str]:
+    """The name of each row's bound; of one that is a channel's own `S_MAX of z`."""
+    names = [Curve(int(code)).name for code in found.curve]
+    if not isinstance(problem, CompositeProblem) or not problem.bounds.channels:
+        return names
+    for part, at, inside in problem.split(found):
+        for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
+            channel = part.channel
+            if isinstance(part.problem, MatrixProblem):
+                past = row // len(part.problem.plants.plants) - part.problem.own.first
+                channel = past if past >= 0 else None
+            if channel is None:
+                continue
+            own = problem.bounds.channels[channel]
+            given = {"S_MAX": own.S_max, "KS": own.M_K}
+            if given.get(names[j]) is not None:
+                names[j] += f" of {own.name}"
+    return names
 
 
 def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:

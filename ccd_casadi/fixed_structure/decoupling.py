@@ -7,13 +7,14 @@ those of `plants.channels`; within a block U and V are the singular vectors of i
 a stage on a soft suspension the directions in which its rigid body moves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -90,6 +91,24 @@ def given_decoupling(
             raise PlantError(f"the channels' directions of {word} are not independent; mend them")
         found.append(M / length)
     return Decoupling(tuple(names), found[0], found[1])
+
+
+def channel_bounds(
+    decoupling: Decoupling, given: Mapping[str, Mapping[str, float]]
+) -> tuple[ChannelBounds, ...]:
+    """`channels` of `Bounds`: by a channel's name what it keeps for itself, in keywords.
+
+    >>> channels = given_decoupling(("z", "tilt"), [[1, 1], [1, -1]], [[1, 1], [1, -1]])
+    >>> own = channel_bounds(channels, {"tilt": {"S_max": 1.5, "bandwidth_ratio": 2.0}})
+    >>> [(one.name, one.S_max, one.bandwidth_ratio) for one in own]
+    [('z', None, 1.0), ('tilt', 1.5, 2.0)]
+    """
+    force = np.linalg.inv(decoupling.inputs)
+    return tuple(
+        ChannelBounds(name, tuple(map(float, decoupling.outputs[:, i])),
+                      tuple(map(float, force[i])), **given.get(name, {}))
+        for i, name in enumerate(decoupling.names)
+    )  # fmt: skip
 
 
 def static_gain(plant: ScaledPlant) -> Array:

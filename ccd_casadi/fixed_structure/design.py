@@ -15,11 +15,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
-from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem, Problem
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope, log_bandwidth_envelope, optimality
 from ccd_casadi.fixed_structure.race import (
     LocalOptimum,
@@ -331,9 +331,8 @@ def designed(
     short: dict[str, float] = {}
     peaks = point.assessment.peaks
     assert peaks is not None
-    for code, value in zip(peaks.curve, peaks.value, strict=True):
+    for name, value in zip(kinds_of_rows(problem, peaks), peaks.value, strict=True):
         if value > 2.0 * MARGIN:
-            name = Curve(int(code)).name
             short[name] = max(short.get(name, 0.0), float(np.exp(value)))
     outcome, words = SectionsOutcome.CERTIFIED, judged.words
     if short:

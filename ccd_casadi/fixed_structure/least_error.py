@@ -25,6 +25,7 @@ from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.descent import Point, descend
 from ccd_casadi.fixed_structure.design import (
@@ -37,7 +38,7 @@ from ccd_casadi.fixed_structure.design import (
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Problem
-from ccd_casadi.fixed_structure.optimality import Envelope, names_of
+from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
@@ -168,7 +169,7 @@ def least_error(
             if made.kkt_residual <= RESIDUAL:
                 direct = goal.to_theta(made.kappa, plants)
                 slopes = to_theta(problem, end.kappa, active)
-                names = names_of(active)
+                names = tuple(kinds_of_rows(problem, active))
                 envelope = Envelope(names, direct, slopes, *conditions).times(error)
             best = replace(best, design=made, error=error, envelope=envelope)
     return replace(best, steps=steps)
@@ -232,7 +233,7 @@ def _judged(
     mu = nnls(matrix, goal, maxiter=100 * matrix.shape[1])[0] if matrix.shape[1] else np.zeros(0)
     residual = float(np.abs(matrix @ mu - goal).max() / np.abs(goal).max())
     multipliers: dict[str, float] = {}
-    for word, value in zip(names_of(active), mu, strict=False):
+    for word, value in zip(kinds_of_rows(problem, active), mu, strict=False):
         if value > 0.0:
             multipliers[word] = multipliers.get(word, 0.0) + float(value)
     count = len(active.v)

@@ -16,7 +16,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.curvature import STEP
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve
-from ccd_casadi.fixed_structure.mimo_figures import MatrixProblem, Rows, evaluate_rows
+from ccd_casadi.fixed_structure.mimo_figures import Rows, evaluate_rows
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
 

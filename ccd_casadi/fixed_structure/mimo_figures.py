@@ -15,7 +15,8 @@ vectors and κ_a a parameter of channel i, each M depends on K_i by rank one,
 
 where G₀ is the continuous plant (without hold and delay, `free_responses`) and K = V diag(K_i) Uᵀ.
 With more inputs than outputs S and T are p x p, KS is m x p, S G₀ p x m: p singular values each, of
-matrices that are filled up to m x m with zeros here.
+matrices that are filled up to m x m with zeros here. Rows that a channel bounds for itself are
+numbered after them (`own_rows`): L M stands for M, and L P for P.
 """
 
 from dataclasses import dataclass
@@ -23,21 +24,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.figures import HALF_POWER, assess, to_theta
+from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.loop import stable
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
     Curve,
-    LoopProblem,
     chain_of,
-    log_weights,
     plant_of_row,
     shaped_at,
 )
-from ccd_casadi.fixed_structure.mimo_loop import MatrixPlantSet, whole_closed_loops
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, levels, offsets
+from ccd_casadi.fixed_structure.mimo_loop import whole_closed_loops
 from ccd_casadi.fixed_structure.peak_search import closed_on_zero, frequency_grid
-from ccd_casadi.fixed_structure.structure import response, response_and_slopes
+from ccd_casadi.fixed_structure.structure import response_and_slopes
 from ccd_casadi.support.arrays import Array
 
 # ln of the share of its bound under which a peak is none of ours: above that of S = I, whose
@@ -52,15 +52,6 @@ CLOSE = 0.1
 FINER = 12
 # Curve, row, start, low and high end of each.
 Brackets = tuple[np.ndarray, np.ndarray, Array, Array, Array]
-OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING)
-
-
-@dataclass(frozen=True)
-class MatrixProblem(LoopProblem):
-    """That of plants of several channels, as a whole."""
-
-    plants: MatrixPlantSet
-    structure: ChannelStructure
 
 
 @dataclass(frozen=True)
@@ -91,7 +82,8 @@ def evaluate_rows(
 ) -> Rows:
     """The singular values that the rows name, of these curves at these v; without the margin."""
     plants, structure = problem.plants, problem.structure
-    which, at = plant_of_row(problem, row), row // len(plants.plants)
+    which, number = plant_of_row(problem, row), row // len(plants.plants)
+    at = np.where(number < problem.own.first, number, 0)
     k, ln_slope, log_slopes = _channels(structure, kappa, v)
     G, dG = plants.responses(which, v)
     K = plants.into @ (k[..., None] * plants.out)
@@ -115,13 +107,16 @@ def evaluate_rows(
         M = np.where(of_gs, _filled(S @ free, m, m), M)
         M_x = np.where(of_gs, _filled(S @ dfree - SL_xS @ free, m, m), M_x)
         right = np.where(of_gs, plants.out @ S @ free, right)
+    L = problem.own.picked(curve, number, m)
+    if L is not None:
+        M, M_x, left = L @ M, L @ M_x, L @ left
     U, s, Vh = np.linalg.svd(M)
     V = np.conj(np.swapaxes(Vh, 1, 2))
     lefts = np.conj(np.swapaxes(U, 1, 2)) @ left @ plants.into
     rights = right @ V
     rows = np.arange(len(v))
     sigma = s[rows, at]
-    offset, offset_slope = _offsets(problem, tau, curve, v)
+    offset, offset_slope = offsets(problem, tau, curve, number, v)
     share = lefts[rows, at] * k * rights[rows, :, at] / sigma[:, None]
     to_kappa = np.empty((len(v), len(kappa)))
     for i, place in enumerate(structure.slices):
@@ -142,7 +137,8 @@ def whole_constraints(
     to_tau = np.zeros(len(v))
     if problem.bounds.shape is not None:
         omega = problem.plants.frequency(v)
-        rising = shaped_at(problem, omega) * problem.bounds.shape < np.exp(tau)
+        end_of_rise = np.exp(tau + problem.own.lead[row // len(problem.plants.plants)])
+        rising = shaped_at(problem, omega) * problem.bounds.shape < end_of_rise
         to_tau[(curve == Curve.SHAPE) & rising] = 1.0
     end = curve == Curve.CROSSING
     to_tau[end] = (found.slope / chain_of(problem, v))[end]
@@ -163,13 +159,15 @@ def _(
     good = stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
-    v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles, tau)
+    own = problem.own
+    v, regular = frequency_grid(
+        problem, problem.structure.roots(kappa), poles, np.unique(tau + own.lead)
+    )
     P, count = v.shape
-    outputs = problem.plants.matrices.shape[2]
-    crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
+    crossing = problem.plants.variable(np.exp(tau + own.lead))  # by number
     found, near = [], []
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
-    for curve, value in _levels(problem, kappa, tau, which, v, min(depth, -within)).items():
+    for curve, value in levels(problem, kappa, tau, which, v, min(depth, -within)).items():
         if curve is Curve.SHAPE:
             value = np.where(v[..., None] <= crossing, value, -np.inf)
         left = np.pad(value, ((0, 0), (1, 0), (0, 0)), constant_values=-np.inf)[:, :-1]
@@ -177,7 +175,7 @@ def _(
         i, at, k = np.nonzero((value > depth) & (value >= left) & (value > right))
         low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
         if curve is Curve.SHAPE:
-            high = np.minimum(high, crossing)
+            high = np.minimum(high, crossing[k])
         brackets = (np.full(len(i), curve), i + k * P, v[i, at], low, high)
         found.append(_split(problem, kappa, tau, brackets, value[i, at, k]))
         i, at, k = np.nonzero(regular[..., None] & (value > -within))
@@ -189,14 +187,16 @@ def _(
 
     top, closed = closed_on_zero(slope, start, low, high)
     # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
-    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing)
+    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing[rows // P])
     kind, rows, top = kind[whole], rows[whole], top[whole]
-    every = np.arange(P * outputs)
+    every = np.arange(P * own.first)
+    faster = (own.first + own.bounded(Curve.CROSSING))[:, None] * P + np.arange(P)
+    ends = np.concatenate([every, faster.ravel()])
     low_v = float(problem.plants.variable(np.array([problem.low]))[0])
     kind = np.concatenate([kind, np.full(len(every), Curve.S_LOW),
-                           np.full(len(every), Curve.CROSSING)])  # fmt: skip
-    rows = np.concatenate([rows, every, every])
-    top = np.concatenate([top, np.full(len(every), low_v), np.full(len(every), crossing)])
+                           np.full(len(ends), Curve.CROSSING)])  # fmt: skip
+    rows = np.concatenate([rows, every, ends])
+    top = np.concatenate([top, np.full(len(every), low_v), crossing[ends // P]])
     other = [np.concatenate(part) for part in zip(*near, strict=True)]
     return Assessment(
         True,
@@ -224,6 +224,9 @@ def _(problem: MatrixProblem, kappa: Array, found: Constraints) -> Array:
     m, p = K.shape[1:]
     own_s = _filled(S, m, p)
     left = np.where(of_ks, K @ S, own_s) * np.where(of_t, 1.0, -1.0)
+    L = problem.own.picked(found.curve, found.plant // len(plants.plants), m)
+    if L is not None:
+        left = L @ left
     right = np.where(of_gs, K @ S @ free, _filled(K @ S, m, m))
     x = np.einsum("mi,mij->mj", u, left)
     y = np.einsum("mij,mj->mi", right, v)
@@ -263,11 +266,13 @@ def _split(
     inside = np.geomspace(low[at], high[at], FINER, axis=1)
     inside = np.sort(np.concatenate([inside, start[at, None]], axis=1), axis=1)
     which = np.broadcast_to((rows[at] % P)[:, None], inside.shape)
-    level = _levels(problem, kappa, tau, which, inside, -2.0 * CLOSE)[Curve(int(kind[0]))]
+    level = levels(problem, kappa, tau, which, inside, -2.0 * CLOSE)[Curve(int(kind[0]))]
 
     def tops(row: np.ndarray) -> np.ndarray:
         own = level[np.arange(len(at)), :, row // P]
         return np.asarray((own[:, 1:-1] >= own[:, :-2]) & (own[:, 1:-1] > own[:, 2:]))
+
+    first = problem.own.first * P  # of the rows that no other crosses
 
     def bracketed(row: np.ndarray, top: np.ndarray) -> Brackets:
         i, m = np.nonzero(top)
@@ -275,8 +280,9 @@ def _split(
 
     own = tops(rows[at])
     kept = np.setdiff1d(np.arange(len(start)), at[own.any(axis=1)])
-    above = np.maximum(rows[at] - P, rows[at] % P)
-    beside = tops(above) & (rows[at] >= P)[:, None]
+    crossed = (rows[at] >= P) & (rows[at] < first)
+    above = np.where(crossed, rows[at] - P, rows[at])
+    beside = tops(above) & crossed[:, None]
     known = above[:, None] == rows  # no maximum twice
     x = inside[:, 1:-1, None]
     beside &= ~(known[:, None] & (low <= x) & (x <= high)).any(axis=2)
@@ -284,81 +290,6 @@ def _split(
                 bracketed(above, beside), strict=True)  # fmt: skip
     kind, rows, start, low, high = (np.concatenate(part) for part in parts)
     return kind, rows, start, low, high
-
-
-def _levels(
-    problem: MatrixProblem, kappa: Array, tau: float, which: np.ndarray, v: Array, least: float
-) -> dict[Curve, Array]:
-    """ln σ over the bound (..., c) of every curve on the plants `which` at v, of one shape.
-
-    -inf where none can be above `least`. σ² is never above the largest row sum of |MᴴM|: most
-    frequencies need no decomposition.
-    """
-    plants = problem.plants
-    S, KS, T = loop_matrices(problem, kappa, which, v)
-    found: dict[Curve, Array] = {}
-    for curve in problem.curves:
-        offset, _ = _offsets(problem, tau, np.full(v.shape, curve), v)
-        if curve is Curve.KS:
-            M = KS
-        elif curve is Curve.T:
-            M = T
-        elif curve is Curve.GS:
-            M = S @ plants.values(which, v, free=True)
-        else:
-            M = S
-        found[curve] = _log_gains(M, offset, least)
-    return found
-
-
-def loop_matrices(
-    problem: MatrixProblem, kappa: Array, which: np.ndarray, v: Array
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """S, KS and T (..., p, p) of the plants `which` at v, without weights."""
-    k = np.stack([response(own, part, 1j * v) for own, part in problem.structure.split(kappa)], -1)
-    K = problem.plants.into @ (k[..., None] * problem.plants.out)
-    G = problem.plants.values(which, v)
-    eye = np.eye(K.shape[-1])
-    S = np.linalg.inv(eye + G @ K)
-    return S, K @ S, eye - S
-
-
-def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:
-    square = np.abs(np.conj(np.swapaxes(M, -1, -2)) @ M).sum(-1).max(-1)
-    with np.errstate(divide="ignore"):
-        chosen = 0.5 * np.log(square) + offset > least
-        out = np.full((*offset.shape, min(M.shape[-2:])), -np.inf)
-        out[chosen] = np.log(np.linalg.svd(M[chosen], compute_uv=False)) + offset[chosen][:, None]
-    return out
-
-
-def _offsets(
-    problem: MatrixProblem, tau: float, curve: np.ndarray, v: Array
-) -> tuple[Array, Array]:
-    """What is added to ln σ to make it a constraint, and its slope to ln v."""
-    plants, bounds = problem.plants, problem.bounds
-    omega = plants.frequency(v)
-    chain = chain_of(problem, v)
-    out, slope = np.zeros(v.shape), np.zeros(v.shape)
-    out[curve == Curve.S_MAX] = -np.log(bounds.S_max)
-    out[curve == Curve.S_LOW] = -np.log(bounds.S_low)
-    out[curve == Curve.CROSSING] = HALF_POWER
-    shape = curve == Curve.SHAPE
-    out[shape] = HALF_POWER
-    if bounds.shape is not None and shape.any():
-        counted = shaped_at(problem, omega)
-        under = np.minimum(np.log(bounds.shape * counted) - tau, 0.0)
-        out[shape] -= under[shape]
-        slope[shape] = np.where((under < 0.0) & (counted == omega), -chain, 0.0)[shape]
-    if bounds.weighted_level is not None and bounds.weights is not None:
-        W, dW = log_weights(bounds.weights, omega * plants.omega_0)
-        for code, row, extra in ((Curve.KS, 0, np.log(plants.force)), (Curve.T, 1, 0.0)):
-            own = curve == code
-            out[own] = (W[row] + extra - np.log(bounds.weighted_level))[own]
-            slope[own] = (dW[row] * chain)[own]
-    if bounds.compliance_max is not None:
-        out[curve == Curve.GS] = -np.log(bounds.compliance_max * plants.force)
-    return out, slope
 
 
 def _filled(M: np.ndarray, rows: int, columns: int) -> np.ndarray:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
+from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.figures import to_theta
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.support.arrays import Array
 
@@ -54,11 +55,13 @@ class Optimality:
     """What binds, its multipliers (change of ln ω_b per ln of a bound), the residual over ‖∇τ‖,
     and by how much a bound is passed (logarithm).
 
-    `ends` are the parameters at an end of their box, as (name, "lower" or "upper", multiplier).
-    `rows` (M, n + 1) are the slopes to (κ, τ) of what is active, the ends last.
+    `kinds` names the bound of each that is active; `ends` are the parameters at an end of their
+    box, as (name, "lower" or "upper", multiplier); `rows` (M, n + 1) are the slopes to (κ, τ) of
+    what is active, the ends last.
     """
 
     active: Constraints
+    kinds: tuple[str, ...]
     multipliers: Array
     ends: tuple[tuple[str, str, float], ...]
     residual: float
@@ -68,7 +71,7 @@ class Optimality:
     def named(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
         found: dict[str, float] = {}
-        for name, mu in zip(names_of(self.active), self.multipliers, strict=True):
+        for name, mu in zip(self.kinds, self.multipliers, strict=True):
             if mu > 0.0:
                 found[name] = found.get(name, 0.0) + float(mu)
         return found
@@ -90,12 +93,14 @@ def optimality(problem: LoopProblem, point: Point) -> Optimality:
     matrix = np.concatenate(columns).T
     goal = np.eye(n + 1)[n]
     if matrix.shape[1] == 0:
-        return Optimality(active, np.zeros(0), (), 1.0, point.assessment.violation, matrix.T)
+        return Optimality(active, (), np.zeros(0), (), 1.0, point.assessment.violation, matrix.T)
     mu, _ = nnls(matrix, goal, maxiter=100 * matrix.shape[1])
     residual = float(np.abs(matrix @ mu - goal).max())
     count = len(active.v)
     found = tuple((*end, float(value)) for end, value in zip(ends, mu[count:], strict=True))
-    return Optimality(active, mu[:count], found, residual, point.assessment.violation, matrix.T)
+    kinds = tuple(kinds_of_rows(problem, active))
+    short = point.assessment.violation
+    return Optimality(active, kinds, mu[:count], found, residual, short, matrix.T)
 
 
 def log_bandwidth_envelope(
@@ -108,9 +113,4 @@ def log_bandwidth_envelope(
     n = found.rows.shape[1]
     mu = np.append(found.multipliers, [value for _, _, value in found.ends])
     goal = np.eye(n)[n - 1]
-    return Envelope(names_of(found.active), np.zeros(slopes.shape[1]), slopes, found.rows, goal, mu)
-
-
-def names_of(active: Constraints) -> tuple[str, ...]:
-    """The kind of bound of each."""
-    return tuple(Curve(int(code)).name for code in active.curve)
+    return Envelope(found.kinds, np.zeros(slopes.shape[1]), slopes, found.rows, goal, mu)

@@ -23,18 +23,22 @@ NARROW = 1e-6  # of its first width: a bracket that is left alone, as at a kink
 
 
 def frequency_grid(
-    problem: LoopProblem, controller: tuple[np.ndarray, np.ndarray], poles: np.ndarray, tau: float
+    problem: LoopProblem,
+    controller: tuple[np.ndarray, np.ndarray],
+    poles: np.ndarray,
+    tau: float | Array,
 ) -> tuple[Array, np.ndarray]:
     """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
 
     `controller`: the zeros and the poles of K. Where the shape turns level its curve has a kink,
-    and may have a peak on either side of it.
+    and may have a peak on either side of it; so for each of several τ.
     """
     own = np.concatenate(controller)
     own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
     parts = [problem.fixed, flanked(own), flanked(poles)]
     if problem.bounds.shape is not None:
-        kink = np.exp(tau) / problem.bounds.shape * AROUND_THE_KINK
+        level = np.exp(np.atleast_1d(tau)) / problem.bounds.shape
+        kink = np.outer(level, AROUND_THE_KINK).ravel()
         parts.append(np.tile(problem.plants.variable(kink), (len(poles), 1)))
     joint = np.concatenate(parts, axis=1)
     bottom, top = problem.base[0], problem.base[-1]

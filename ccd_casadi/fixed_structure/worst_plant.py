@@ -10,7 +10,7 @@ worst of them. For what lies between there is `box_proof`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -268,7 +268,7 @@ def synthesise_robustly(
     if made.certified and made.controller is not None:
         points = [*lattice(uncertain, count, seed + 1000), (worst.option, worst.point)]
         checked = len(points)
-        tolerant = _loosened(bounds, 2.0 * WITHIN)
+        tolerant = bounds.looser(2.0 * WITHIN)
         judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,
                          integrator=structure.integrator, workers=workers)  # fmt: skip
         proof = prove(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
@@ -293,14 +293,3 @@ def _apart(
         if head.value > WITHIN and (not near or min(near) > 1e-4) and len(found) < AT_ONCE:
             found.append((head.option, head.point))
     return found
-
-
-def _loosened(bounds: Bounds, by: float) -> Bounds:
-    level, compliance = bounds.weighted_level, bounds.compliance_max
-    return replace(
-        bounds,
-        S_max=bounds.S_max * (1.0 + by),
-        S_low=bounds.S_low * (1.0 + by),
-        weighted_level=None if level is None else level * (1.0 + by),
-        compliance_max=None if compliance is None else compliance * (1.0 + by),
-    )

@@ -6,8 +6,13 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
+from ccd_casadi.fixed_structure.decoupling import (
+    channel_bounds,
+    find_decoupling,
+    given_decoupling,
+)
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
@@ -34,7 +39,26 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         weighted_level=sections.weighted_level,
         weights=problem.weights if weighted else None,
         compliance_max=sections.compliance_max,
+        channels=_channel_bounds(problem),
     )
+
+
+def _channel_bounds(problem: CoDesignProblem) -> tuple[ChannelBounds, ...]:
+    """The channels' own, where they are tighter than the whole's; none where none is."""
+    sections = sections_of_problem(problem)
+    whole = {"S_max": problem.inner.S_max, "M_K": problem.weights.M_K}
+    given = {}
+    for channel in sections.channels:
+        own = {key: getattr(channel, key) for key in whole}
+        own = {key: value for key, value in own.items() if value and value < whole[key]}
+        if channel.bandwidth_ratio > 1.0:
+            own["bandwidth_ratio"] = channel.bandwidth_ratio
+        if own:
+            given[channel.name] = own
+    structure = structure_of(problem) if given else None
+    if not isinstance(structure, ChannelStructure):
+        return ()
+    return channel_bounds(structure.decoupling, given)
 
 
 def structure_of(problem: CoDesignProblem) -> Structure | ChannelStructure:

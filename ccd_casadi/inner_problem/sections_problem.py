@@ -35,13 +35,23 @@ class Uncertainty:
 class ChannelProblem:
     """One channel of a plant with several: its structure, and its directions of outputs and inputs
     (None: not given; those that are found at the start hold then for every θ). `like` names the
-    channel whose parameters it has."""
+    channel whose parameters it has. What it keeps besides the whole loop, see `ChannelBounds`:
+    `S_max`, `M_K` (None: nothing), and `bandwidth_ratio` times ω_b."""
 
     name: str
     structure: Structure
     outputs: tuple[float, ...] | None = None
     inputs: tuple[float, ...] | None = None
     like: str | None = None
+    S_max: float | None = None
+    M_K: float | None = None
+    bandwidth_ratio: float = 1.0
+
+    def identity(self) -> dict[str, Any]:
+        """Its values; of what came later only those that are not the default."""
+        later = {"like": None, "S_max": None, "M_K": None, "bandwidth_ratio": 1.0}
+        found = {key: value for key, value in vars(self).items() if value != later.get(key, ...)}
+        return found | {"structure": vars(self.structure)}
 
 
 @dataclass(frozen=True)
@@ -99,15 +109,7 @@ class SectionsProblem:
             "members": self.members,
         }
         if self.channels:
-            found["channels"] = [
-                {
-                    key: value
-                    for key, value in vars(channel).items()
-                    if (key, value) != ("like", None)
-                }
-                | {"structure": vars(channel.structure)}
-                for channel in self.channels
-            ]
+            found["channels"] = [channel.identity() for channel in self.channels]
         if self.of_error:
             found["least_error"] = [self.bandwidth_least, self.error_anchors]
         return found

@@ -5,7 +5,6 @@ the box beside them, branch and bound at all of it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -101,18 +100,8 @@ def _judged(
     workers: Pool | None = None,
 ) -> Certificate:
     sections, bounds = sections_of_problem(problem), bounds_of(problem)
-    loose = replace(
-        bounds,
-        S_max=bounds.S_max * (1.0 + LOOSE),
-        S_low=bounds.S_low * (1.0 + LOOSE),
-        weighted_level=_times(bounds.weighted_level),
-        compliance_max=_times(bounds.compliance_max),
-    )
     integrator = structure_of(problem).integrator
     return certify(
-        plants, controller, loose, sections.sampling, integrator=integrator, workers=workers
-    )
-
-
-def _times(value: float | None) -> float | None:
-    return None if value is None else value * (1.0 + LOOSE)
+        plants, controller, bounds.looser(LOOSE), sections.sampling, integrator=integrator,
+        workers=workers,
+    )  # fmt: skip

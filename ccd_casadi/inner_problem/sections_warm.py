@@ -34,7 +34,7 @@ def warm_starts(
     anchors = [np.array(kappa) for kappa in sections.anchors]
 
     def nearer(
-        own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array
+        own: Structure, before: ScaledPlant, set_of: list[ScaledPlant], kappa: Array, bounds: Bounds
     ) -> Array:
         found = problem_for(set_of, own, bounds, sections.sampling, sections.frequencies)
         both = [kappa, moved(own, before, set_of[0], kappa)]
@@ -45,14 +45,14 @@ def warm_starts(
         return both[int(np.argmax(merits))]
 
     if isinstance(structure, Structure):
-        return [nearer(structure, first, list(plants), kappa) for kappa in anchors]
+        return [nearer(structure, first, list(plants), kappa, bounds) for kappa in anchors]
     warm = [kappa.copy() for kappa in anchors]
     for i in structure.free:
         own, place = structure.structures[i], structure.slices[i]
         before = channel_plant(first, structure.decoupling, i)
         set_of = [channel_plant(plant, structure.decoupling, i) for plant in plants]
         for kappa in warm:
-            kappa[place] = nearer(own, before, set_of, kappa[place])
+            kappa[place] = nearer(own, before, set_of, kappa[place], bounds.of_channel(i))
     return warm
 
 

@@ -5,12 +5,11 @@ A model function speaks CasADi; a plant builder takes the names of θ and evalua
 
 from collections.abc import Callable
 
-from ccd_casadi.plants.cad.plant import cad_stage as cad_stage
-from ccd_casadi.plants.imported.plant import modal_table as modal_table
-from ccd_casadi.plants.imported.plant import sampled_matrices as sampled_matrices
+from ccd_casadi.plants.cad.plant import cad_stage
+from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
 from ccd_casadi.plants.plant import ModelFunction, Plant
-from ccd_casadi.plants.rib_stage.plant import rib_stage as rib_stage
-from ccd_casadi.plants.two_mass import two_mass as two_mass
+from ccd_casadi.plants.rib_stage.plant import rib_stage
+from ccd_casadi.plants.two_mass import two_mass
 
 MODELS: dict[str, ModelFunction] = {"two_mass": two_mass}
 BUILDERS: dict[str, Callable[..., Plant]] = {

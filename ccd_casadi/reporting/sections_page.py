@@ -22,7 +22,7 @@ from ccd_casadi.reporting.sections_move import move_html, move_panels
 from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.run import Solution
+    from ccd_casadi.codesign.solution import Solution
 
 
 def sections_conclusion(result: dict[str, Any]) -> str:
@@ -84,11 +84,14 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     gain = "lower the RMS error" if sections_of_problem(problem).of_error else "raise ω_b"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S below ω_b", "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
-    over_kappa = [
-        f"{words} binds; a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"
-        for name, words in names.items()
-        if mu.get(name, 0.0) > 1e-6
-    ]
+    over_kappa = []
+    for kind, words in names.items():
+        for name in (name for name, value in mu.items() if value > 1e-6):
+            own, _, channel = name.partition(" of ")
+            if own == kind:
+                of = f" of channel {channel}" if channel else ""
+                loosened = f"a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"
+                over_kappa.append(f"{words}{of} binds; {loosened}")
     ranges = [words.rpartition(" ") for words in result["controller"]["at_range"]]
     ends = [f"{name} is at the {end} end of its range" for name, _, end in ranges]
     return [*over_theta, *over_kappa, *ends]
@@ -175,6 +178,9 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
         ("Loop", runs, ""),
         ("Peak of sensitivity", number(r["sensitivity_peak"], 6),
          f"at {number(r['sensitivity_peak_hz'], 4)} Hz; S_max = {inner.S_max:g}"),
+        *((f"Channel {own['name']}", f"peak of S {number(own['sensitivity_peak'], 6)}, "
+           f"{number(own['bandwidth_hz'], 6)} Hz", _asked_of(own))
+          for own in r.get("channel_bounds", ())),
         ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
         (f"|S| at {number(inner.omega_low / HZ)} Hz", number(r["sensitivity_low"], 4),
          f"S_low = {inner.S_low:g}"),
@@ -194,6 +200,16 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
          f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
+
+
+def _asked_of(own: Mapping[str, Any]) -> str:
+    """The bounds of an entry of `channel_bounds`."""
+    asked = [] if own["S_max"] is None else [f"S_max = {own['S_max']:g}"]
+    if own["bandwidth_ratio"] > 1.0:
+        asked.append(f"at least {own['bandwidth_ratio']:g} ω_b")
+    if "M_K" in own:
+        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {own['M_K']:g} N/m")
+    return "; ".join(asked)
 
 
 def _over(kkt: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.cases.case import Case
+from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
 from ccd_casadi.codesign.verdict import State

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from ccd_casadi.robust.demands import Limits as Limits
+from ccd_casadi.robust.demands import Limits
 from ccd_casadi.support.arrays import Array
 
 

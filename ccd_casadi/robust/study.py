@@ -9,7 +9,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.robust.demands import Demands as Demands
+from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins, sampled_margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled

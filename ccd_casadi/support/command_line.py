@@ -10,13 +10,13 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.support.errors import PlantError, UserError, one_line
+from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import WorkerLost, usable_cores
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode as ExitCode
-from surrogates.options import Parser, whole
+from surrogates.options import Parser, one_line, whole
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"

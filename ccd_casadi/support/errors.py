@@ -1,7 +1,5 @@
 """The base of every error that a user can cause and mend, and its one line."""
 
-from surrogates.options import one_line as one_line  # of every command, here and there
-
 
 class UserError(ValueError):
     """One line that says what is wrong and what to change; commands print it and exit with 2."""

@@ -7,9 +7,9 @@ import numpy as np
 
 from ccd_casadi.plants.rib_stage.mesh import Mesh
 from ccd_casadi.plants.rib_stage.model import RibStage, discretisation, modes_at
-from ccd_casadi.plants.rib_stage.modes import sector_of, swap_displacements
+from ccd_casadi.plants.rib_stage.modes import sector_of
 from ccd_casadi.plants.rib_stage.rigid import rigid_motion
-from ccd_casadi.plants.rib_stage.symmetry import mirror_signs
+from ccd_casadi.plants.rib_stage.symmetry import mirror_signs, swap_displacements
 from ccd_casadi.support.arrays import Array
 
 QUADRANTS = ((False, False), (True, False), (True, True), (False, True))

@@ -1,0 +1,110 @@
+"""The beam of the examples: one axis tighter than the other, as docs and README tell it."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccd_casadi.cases.case import parse_case, problem_of
+from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_result import active_of, design_dict
+from ccd_casadi.deployment.as_designed import _require_own_bounds
+from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value
+from ccd_casadi.inner_problem.sections_words import channel_words
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.errors import UserError
+
+ROOT = Path(__file__).parent.parent
+CASE = ROOT / "examples" / "two_axes" / "case.toml"
+TABLE = (ROOT / "docs" / "fixed_structure_codesign.md").read_text()
+README = CASE.with_name("README.md").read_text()
+
+
+def case(tilt: dict[str, float] | None = None, plants: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The example's tables, with other bounds of the tilt and more plants."""
+    data = tomllib.loads(CASE.read_text())
+    if tilt is not None:
+        data["controller"]["channel"]["tilt"] = {"outputs": [1, -1]} | tilt
+    return data | ({"robust": {"plants": list(plants)}} if plants else {})
+
+
+@pytest.mark.parametrize(
+    ("tilt", "plants", "row"),
+    [
+        ({"S_max": 1.8999999}, (), "| nothing | {} | {} | {} |"),  # to have its figures
+        (None, (), "| S_max 1.5, bandwidth_ratio 1.25 (the case) | {} | {} | {} |"),
+        ({"S_max": 1.5, "bandwidth_ratio": 2.5}, (),
+         "| S_max 1.5, bandwidth_ratio 2.5 | {} | {} | {} |"),
+        (None, ("plants/off_centre.toml",),
+         '`plants = ["plants/off_centre.toml"]`) | {} | {} | {} |'),
+    ],
+)  # fmt: skip
+def test_the_table_of_the_docs(
+    tilt: dict[str, float] | None, plants: tuple[str, ...], row: str
+) -> None:
+    problem, made = prepared(problem_of(parse_case(case(tilt, plants), CASE)))
+    assert made.certified
+    found = design_dict(problem, made)
+    own = found["channel_bounds"][0]
+    figures = found["bandwidth_hz"], own["sensitivity_peak"], own["bandwidth_hz"]
+    shown = f"{figures[0]:.2f} Hz", f"{figures[1]:.3f}", f"{figures[2]:.1f} Hz"
+    assert row.format(*shown) in TABLE
+    assert found["sensitivity_peak"] <= 1.9
+    if tilt is None:
+        assert shown[0] in README
+        assert shown[2] in README
+        assert own["S_max"] == 1.5
+        assert "(S_max 1.5)" in channel_words(own)
+        assert "(at least 1.25 omega_b)" in channel_words(own)
+        assert ("S_max of channel tilt" in active_of(made)) == bool(plants)
+
+
+def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
+    """ω_b*(h) is the least of two: an optimum at their kink is seen to be one."""
+    problem = prepared(problem_of(parse_case(case(), CASE)))[0]
+
+    def at(h: float) -> tuple[BandwidthSample, Envelope | None]:
+        value = sections_value(problem, (h,))
+        own = BandwidthSample((h,), value.bandwidth, value.gradient, np.nan, np.nan, (), "", 0.0, 1)
+        return own, value.envelope
+
+    def meeting(first: BandwidthSample, second: BandwidthSample) -> float:
+        """Where the tangents of both sides cross."""
+        (a,), (b,) = first.theta, second.theta
+        (down,), (up,) = first.gradient, second.gradient
+        return (first.bandwidth - second.bandwidth + up * b - down * a) / (up - down)
+
+    (thin, _), (thick, _) = at(0.0198), at(0.0200)
+    assert thin.gradient[0] * thick.gradient[0] < 0.0
+    near = meeting(thin, thick)
+    close = [at(near - 1e-6)[0], at(near + 1e-6)[0]]
+    assert close[0].gradient[0] * close[1].gradient[0] < 0.0
+    kink, envelope = at(meeting(*close))
+    assert kink.bandwidth > max(one.bandwidth for one in (thin, thick, *close)) * (1.0 - 1e-9)
+    assert sections_kkt(problem, kink, None, envelope).stationarity < 1e-5
+    assert sections_kkt(problem, kink).stationarity > 0.1  # one side's gradient alone
+    beside, other = at(near + 1e-4)
+    assert sections_kkt(problem, beside, None, other).stationarity > 0.1
+    dearer = replace(problem, w1=1e3 * problem.w1)  # no balance of the two makes up for that
+    assert sections_kkt(dearer, kink, None, envelope).stationarity > 0.9
+
+
+def test_what_is_judged_as_designed_is_deployed_as_designed() -> None:
+    run: Any = SimpleNamespace(folder=CASE.parent, problem=problem_of(parse_case(case(), CASE)))
+    designed = Sampling(8000.0, 100.0)
+    _require_own_bounds(run, designed, Timing())
+    _require_own_bounds(run, designed, Timing(rate_hz=8000.0, delay=designed.delay))
+    for loop, timing in ((None, Timing()), (designed, Timing(rate_hz=4000.0)),
+                         (designed, Timing(delay=2e-4))):  # fmt: skip
+        with pytest.raises(UserError, match="bounds of their own"):
+            _require_own_bounds(run, loop, timing)
+    plain = parse_case(case({}), CASE)
+    _require_own_bounds(SimpleNamespace(folder=CASE.parent, problem=problem_of(plain)), None,
+                        Timing())  # fmt: skip
