@@ -33,7 +33,6 @@ class Session:
         self.start = knobs_of(case)
         if run is not None:
             self.start = replace(self.start, theta=run.theta)
-        self.store = SampleStore(folder / "samples.sqlite")
         # of a fixed structure: the last controller, and the problem that it was designed for
         self.kappa = None if run is None else run.kappa
         self.designed_for = None if self.kappa is None or run is None else run.problem
@@ -53,6 +52,7 @@ class Session:
         inner = problem.inner
         # until something was searched: the middle of the ranges
         self.point = tuple(float(np.sqrt(a * b)) for a, b in (inner.omega_S, inner.omega_T))
+        self.store = SampleStore(folder / "samples.sqlite")  # last: what is refused opens none
 
     def elements(self, problem: CoDesignProblem, theta: tuple[float, ...]) -> Elements:
         """The plant's matrices at θ as fast as one drags."""

@@ -27,7 +27,6 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import judged_corners as judged_corners
 from ccd_casadi.inner_problem.sections_robustness import worst_members
 from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -7,7 +7,6 @@ their own states in the Hamiltonian test.
 
 import numpy as np
 
-from ccd_casadi.kernels.closed_loop import weighted_loop as weighted_loop
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights

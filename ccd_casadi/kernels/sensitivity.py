@@ -9,7 +9,6 @@ Bruinsma & Steinbuch 1990.) Frequencies are in the units of A.
 import numpy as np
 
 from ccd_casadi.kernels.blocks import add, ascending, place, place_transposed, transposed
-from ccd_casadi.kernels.closed_loop import loop_matrices as loop_matrices
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, response_and_slope, responses
 from ccd_casadi.kernels.lapack import eigenvalues
