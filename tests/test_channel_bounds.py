@@ -164,7 +164,7 @@ def designed(off: tuple[float, ...], bounds: Bounds) -> SectionsDesign:
     return synthesise([plant(off=x) for x in off], structure(LIGHT), bounds, starts=2)
 
 
-@pytest.mark.parametrize("off", [(0.0,), (0.0, 0.2)])
+@pytest.mark.parametrize("off", [(0.0,), pytest.param((0.0, 0.2), marks=pytest.mark.slow)])
 def test_what_the_whole_asks_anyway_changes_nothing(off: tuple[float, ...]) -> None:
     """Equal S_max, a ratio of 1 and the weights' M_K: the design without them."""
     same = {"S_max": BOUNDS.S_max, "M_K": BOUNDS.weights.M_K}
@@ -264,6 +264,7 @@ def on_axes(of: ScaledPlant, bounds: Bounds) -> SectionsDesign:
     return synthesise([of], whole, bounds, starts=4, frequencies=SPAN)
 
 
+@pytest.mark.slow
 @settings(max_examples=3, deadline=None)
 @given(speed=st.floats(1.2, 3.0), unit=st.floats(0.05, 20.0))
 def test_a_faster_axis_in_other_units_has_the_same_design(speed: float, unit: float) -> None:

@@ -38,12 +38,14 @@ def case(tilt: dict[str, float] | None = None, plants: tuple[str, ...] = ()) -> 
 @pytest.mark.parametrize(
     ("tilt", "plants", "row"),
     [
-        ({"S_max": 1.8999999}, (), "| nothing | {} | {} | {} |"),  # to have its figures
+        pytest.param({"S_max": 1.8999999}, (), "| nothing | {} | {} | {} |",  # to have its figures
+                     marks=pytest.mark.slow),
         (None, (), "| S_max 1.5, bandwidth_ratio 1.25 (the case) | {} | {} | {} |"),
-        ({"S_max": 1.5, "bandwidth_ratio": 2.5}, (),
-         "| S_max 1.5, bandwidth_ratio 2.5 | {} | {} | {} |"),
-        (None, ("plants/off_centre.toml",),
-         '`plants = ["plants/off_centre.toml"]`) | {} | {} | {} |'),
+        pytest.param({"S_max": 1.5, "bandwidth_ratio": 2.5}, (),
+                     "| S_max 1.5, bandwidth_ratio 2.5 | {} | {} | {} |", marks=pytest.mark.slow),
+        pytest.param(None, ("plants/off_centre.toml",),
+                     '`plants = ["plants/off_centre.toml"]`) | {} | {} | {} |',
+                     marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_the_table_of_the_docs(
