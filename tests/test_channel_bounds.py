@@ -178,7 +178,7 @@ def test_what_the_whole_asks_anyway_changes_nothing(off: tuple[float, ...]) -> N
     assert max(peaks) <= own.certificate.plants[0].S_peak * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("off", [(0.0,), (0.0, 0.2)])
+@pytest.mark.parametrize("off", [pytest.param((0.0,), marks=pytest.mark.slow), (0.0, 0.2)])
 def test_a_dense_grid_sees_every_channels_bounds_held(off: tuple[float, ...]) -> None:
     """On uncoupled and on coupled plants; they cost bandwidth, so that they do something."""
     asked = {"1": {"bandwidth_ratio": 1.5}, "2": {"S_max": 1.3}, "3": {"M_K": 0.05 * M_K}}
@@ -282,6 +282,7 @@ def test_a_faster_axis_in_other_units_has_the_same_design(speed: float, unit: fl
     assert rows[1].S_peak == pytest.approx(1.8, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_slow_axis_of_two_loses_nothing_to_the_fast_one() -> None:
     """With axis b twice as fast ω_b is that of axis a for every ratio up to 2, then b's over it."""
     of, found = axes(2.0, 1.0), {}
