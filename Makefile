@@ -6,12 +6,16 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test test-processors lint docs bench peers setup setup-test clean
+.PHONY: solve test tests test-processors lint docs bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
-test: setup-test lint docs
+# Types and pages are checked beside the tests, which leave a core idle now and then.
+test: setup-test
+	$(MAKE) --no-print-directory -j 2 docs lint tests
+
+tests: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 	$(BIN)/python benchmarks/processors.py --other
 

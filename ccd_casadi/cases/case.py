@@ -11,6 +11,7 @@ from typing import Any
 
 from ccd_casadi.cases.budget import checked_budget, error_budget
 from ccd_casadi.cases.checks import closest, shown
+from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import (
@@ -22,7 +23,7 @@ from ccd_casadi.cases.kinds import (
     weights_of,
 )
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
-from ccd_casadi.cases.sections import SECTIONS, Case, ChannelSection, RobustSection
+from ccd_casadi.cases.sections import SECTIONS, Case, RobustSection
 from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem

@@ -7,15 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.budget import Kind
-from ccd_casadi.cases.sections import (
-    Case,
-    ChannelSection,
-    ControllerSection,
-    InnerSection,
-    LoopSection,
-    RobustSection,
-    WeightsSection,
-)
+from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
+from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.sections_problem import (

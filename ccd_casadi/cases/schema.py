@@ -9,9 +9,10 @@ from dataclasses import MISSING, Field, fields
 from typing import Any
 
 from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
+from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
-from ccd_casadi.cases.sections import SECTIONS, ChannelSection
+from ccd_casadi.cases.sections import SECTIONS
 from ccd_casadi.plants.registry import BUILDERS, MODELS
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"

@@ -5,7 +5,7 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +13,26 @@ from ccd_casadi.cases.checks import (
     ABOVE_ONE,
     FRACTION,
     POSITIVE,
-    Check,
     choice,
     count,
-    direction,
     factors,
     files,
-    flag,
     interval,
     number,
     points,
     signed,
-    steps,
-    table,
     tables,
     text,
 )
+from ccd_casadi.cases.controller_sections import ControllerSection, LoopSection
+from ccd_casadi.cases.keys import key
+from ccd_casadi.cases.run_sections import (
+    BaselineSection,
+    LimitsSection,
+    OuterSection,
+    SamplingSection,
+)
 from ccd_casadi.support.notebook import Shown
-
-
-def _key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
-    """A key of a section: its check, default, one sentence for a person, and its unit."""
-    metadata = {"check": check, "says": says, "unit": unit}
-    if default is MISSING:
-        return field(metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -82,15 +77,15 @@ class Parameter:
 class ObjectiveSection:
     """[objective] J = w1 f(θ) + w2 ω_b, ω_b in rad/s; of `minimise = "rms_error"` w2 e, m."""
 
-    w1: float = _key(
+    w1: float = key(
         number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
         says="what a unit of the hardware cost f(θ) weighs in J",
     )
-    w2: float = _key(
+    w2: float = key(
         signed("give a negative number: J must reward bandwidth"),
         says="what bandwidth is worth in J, negative, in 1/(rad/s); of an RMS error positive, 1/m",
     )
-    cost_unit: str = _key(text, "", says="of the hardware cost f(θ), for tables and pages")
+    cost_unit: str = key(text, "", says="of the hardware cost f(θ), for tables and pages")
 
 
 @dataclass(frozen=True)
@@ -101,26 +96,26 @@ class WeightsSection:
     much as a reference of one unit of length. Default: ten times M_K.
     """
 
-    M_S: float = _key(
+    M_S: float = key(
         POSITIVE, says="W_S at high frequency is 1/M_S: the peak of S that the weight lets pass"
     )
-    A_S: float = _key(
+    A_S: float = key(
         FRACTION, says="W_S at zero frequency is 1/A_S: the S that the weight lets pass there"
     )
-    c_K: float = _key(ABOVE_ONE, says="W_KS grows by this factor above omega_K")
-    omega_K_hz: float = _key(
+    c_K: float = key(ABOVE_ONE, says="W_KS grows by this factor above omega_K")
+    omega_K_hz: float = key(
         POSITIVE, says="W_KS is 1/M_K below this frequency and grows above it", unit="Hz"
     )
-    M_K: float = _key(
+    M_K: float = key(
         POSITIVE,
         says="gain of the controller that W_KS lets pass: about mass times (2π ω_b)²",
         unit="N/m",
     )
-    A_l: float = _key(POSITIVE, says="W_T at zero frequency is 1/A_l")
-    A_u: float = _key(
+    A_l: float = key(POSITIVE, says="W_T at zero frequency is 1/A_l")
+    A_u: float = key(
         FRACTION, says="W_T at high frequency is 1/A_u: the T that the weight lets pass there"
     )
-    disturbance: float | None = _key(
+    disturbance: float | None = key(
         POSITIVE,
         None,
         says='of "h_infinity_disturbance": weighs as one metre of reference; default 10 M_K',
@@ -136,50 +131,50 @@ class InnerSection:
     at a bandwidth of `bandwidth_least_hz` or more.
     """
 
-    S_max: float = _key(
+    S_max: float = key(
         number(1.0, math.inf, "give more than 1: a peak of S below 1 contradicts Bode's integral"),
         says="bound of the peak of S, as a ratio: 2 is 6 dB",
     )
-    S_low: float = _key(FRACTION, says="bound of |S| at omega_low")
-    omega_low_hz: float = _key(POSITIVE, says="where S_low holds", unit="Hz")
-    omega_S_hz: tuple[float, float] = _key(
+    S_low: float = key(FRACTION, says="bound of |S| at omega_low")
+    omega_low_hz: float = key(POSITIVE, says="where S_low holds", unit="Hz")
+    omega_S_hz: tuple[float, float] = key(
         interval, says="range of the frequency of W_S that is searched", unit="Hz"
     )
-    omega_T_hz: tuple[float, float] = _key(
+    omega_T_hz: tuple[float, float] = key(
         interval,
         says="range of the frequency of W_T that is searched; with sections its lower end is W_T's",
         unit="Hz",
     )
-    gamma_backoff: float = _key(
+    gamma_backoff: float = key(
         number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
         1.02,
         says="controllers are made at this multiple of γ_opt",
     )
-    sweep_points: tuple[int, int] = _key(
+    sweep_points: tuple[int, int] = key(
         points, (20, 20), says='mesh of (omega_S, omega_T) of method "sweep", as the paper has it'
     )
-    method: str = _key(
+    method: str = key(
         choice("search", "sweep"),
         "search",
         says="the best pair of weights by a search with exact derivatives, or on a mesh",
     )
-    shape: float | None = _key(
+    shape: float | None = key(
         number(1.0, 10.0, "give 1 to 10", closed=True),
         None,
         says="with sections: below ω_b, |S| stays under this times (ω/ω_b)/√2; absent: no bound",
     )
-    compliance_max: float | None = _key(
+    compliance_max: float | None = key(
         POSITIVE,
         None,
         says="bound of the peak of GS, the displacement by a force at any frequency",
         unit="m/N",
     )
-    minimise: str = _key(
+    minimise: str = key(
         choice("bandwidth", "rms_error"),
         "bandwidth",
         says="with sections: the negative bandwidth, or the RMS error of [budget]",
     )
-    bandwidth_least_hz: float | None = _key(
+    bandwidth_least_hz: float | None = key(
         POSITIVE,
         None,
         says='with minimise = "rms_error": the bandwidth that is kept at least',
@@ -191,14 +186,14 @@ class InnerSection:
 class SuspensionSection:
     """[suspension]: where rigid-body poles are put, and how many there must be (default: any)."""
 
-    frequency_hz: float = _key(
+    frequency_hz: float = key(
         POSITIVE,
         0.1,
         says="where the poles of rigid bodies are put, which synthesis needs off the axis",
         unit="Hz",
     )
-    damping_ratio: float = _key(POSITIVE, 0.7, says="of these poles")
-    rigid_modes: int | None = _key(
+    damping_ratio: float = key(POSITIVE, 0.7, says="of these poles")
+    rigid_modes: int | None = key(
         count(0), None, says="how many rigid-body modes there must be; absent: any number"
     )
 
@@ -216,139 +211,32 @@ class RobustSection:
     of plant options (loads, positions).
     """
 
-    resonance_shift: float = _key(
+    resonance_shift: float = key(
         number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
         0.0,
         says="every flexible frequency may be off by this share, all together",
     )
-    shifts: int = _key(
+    shifts: int = key(
         count(2), 5, says="how many plants are taken over that range (full-order kinds)"
     )
-    damping: tuple[float, ...] = _key(factors, (), says="factors of every modal damping, besides 1")
-    design_at: str = _key(
+    damping: tuple[float, ...] = key(factors, (), says="factors of every modal damping, besides 1")
+    design_at: str = key(
         choice("auto", "low", "nominal", "high"),
         "auto",
         says='which plant of the range a full-order controller is made on; "auto" tries all three',
     )
-    mode_shift: float = _key(
+    mode_shift: float = key(
         number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
         0.0,
         says="with sections: each flexible mode may be off by this share on its own",
     )
-    gain: float = _key(
+    gain: float = key(
         number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
         0.0,
         says="with sections: the plant's gain may be off by this share",
     )
-    plants: tuple[str, ...] = _key(
+    plants: tuple[str, ...] = key(
         files, (), says="with sections: TOML files of plant options: other loads, positions, meshes"
-    )
-
-
-@dataclass(frozen=True)
-class ChannelSection:
-    """[controller.channel.NAME] of a plant with several outputs: what differs from [controller].
-
-    `outputs`: how the channel's measurement is made of the plant's, `inputs`: how its force acts on
-    the plant's (default: as `outputs`). Either every channel gives them or none: then the channels
-    are those that are found, named "1", "2", …. `like` names a channel with the same parameters, as
-    tip and tilt of a square stage may have: then nothing else of the structure is given.
-
-    `S_max`, `M_K` and `bandwidth_ratio` ask more of this channel than of the whole loop.
-    """
-
-    outputs: tuple[float, ...] | None = _key(
-        direction, None, says="how the channel's measurement is made of the plant's outputs"
-    )
-    inputs: tuple[float, ...] | None = _key(
-        direction,
-        None,
-        says="how the channel's force acts on the plant's inputs; default: as outputs",
-    )
-    like: str | None = _key(
-        text, None, says="the channel whose parameters this one has: one controller for both"
-    )
-    integrator: bool | None = _key(flag, None, says="instead of [controller]'s")
-    lead: int | None = _key(count(0), None, says="instead of [controller]'s")
-    biquads: int | None = _key(count(0), None, says="instead of [controller]'s")
-    roll_off: int | None = _key(count(0), None, says="instead of [controller]'s")
-    least_damping: float | None = _key(
-        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
-        None,
-        says="instead of [controller]'s",
-    )
-    S_max: float | None = _key(
-        number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
-        None,
-        says="bound of the peak of this channel's S, tighter than [inner]'s, which the whole keeps",
-    )
-    M_K: float | None = _key(
-        POSITIVE,
-        None,
-        says="of this channel's W_KS, lower than [weights]': its force counts more",
-        unit="N/m",
-    )
-    bandwidth_ratio: float = _key(
-        number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
-        1.0,
-        says="this channel's bandwidth is at least so many times ω_b, which is the slowest one's",
-    )
-
-
-@dataclass(frozen=True)
-class ControllerSection:
-    """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
-    of full order with an input disturbance beside the reference, or "sections".
-
-    The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
-    of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
-    The search starts at `starts` places. `channel` overrides the structure of single channels.
-    """
-
-    structure: str = _key(
-        choice("h_infinity", "h_infinity_disturbance", "sections"),
-        "h_infinity",
-        says="mixed sensitivity, the same with an input disturbance, or a fixed structure",
-    )
-    integrator: bool = _key(flag, True, says="of sections: an integrator with a zero")
-    lead: int = _key(count(0), 1, says="of sections: how many first-order leads")
-    biquads: int = _key(
-        count(0),
-        2,
-        says="of sections: how many pairs of zeros with pairs of poles: notches, skewed notches",
-    )
-    roll_off: int = _key(count(0), 2, says="of sections: order of the roll-off")
-    weighted_level: float | None = _key(
-        POSITIVE,
-        None,
-        says="of sections: bound of |W_KS KS| and |W_T T|; absent: no bound, and results say so",
-    )
-    least_damping: float = _key(
-        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
-        0.0,
-        says="of sections: least damping ratio of their zeros and poles",
-    )
-    starts: int = _key(count(1), 24, says="of sections: how many places the search starts from")
-    channel: tuple[tuple[str, ChannelSection], ...] = _key(
-        table, (), says="tables [controller.channel.NAME] of plants with several outputs"
-    )
-
-
-@dataclass(frozen=True)
-class LoopSection:
-    """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
-
-    rate_hz: float | None = _key(
-        POSITIVE,
-        None,
-        says="with sections: the loop is sampled with a hold at this rate; absent: continuous",
-        unit="Hz",
-    )
-    delay_us: float = _key(
-        number(0.0, 1e6, "give 0 to 1e6", closed=True),
-        0.0,
-        says="from reading the sensor to the new force",
-        unit="µs",
     )
 
 
@@ -359,91 +247,17 @@ class BudgetSection:
     Each kind is one table or several of them; their keys are checked in `budget`.
     """
 
-    window_ms: float | None = _key(
+    window_ms: float | None = key(
         POSITIVE, None, says="window of the moving average and the moving deviation", unit="ms"
     )
-    force: tuple[Mapping[str, Any], ...] = _key(tables, (), says="spectra of forces on the stage")
-    floor_motion: tuple[Mapping[str, Any], ...] = _key(
+    force: tuple[Mapping[str, Any], ...] = key(tables, (), says="spectra of forces on the stage")
+    floor_motion: tuple[Mapping[str, Any], ...] = key(
         tables, (), says="spectra of the floor's motion"
     )
-    sensor_noise: tuple[Mapping[str, Any], ...] = _key(
+    sensor_noise: tuple[Mapping[str, Any], ...] = key(
         tables, (), says="spectra of the sensor's noise"
     )
-    setpoint: tuple[Mapping[str, Any], ...] = _key(tables, (), says="spectra of the setpoint")
-
-
-@dataclass(frozen=True)
-class SamplingSection:
-    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
-
-    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
-    """
-
-    design: str = _key(choice("grid", "sobol", "lhs"), "grid", says="how θ is spread for samples")
-    points: int = _key(
-        count(2), 5, says="of θ: on each axis of a grid, in all for the other designs"
-    )
-    lifted_points: int = _key(
-        count(0), 0, says="designs of (θ, ω_S, ω_T) for the lifted formulation; 0 chooses"
-    )
-
-
-@dataclass(frozen=True)
-class OuterSection:
-    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
-
-    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
-    that predicts left-out samples best. `box_points`: true inner problems spread over the box of θ
-    that a solve ends with a look at, those that it has solved already among them; 0: none.
-    """
-
-    starts: int = _key(count(1), 16, says="of IPOPT on the surrogates")
-    direct_starts: int = _key(count(1), 4, says="of IPOPT on the true problem")
-    tolerance: float = _key(
-        FRACTION, 1e-3, says="to which prediction and truth have to agree, relative"
-    )
-    max_refinements: int = _key(count(0), 12, says="rounds of adding true samples at the optimum")
-    surrogate: str = _key(
-        choice("matern52", "rbf", "auto"),
-        "matern52",
-        says='kernel of the Gaussian processes; "auto": what predicts left-out samples best',
-    )
-    box_points: int = _key(
-        count(0), 32, says="θ spread over the box that every solve ends with a look at; 0: none"
-    )
-
-
-@dataclass(frozen=True)
-class BaselineSection:
-    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
-
-    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
-    and a Latin hypercube.
-    """
-
-    first_resonance_hz: float = _key(
-        POSITIVE,
-        250.0,
-        says="of the sequential design: its first resonance is at least this",
-        unit="Hz",
-    )
-    steps: tuple[float, ...] = _key(
-        steps, (0.02, 0.05, 0.1), says="first steps that the descents try, as shares of the box"
-    )
-    starts: int = _key(count(1), 3, says="of the descents: the case's own and a Latin hypercube")
-    max_iterations: int = _key(count(1), 100, says="of a descent")
-
-
-@dataclass(frozen=True)
-class LimitsSection:
-    """[limits]: how long a user's plant function may take at each call, in s."""
-
-    plant_seconds: float = _key(
-        POSITIVE,
-        60.0,
-        says="how long a plant function of one's own may take at each call",
-        unit="s",
-    )
+    setpoint: tuple[Mapping[str, Any], ...] = key(tables, (), says="spectra of the setpoint")
 
 
 @dataclass(frozen=True)

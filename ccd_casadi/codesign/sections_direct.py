@@ -1,12 +1,13 @@
 """IPOPT on the true ω_b*(θ) of a fixed structure, and a polish that passes its kinks."""
 
+from contextlib import suppress
+
 import numpy as np
 
 from ccd_casadi.codesign.bundle import Local, descend
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
-    OuterSolution,
     nested_program,
     solve_program,
 )
@@ -56,7 +57,7 @@ def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> Formul
     return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
 
 
-def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, OuterSolution | None]:
+def polish_sections(sampler: Sampler, theta: Array) -> BandwidthSample:
     """From a design nearly optimal to the best θ that is found near it on the true problem.
 
     By pieces (`bundle`), which know kinks; by IPOPT where J has one gradient and that is not yet
@@ -72,17 +73,12 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[BandwidthSample, Ou
     if sections_kkt(problem, best).stationarity > STATIONARY:
         best = _by_pieces(truth, best)
     if sections_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
-        return best, None
+        return best
     program = nested_program(problem, truth)
     program = type(program)(**{**vars(program), "exact_hessian": False})
-    solution: OuterSolution | None = None
-    try:
-        solution = solve_program(
-            program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED
-        )
-    except OuterFailure:
-        pass
-    return min(truth.known.values(), key=lambda s: objective(problem, s)), solution
+    with suppress(OuterFailure):  # what it has asked for on its way counts
+        solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
+    return min(truth.known.values(), key=lambda s: objective(problem, s))
 
 
 def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:

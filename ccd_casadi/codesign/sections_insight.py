@@ -17,6 +17,7 @@ from ccd_casadi.codesign.pareto import FLAT, STARTS, Front, efficient, ends_of, 
 from ccd_casadi.codesign.post_optimal import WEAK, PostOptimal, Response
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.stored import stored_thetas
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
@@ -154,7 +155,7 @@ def _loop_bounds(
 ) -> list[tuple[str, float, float]]:
     """Bounds on the loop that the case gives: name, value, and d ln ω_b/d ln of it."""
     sections = sections_of_problem(problem)
-    effort = sum(value for name, value in mu.items() if name.partition(" of ")[0] == "KS")
+    effort = sum(value for name, value in mu.items() if kind_and_channel(name)[0] == "KS")
     rows = [
         ("S_max", problem.inner.S_max, mu.get("S_MAX", 0.0)),
         ("S_low", problem.inner.S_low, mu.get("S_LOW", 0.0)),

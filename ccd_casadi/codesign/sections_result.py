@@ -21,6 +21,7 @@ from ccd_casadi.codesign.sections_verdict import sections_verdict
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
@@ -37,18 +38,6 @@ BINDS = {
     "T": "weighted_level of T",
     "GS": "compliance_max",
 }
-
-
-def bound_words(name: str) -> str:
-    """A kind of bound as the case has it.
-
-    >>> bound_words("S_LOW"), bound_words("S_MAX of tilt")
-    ('S_low', 'S_max of channel tilt')
-    """
-    kind, _, channel = name.partition(" of ")
-    return BINDS[kind] + (f" of channel {channel}" if channel else "")
-
-
 WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
 
 
@@ -108,10 +97,12 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
 def active_of(made: SectionsDesign) -> list[str]:
     """What binds the controller."""
     order = list(BINDS)
-    names = [name for name, mu in made.multipliers.items() if mu > 1e-6]
-    names = [name for name in names if name.partition(" of ")[0] in BINDS]
-    kinds = sorted(names, key=lambda name: (order.index(name.partition(" of ")[0]), name))
-    return [bound_words(name) for name in kinds]
+    names = [kind_and_channel(name) for name, mu in made.multipliers.items() if mu > 1e-6]
+    bounds = [(order.index(kind), channel) for kind, channel in names if kind in BINDS]
+    return [
+        BINDS[order[kind]] + (f" of channel {channel}" if channel else "")
+        for kind, channel in sorted(bounds)
+    ]
 
 
 def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:

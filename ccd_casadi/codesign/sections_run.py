@@ -170,7 +170,7 @@ class _End:
 
 def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
-    best, _ = polish_sections(asked, theta)
+    best = polish_sections(asked, theta)
     found = sections_value(problem, best.theta)
     raced = _raced(asked.store, problem, best.theta, quiet, asked.workers)
     tell = _teller("at the end", quiet)

@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ccd_casadi.cases.case import problem_of
+from ccd_casadi.cases.controller_sections import LoopSection
 from ccd_casadi.cases.kinds import with_structure
-from ccd_casadi.cases.sections import Case, LoopSection
+from ccd_casadi.cases.sections import Case
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ
 

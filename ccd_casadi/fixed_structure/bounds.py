@@ -8,6 +8,16 @@ from typing import Protocol
 from ccd_casadi.synthesis.weights import Weights
 
 
+def kind_and_channel(name: str) -> tuple[str, str]:
+    """A multiplier's name in parts: the kind of bound, and the channel whose own it is, if any.
+
+    >>> kind_and_channel("S_MAX"), kind_and_channel("S_MAX of tilt")
+    (('S_MAX', ''), ('S_MAX', 'tilt'))
+    """
+    kind, _, channel = name.partition(" of ")
+    return kind, channel
+
+
 @dataclass(frozen=True)
 class ChannelBounds:
     """What one channel keeps besides the whole loop; None, or a ratio of 1: nothing of its own.

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
@@ -87,7 +88,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     over_kappa = []
     for kind, words in names.items():
         for name in (name for name, value in mu.items() if value > 1e-6):
-            own, _, channel = name.partition(" of ")
+            own, channel = kind_and_channel(name)
             if own == kind:
                 of = f" of channel {channel}" if channel else ""
                 loosened = f"a bound looser by 1 % would {gain} by {number(mu[name], 3)} %"

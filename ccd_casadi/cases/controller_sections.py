@@ -1,0 +1,114 @@
+"""[controller] and [loop] of a case file: what the controller is, and how it runs."""
+
+import math
+from dataclasses import dataclass
+
+from ccd_casadi.cases.checks import POSITIVE, choice, count, direction, flag, number, table, text
+from ccd_casadi.cases.keys import key
+
+
+@dataclass(frozen=True)
+class ChannelSection:
+    """[controller.channel.NAME] of a plant with several outputs: what differs from [controller].
+
+    `outputs`: how the channel's measurement is made of the plant's, `inputs`: how its force acts on
+    the plant's (default: as `outputs`). Either every channel gives them or none: then the channels
+    are those that are found, named "1", "2", …. `like` names a channel with the same parameters, as
+    tip and tilt of a square stage may have: then nothing else of the structure is given.
+
+    `S_max`, `M_K` and `bandwidth_ratio` ask more of this channel than of the whole loop.
+    """
+
+    outputs: tuple[float, ...] | None = key(
+        direction, None, says="how the channel's measurement is made of the plant's outputs"
+    )
+    inputs: tuple[float, ...] | None = key(
+        direction,
+        None,
+        says="how the channel's force acts on the plant's inputs; default: as outputs",
+    )
+    like: str | None = key(
+        text, None, says="the channel whose parameters this one has: one controller for both"
+    )
+    integrator: bool | None = key(flag, None, says="instead of [controller]'s")
+    lead: int | None = key(count(0), None, says="instead of [controller]'s")
+    biquads: int | None = key(count(0), None, says="instead of [controller]'s")
+    roll_off: int | None = key(count(0), None, says="instead of [controller]'s")
+    least_damping: float | None = key(
+        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
+        None,
+        says="instead of [controller]'s",
+    )
+    S_max: float | None = key(
+        number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
+        None,
+        says="bound of the peak of this channel's S, tighter than [inner]'s, which the whole keeps",
+    )
+    M_K: float | None = key(
+        POSITIVE,
+        None,
+        says="of this channel's W_KS, lower than [weights]': its force counts more",
+        unit="N/m",
+    )
+    bandwidth_ratio: float = key(
+        number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
+        1.0,
+        says="this channel's bandwidth is at least so many times ω_b, which is the slowest one's",
+    )
+
+
+@dataclass(frozen=True)
+class ControllerSection:
+    """[controller]: "h_infinity", of full order by mixed sensitivity, "h_infinity_disturbance",
+    of full order with an input disturbance beside the reference, or "sections".
+
+    The sections: an integrator, `lead` first-order leads, `biquads` (each a pair of zeros and one
+    of poles), a roll-off of order `roll_off`. |W_KS KS| and |W_T T| stay below `weighted_level`.
+    The search starts at `starts` places. `channel` overrides the structure of single channels.
+    """
+
+    structure: str = key(
+        choice("h_infinity", "h_infinity_disturbance", "sections"),
+        "h_infinity",
+        says="mixed sensitivity, the same with an input disturbance, or a fixed structure",
+    )
+    integrator: bool = key(flag, True, says="of sections: an integrator with a zero")
+    lead: int = key(count(0), 1, says="of sections: how many first-order leads")
+    biquads: int = key(
+        count(0),
+        2,
+        says="of sections: how many pairs of zeros with pairs of poles: notches, skewed notches",
+    )
+    roll_off: int = key(count(0), 2, says="of sections: order of the roll-off")
+    weighted_level: float | None = key(
+        POSITIVE,
+        None,
+        says="of sections: bound of |W_KS KS| and |W_T T|; absent: no bound, and results say so",
+    )
+    least_damping: float = key(
+        number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
+        0.0,
+        says="of sections: least damping ratio of their zeros and poles",
+    )
+    starts: int = key(count(1), 24, says="of sections: how many places the search starts from")
+    channel: tuple[tuple[str, ChannelSection], ...] = key(
+        table, (), says="tables [controller.channel.NAME] of plants with several outputs"
+    )
+
+
+@dataclass(frozen=True)
+class LoopSection:
+    """[loop]: sampled with a hold at `rate_hz`; `delay_us` from measurement to force."""
+
+    rate_hz: float | None = key(
+        POSITIVE,
+        None,
+        says="with sections: the loop is sampled with a hold at this rate; absent: continuous",
+        unit="Hz",
+    )
+    delay_us: float = key(
+        number(0.0, 1e6, "give 0 to 1e6", closed=True),
+        0.0,
+        says="from reading the sensor to the new force",
+        unit="µs",
+    )
