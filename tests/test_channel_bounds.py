@@ -200,7 +200,8 @@ def test_what_the_whole_asks_anyway_changes_nothing(off: tuple[float, ...]) -> N
     assert max(peaks) <= own.certificate.plants[0].S_peak * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("off", [(0.0,), pytest.param((0.0, 0.2), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("off", [(0.0,), (0.0, 0.2)])
 def test_a_dense_grid_sees_every_channels_bounds_held(off: tuple[float, ...]) -> None:
     """On uncoupled and on coupled plants; they cost bandwidth, so that they do something."""
     asked = {"1": {"bandwidth_ratio": 1.5}, "2": {"S_max": 1.3}, "3": {"M_K": 0.05 * M_K}}

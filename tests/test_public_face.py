@@ -14,9 +14,16 @@ NAMES = sorted(set(ccd_casadi.__all__) - {"__version__"})
 HEAVY = ("numpy", "numba", "casadi", "matplotlib", "scipy")
 
 
-def test_importing_it_loads_nothing() -> None:
+# what a solve can do without until its page is drawn: a second and more to import together
+LATER = ("matplotlib", "plotly", "pandas", "sklearn", "scipy.stats", "dask", "control", "gmsh")
+
+
+@pytest.mark.parametrize(
+    ("module", "heavy"), [("ccd_casadi", HEAVY), ("ccd_casadi.codesign.run", LATER)]
+)
+def test_importing_it_loads_nothing_that_can_wait(module: str, heavy: tuple[str, ...]) -> None:
     words = (
-        f"import sys, json, ccd_casadi; print(json.dumps([m for m in {HEAVY} if m in sys.modules]))"
+        f"import sys, json, {module}; print(json.dumps([m for m in {heavy} if m in sys.modules]))"
     )
     found = subprocess.run(
         [sys.executable, "-c", words], capture_output=True, text=True, check=True

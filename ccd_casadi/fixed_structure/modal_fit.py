@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.support.arrays import Array
@@ -87,7 +87,7 @@ class ModalFit(Shown):
         """
         if not 0.0 < confidence < 1.0:
             raise UserError(f"confidence is {confidence:g}; give a share between 0 and 1")
-        k = float(np.sqrt(chi2.ppf(confidence, len(self.covariance))))
+        k = float(np.sqrt(chdtri(len(self.covariance), 1.0 - confidence)))
         ends = k * self.covariance / self.deviations[:, None]
         ends = ends[np.argsort(-np.linalg.norm(ends, axis=1))]
         return [self.system(), *(self.system(sign * row) for row in ends for sign in (1.0, -1.0))]

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from ccd_casadi.plants.cad import solid
 from ccd_casadi.support.arrays import Array
@@ -84,6 +83,8 @@ def draw_morph(
     """
     names = tuple(bounds)
     lower, upper = np.array([bounds[name] for name in names], float).T
+    from scipy.stats import qmc  # half a second to import, which every command would wait for
+
     powers = product(range(degree + 1), repeat=len(names))
     exponents = np.array([row for row in powers if sum(row) <= degree])
     count = 2 * len(exponents) + UNSEEN
