@@ -11,9 +11,9 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-b
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
 
-# Types and pages are checked beside the tests, which leave a core idle now and then.
+# Types and pages are checked beside the tests, whose processes wait for each other now and then.
 test: setup-test
-	$(MAKE) --no-print-directory -j 2 docs lint tests
+	$(MAKE) --no-print-directory -j 2 tests lint docs
 
 tests: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
