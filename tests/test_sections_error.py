@@ -15,7 +15,7 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.sections_run import seeded_and_prepared
+from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.codesign.sections_truth import objective
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem

@@ -25,7 +25,8 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
 from ccd_casadi.codesign.run import conclude, rescue, solution_of_sections, write_run
-from ccd_casadi.codesign.sections_run import conclude_sections, seeded_and_prepared
+from ccd_casadi.codesign.sections_races import seeded_and_prepared
+from ccd_casadi.codesign.sections_run import conclude_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of

@@ -5,9 +5,6 @@ a search for worse plants ask whether these were good enough at the θ that was 
 they find joins, and the outer problem is solved again, a few times at most.
 """
 
-import sys
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +16,7 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
 from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
@@ -26,42 +24,17 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import (
-    joined,
-    prepared,
-    race,
-    sections_value,
-    too_slow,
-    valued,
-    with_range,
-)
-from ccd_casadi.inner_problem.sections_error import least_error_at
-from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
-from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 AGAIN = 3  # times that the outer problem is solved at most
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
-
-
-@dataclass(frozen=True)
-class Raced:
-    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count).
-
-    With `error` (m) the least RMS error from there, and κ that of its controller.
-    """
-
-    certified: bool
-    bandwidth: float
-    kappa: tuple[float, ...]
-    optima: tuple[tuple[float, int], ...]
-    error: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -172,8 +145,8 @@ def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
     best = polish_sections(asked, theta)
     found = sections_value(problem, best.theta)
-    raced = _raced(asked.store, problem, best.theta, quiet, asked.workers)
-    tell = _teller("at the end", quiet)
+    raced = raced_at(asked.store, problem, best.theta, quiet, asked.workers)
+    tell = teller("at the end", quiet)
     worst, members = worst_members(problem, best.theta, found.design, 0, tell)
     return _End(best, found.design, found.envelope, raced, worst, members)
 
@@ -251,96 +224,3 @@ def _nested(
     options = Nested("sobol", points, formulation.starts, formulation.tolerance,
                      formulation.max_refinements, formulation.kernel)  # fmt: skip
     return solve_nested(asked, options, seed=seed, given=given, gradients=True)
-
-
-def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
-    return with_range(replace(problem, sections=replace(sections_of_problem(problem), seed=seed)))
-
-
-def seeded_and_prepared(
-    store: SampleStore,
-    problem: CoDesignProblem,
-    seed: int,
-    quiet: bool,
-    workers: Pool | None = None,
-) -> tuple[CoDesignProblem, str]:
-    """Anchors and members, from the store where an earlier run has found them.
-
-    Second, in words, why there are no anchors; empty where there are.
-    """
-    problem = _seeded(problem, seed)
-    key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
-    known = store.get_result(key)
-    if known is None:
-        tell = _teller("race at the start", quiet)
-        found, made = prepared(problem, tell, workers)
-        if made.certified and sections_of_problem(problem).of_error:
-            made = too_slow(problem, made)
-        if made.certified and sections_of_problem(problem).of_error:
-            found, least = least_error_at(found, problem.start, made, tell)
-            made = least.design
-        sections = sections_of_problem(found)
-        known = {
-            "anchors": [list(a) for a in sections.anchors],
-            "members": [[option, list(point)] for option, point in sections.members],
-            "words": "" if made.certified else made.words,
-            "error_anchors": [list(a) for a in sections.error_anchors],
-        }
-        owner = problem_hash({"race": problem_hash(problem.identity())})
-        store.put_unit([], (key, owner, problem.start, known), None)
-    try:
-        anchors = tuple(tuple(map(float, a)) for a in known["anchors"])
-        members = tuple((int(o), tuple(map(float, p))) for o, p in known["members"])
-        words = str(known["words"])
-        of_error = tuple(tuple(map(float, a)) for a in known.get("error_anchors", ()))
-    except (KeyError, TypeError, ValueError) as error:
-        raise store.damaged() from error
-    sections = replace(
-        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=of_error
-    )
-    return replace(problem, sections=sections), words
-
-
-def _raced(
-    store: SampleStore,
-    problem: CoDesignProblem,
-    theta: tuple[float, ...],
-    quiet: bool,
-    workers: Pool | None = None,
-) -> Raced:
-    """A full race at θ, from the store where it was run before."""
-    owner = problem_hash({"race": problem_hash(problem.identity())})
-    key = sample_key(owner, theta, 0.0, 0.0)
-    known = store.get_result(key)
-    if known is None:
-        made = race(problem, theta, _teller("race at the end", quiet), workers)
-        error = None
-        if made.certified and sections_of_problem(problem).of_error:
-            found = valued(problem, theta, plants_of(problem, theta), made, 1)
-            made, error = replace(found.design, local_optima=made.local_optima), found.error
-        known = {
-            "error": error if made.certified else None,
-            "certified": made.certified,
-            "bandwidth": float(made.bandwidth) if made.certified else 0.0,
-            "kappa": [float(v) for v in made.kappa] if made.certified else [],
-            "optima": [[item.bandwidth, item.count] for item in made.local_optima],
-        }
-        store.put_unit([], (key, owner, theta, known), None)
-    try:
-        optima = tuple((float(value), int(count)) for value, count in known["optima"])
-        kappa = tuple(map(float, known["kappa"]))
-        error = float("nan") if known.get("error") is None else float(known["error"])
-        return Raced(bool(known["certified"]), float(known["bandwidth"]), kappa, optima, error)
-    except (KeyError, TypeError, ValueError) as error:
-        raise store.damaged() from error
-
-
-def _teller(label: str, quiet: bool) -> Callable[[str], None]:
-    """Lines of progress on stderr."""
-
-    def tell(words: str) -> None:
-        if not quiet:
-            with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                print(f"{label}: {words}", file=sys.stderr, flush=True)
-
-    return tell

@@ -1,0 +1,125 @@
+"""The races of a co-design with a controller of fixed structure, kept in the store of samples.
+
+At the start a race and a search for worst plants give the problem its anchors and members; at the
+end another asks whether they were good enough. A run that goes on from its store races neither
+again.
+"""
+
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, too_slow, valued, with_range
+from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
+from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.support.process_pool import Pool
+
+
+@dataclass(frozen=True)
+class Raced:
+    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count).
+
+    With `error` (m) the least RMS error from there, and κ that of its controller.
+    """
+
+    certified: bool
+    bandwidth: float
+    kappa: tuple[float, ...]
+    optima: tuple[tuple[float, int], ...]
+    error: float = float("nan")
+
+
+def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
+    return with_range(replace(problem, sections=replace(sections_of_problem(problem), seed=seed)))
+
+
+def seeded_and_prepared(
+    store: SampleStore,
+    problem: CoDesignProblem,
+    seed: int,
+    quiet: bool,
+    workers: Pool | None = None,
+) -> tuple[CoDesignProblem, str]:
+    """Anchors and members, from the store where an earlier run has found them.
+
+    Second, in words, why there are no anchors; empty where there are.
+    """
+    problem = _seeded(problem, seed)
+    key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
+    stored = store.get_result(key)
+    if stored is None:
+        tell = teller("race at the start", quiet)
+        found, made = prepared(problem, tell, workers)
+        if made.certified and sections_of_problem(problem).of_error:
+            made = too_slow(problem, made)
+        if made.certified and sections_of_problem(problem).of_error:
+            found, least = least_error_at(found, problem.start, made, tell)
+            made = least.design
+        sections = sections_of_problem(found)
+        stored = {
+            "anchors": [list(a) for a in sections.anchors],
+            "members": [[option, list(point)] for option, point in sections.members],
+            "words": "" if made.certified else made.words,
+            "error_anchors": [list(a) for a in sections.error_anchors],
+        }
+        owner = problem_hash({"race": problem_hash(problem.identity())})
+        store.put_unit([], (key, owner, problem.start, stored), None)
+    try:
+        anchors = tuple(tuple(map(float, a)) for a in stored["anchors"])
+        members = tuple((int(o), tuple(map(float, p))) for o, p in stored["members"])
+        words = str(stored["words"])
+        of_error = tuple(tuple(map(float, a)) for a in stored.get("error_anchors", ()))
+    except (KeyError, TypeError, ValueError) as error:
+        raise store.damaged() from error
+    sections = replace(
+        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=of_error
+    )
+    return replace(problem, sections=sections), words
+
+
+def raced_at(
+    store: SampleStore,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    quiet: bool,
+    workers: Pool | None = None,
+) -> Raced:
+    """A full race at θ, from the store where it was run before."""
+    owner = problem_hash({"race": problem_hash(problem.identity())})
+    key = sample_key(owner, theta, 0.0, 0.0)
+    stored = store.get_result(key)
+    if stored is None:
+        made = race(problem, theta, teller("race at the end", quiet), workers)
+        error = None
+        if made.certified and sections_of_problem(problem).of_error:
+            found = valued(problem, theta, plants_of(problem, theta), made, 1)
+            made, error = replace(found.design, local_optima=made.local_optima), found.error
+        stored = {
+            "error": error if made.certified else None,
+            "certified": made.certified,
+            "bandwidth": float(made.bandwidth) if made.certified else 0.0,
+            "kappa": [float(v) for v in made.kappa] if made.certified else [],
+            "optima": [[item.bandwidth, item.count] for item in made.local_optima],
+        }
+        store.put_unit([], (key, owner, theta, stored), None)
+    try:
+        optima = tuple((float(value), int(count)) for value, count in stored["optima"])
+        kappa = tuple(map(float, stored["kappa"]))
+        error = float("nan") if stored.get("error") is None else float(stored["error"])
+        return Raced(bool(stored["certified"]), float(stored["bandwidth"]), kappa, optima, error)
+    except (KeyError, TypeError, ValueError) as error:
+        raise store.damaged() from error
+
+
+def teller(label: str, quiet: bool) -> Callable[[str], None]:
+    """Lines of progress on stderr."""
+
+    def tell(words: str) -> None:
+        if not quiet:
+            with suppress(OSError, ValueError):  # a stream that fails ends the printing
+                print(f"{label}: {words}", file=sys.stderr, flush=True)
+
+    return tell
