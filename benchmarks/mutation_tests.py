@@ -64,7 +64,8 @@ GROUPS = (
             )
         ),
         (*DESIGN_TESTS, "tests/test_closed_loop.py", "tests/test_plant.py",
-         "tests/test_derivatives.py", "tests/test_backends.py", "tests/test_robust_design.py"),
+         "tests/test_derivatives.py", "tests/test_backends.py", "tests/test_robust_design.py",
+         "tests/test_compliance.py"),
         "not robust_co_design",
         interpreted=False,
     ),

@@ -2,8 +2,9 @@
 
 Python raises KeyboardInterrupt between two instructions of whatever runs. Three places need care:
 imports (nothing has begun: the process just ends), finalizers (the exception is printed and lost),
-and compiled code (it comes out as another exception, with or without a trace of the first; CasADi's
-solvers swallow it, so `interrupts_kept` holds it until they are done).
+and compiled code. There it comes out as another exception, with or without a trace of the first, or
+not at all: `raise_dropped` asks between the steps of long work. CasADi's solvers swallow it, so
+`interrupts_kept` holds it until they are done.
 """
 
 import _thread
@@ -18,6 +19,7 @@ from typing import Any
 
 AGAIN = 0.01  # s
 _pressed = threading.Event()
+_noticing = threading.Event()
 _kept = threading.Event()
 
 
@@ -73,13 +75,24 @@ def ctrl_c_noticed() -> Iterator[None]:
         timer.start()
 
     sys.unraisablehook = noticed
+    _noticing.set()
     try:
         yield
     finally:
         active = False
+        _noticing.clear()
         sys.unraisablehook = before
         if ours:
             signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def raise_dropped() -> None:
+    """Raise the KeyboardInterrupt that a compiled library dropped on its way, if one did.
+
+    Long work calls it between its steps; it does nothing outside `ctrl_c_noticed`.
+    """
+    if _pressed.is_set() and _noticing.is_set():
+        raise KeyboardInterrupt
 
 
 def was_ctrl_c(error: BaseException | None) -> bool:
@@ -121,5 +134,5 @@ def interrupts_kept() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         held = _kept.is_set()
         _kept.clear()
-    if held:
-        raise KeyboardInterrupt
+        if held:  # also where the block ends with an error, which may be of the end that was asked
+            raise KeyboardInterrupt

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from surrogates.interface import Array
-from surrogates.interrupts import interrupts_kept
+from surrogates.interrupts import interrupts_kept, raise_dropped
 
 OPTIONS: dict[str, Any] = {
     "print_time": False,
@@ -50,6 +50,7 @@ def end_points(
     solver = ca.nlpsol("program", "ipopt", program, OPTIONS | (options or {}))
     found = []
     for start in starts:
+        raise_dropped()
         with interrupts_kept():
             result = solver(x0=np.clip(start, 0.0, 1.0), lbx=0.0, ubx=1.0, lbg=g_lower, ubg=0.0)
         stats = solver.stats()

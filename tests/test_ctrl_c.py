@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogates.interrupts import ctrl_c_noticed, was_ctrl_c
+from surrogates.interrupts import ctrl_c_noticed, interrupts_kept, raise_dropped, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.
@@ -59,3 +59,23 @@ def test_what_stumbles_over_a_dropped_ctrl_c_counts_as_one() -> None:
         pass
     assert not was_ctrl_c(error), "an earlier command's Ctrl-C is no excuse for the next"
     assert was_ctrl_c(KeyboardInterrupt())
+
+
+def test_a_dropped_ctrl_c_is_raised_at_the_next_step() -> None:
+    with ctrl_c_noticed():
+        raise_dropped()  # none has come
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            raise_dropped()
+    raise_dropped()  # a command's own, not for who comes later
+
+
+def test_a_held_ctrl_c_comes_also_where_the_block_fails() -> None:
+    def asked_to_end() -> None:
+        with interrupts_kept():
+            signal.raise_signal(signal.SIGINT)
+            raise RuntimeError("the solver was asked to end")
+
+    with pytest.raises(KeyboardInterrupt):
+        asked_to_end()

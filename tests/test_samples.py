@@ -84,6 +84,11 @@ def test_key_does_not_confuse_theta_with_frequencies() -> None:
     assert sample_key("p", [1], 2, 3) == sample_key("p", [1.0], 2.0, 3.0)
 
 
+def test_integers_that_no_float_holds_are_kept_apart() -> None:
+    assert problem_hash({"seed": 2**53 + 1}) != problem_hash({"seed": 2**53})
+    assert problem_hash({"seed": -(2**53) - 1}) != problem_hash({"seed": -(2**53)})
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_no_key_of_what_is_not_finite(value: float) -> None:
     with pytest.raises(ValueError, match="give finite numbers"):

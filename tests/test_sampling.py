@@ -195,6 +195,16 @@ def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     assert math.isnan(sampler.trace[1].objective)
 
 
+def test_an_easier_problems_designs_are_counted_and_not_traced(tmp_path: Path) -> None:
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        sampler = Sampler(problem(), store, Workers(1))
+        beside, easier = sampler.of(problem()), sampler.of(problem(), traced=False)
+        easier._spend("a", 5, (60.0, 60.0), 12.0)
+        assert (sampler.syntheses, sampler.trace) == (5, [])
+        beside._spend("b", 2, (61.0, 60.0), 10.0)
+    assert [entry.syntheses for entry in sampler.trace] == [7]
+
+
 def test_the_rows_of_a_unit_share_its_seconds() -> None:
     began = time.perf_counter()
     rows, (key, theta, payload) = units.inner_unit((problem(), "p", "k", (60.0, 60.0)))

@@ -7,7 +7,7 @@ import control
 import numpy as np
 import pytest
 from helpers import few, random_plant
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
@@ -48,6 +48,7 @@ positive = st.floats(1e-3, 1e3)
 
 
 @given(positive, positive, positive, positive, positive)
+@example(stroke=577.0, v=0.004, a=1.0, j=343.0, s=848.0)  # 40 hours at one velocity
 @few(max_examples=100)
 def test_a_setpoint_arrives_at_rest_within_its_bounds(
     stroke: float, v: float, a: float, j: float, s: float
@@ -57,13 +58,15 @@ def test_a_setpoint_arrives_at_rest_within_its_bounds(
     assert (profile.durations >= 0.0).all()
     _, states = flown(profile)
     bounds = np.array([stroke, v, a, j])
-    assert (np.abs(states) <= bounds * (1.0 + 1e-9)).all()
+    # a last digit of acceleration and jerk, integrated over the whole move
+    T, digit = profile.duration, 4.0 * np.finfo(float).eps
+    drift = digit * np.array([profile.acceleration * T**2, profile.acceleration * T, 0.0, 0.0])
+    assert (np.abs(states) <= bounds * (1.0 + 1e-9) + drift).all()
     reached = np.abs(states).max(axis=0)
     end = np.array([stroke, 0.0, 0.0, 0.0])
     assert np.abs(states[-1] - end) == pytest.approx(0.0, abs=1e-8 * max(1.0, *reached))
-    assert reached[1:] == pytest.approx(
-        [profile.velocity, profile.acceleration, profile.jerk], rel=1e-9
-    )
+    met = np.array([profile.velocity, profile.acceleration, profile.jerk])
+    assert (np.abs(reached[1:] - met) <= 1e-9 * met + drift[1:]).all()
 
 
 @given(st.tuples(positive, positive, positive, positive, positive), st.integers(1, 4))

@@ -20,6 +20,8 @@ from reprlib import Repr
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
+from surrogates.interrupts import raise_dropped
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -105,11 +107,14 @@ class Workers:
         worker's traceback as a note), and RuntimeError where another map is not yet finished.
         """
         if self.count == 1 or len(tasks) <= 1:
-            yield from map(function, tasks)
+            for task in tasks:
+                raise_dropped()
+                yield function(task)
             return
         began, done_here = time.monotonic(), 0
         while not self._workers and done_here < len(tasks):
             each = (time.monotonic() - began) / done_here if done_here else 0.0
+            raise_dropped()
             if self.patience == 0.0 or each * (len(tasks) - done_here) > self.patience:
                 break
             yield function(tasks[done_here])
@@ -133,6 +138,7 @@ class Workers:
     ) -> Iterator[R]:
         retried: set[int] = set()
         while waiting or running:
+            raise_dropped()
             self._feed(function, tasks, waiting, running)
             for pipe in connection.wait(list(running)):
                 assert isinstance(pipe, connection.Connection)
