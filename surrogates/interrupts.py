@@ -52,7 +52,7 @@ def ctrl_c_noticed() -> Iterator[None]:
 
     One that came where nothing can be raised is sent once more.
     """
-    before, active = sys.unraisablehook, True
+    before = sys.unraisablehook
     _pressed.clear()
     ours = (
         threading.current_thread() is threading.main_thread()
@@ -62,7 +62,7 @@ def ctrl_c_noticed() -> Iterator[None]:
         signal.signal(signal.SIGINT, _press)
 
     def again() -> None:
-        if active:
+        if _noticing.is_set():
             _thread.interrupt_main()
 
     def noticed(unraisable: Any) -> None:
@@ -79,7 +79,6 @@ def ctrl_c_noticed() -> Iterator[None]:
     try:
         yield
     finally:
-        active = False
         _noticing.clear()
         sys.unraisablehook = before
         if ours:
@@ -92,6 +91,7 @@ def raise_dropped() -> None:
     Long work calls it between its steps; it does nothing outside `ctrl_c_noticed`.
     """
     if _pressed.is_set() and _noticing.is_set():
+        _noticing.clear()  # once: what is under way to the end is not to be met by another
         raise KeyboardInterrupt
 
 
