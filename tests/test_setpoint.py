@@ -58,13 +58,13 @@ def test_a_setpoint_arrives_at_rest_within_its_bounds(
     assert (profile.durations >= 0.0).all()
     _, states = flown(profile)
     bounds = np.array([stroke, v, a, j])
-    # a last digit of acceleration and jerk, integrated over the whole move
-    T, digit = profile.duration, 4.0 * np.finfo(float).eps
+    # a last digit of acceleration, integrated over the whole move: 0.8 of it was met
+    T, digit = profile.duration, 2.0 * np.finfo(float).eps
     drift = digit * np.array([profile.acceleration * T**2, profile.acceleration * T, 0.0, 0.0])
     assert (np.abs(states) <= bounds * (1.0 + 1e-9) + drift).all()
     reached = np.abs(states).max(axis=0)
     end = np.array([stroke, 0.0, 0.0, 0.0])
-    assert np.abs(states[-1] - end) == pytest.approx(0.0, abs=1e-8 * max(1.0, *reached))
+    assert (np.abs(states[-1] - end) <= 1e-8 * max(1.0, *reached) + drift).all()
     met = np.array([profile.velocity, profile.acceleration, profile.jerk])
     assert (np.abs(reached[1:] - met) <= 1e-9 * met + drift[1:]).all()
 

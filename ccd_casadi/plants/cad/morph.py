@@ -81,10 +81,10 @@ def draw_morph(
 
     Raises PlantError where the solid at some θ has other faces, or `degree` does not follow it.
     """
-    names = tuple(bounds)
-    lower, upper = np.array([bounds[name] for name in names], float).T
     from scipy.stats import qmc  # half a second to import, which every command would wait for
 
+    names = tuple(bounds)
+    lower, upper = np.array([bounds[name] for name in names], float).T
     powers = product(range(degree + 1), repeat=len(names))
     exponents = np.array([row for row in powers if sum(row) <= degree])
     count = 2 * len(exponents) + UNSEEN
