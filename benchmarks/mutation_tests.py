@@ -70,7 +70,10 @@ GROUPS = (
         interpreted=False,
     ),
     Group(
-        tuple(f"ccd_casadi/sampling/{n}.py" for n in ("store", "samples", "units", "sampler")),
+        tuple(
+            f"ccd_casadi/sampling/{n}.py"
+            for n in ("keys", "rows", "store", "samples", "units", "sampler")
+        ),
         ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
         "",
         interpreted=False,

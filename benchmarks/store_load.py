@@ -19,8 +19,9 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
 ROOT = Path(__file__).parent.parent

@@ -33,9 +33,10 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
+from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
-from ccd_casadi.sampling.store import SampleStore, problem_hash
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.process_pool import PATIENCE, WorkerLost

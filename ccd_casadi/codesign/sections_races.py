@@ -14,7 +14,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, too_slow, valued, with_range
 from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
-from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool
 
 

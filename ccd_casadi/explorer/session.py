@@ -16,8 +16,9 @@ from ccd_casadi.explorer.modes import KnownModes, in_modal_form
 from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.machine import lumped, stage_modes_html
+from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
-from ccd_casadi.sampling.store import SampleStore, problem_hash, sample_key
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of
 from surrogates.files import write_whole
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design
 from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
     QuantitySample,
@@ -17,7 +19,7 @@ from ccd_casadi.sampling.samples import (
     quantity_sample,
     sample_of,
 )
-from ccd_casadi.sampling.store import Sample, SampleStore, problem_hash, sample_key
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import design_unit, frequencies, inner_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.inner_problem.sweep import InnerProblem
-from ccd_casadi.sampling.store import Sample
+from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures

@@ -5,19 +5,16 @@ duplicate is never counted twice. Units of work are written in one transaction. 
 may use the file at once (write-ahead log, busy timeout).
 """
 
-import hashlib
 import json
-import math
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from numbers import Integral, Real
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from ccd_casadi.sampling.rows import COLUMNS, DAMAGED, Sample, decoded, from_row, numbers_of, to_row
 from ccd_casadi.support.errors import UserError
 
 SCHEMA = 1
@@ -28,43 +25,7 @@ class SampleStoreError(UserError):
     """The file is not a usable sample store; the message names it and says what to do."""
 
 
-@dataclass(frozen=True)
-class Sample:
-    """One synthesis, certified or not; SI, frequencies in rad/s, NaN where there is no figure.
-
-    `gradients` are the flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞,
-    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed. With `compliance`
-    (‖GS‖∞, m/N) its logarithm stands before γ_opt.
-    """
-
-    key: str
-    theta: tuple[float, ...]
-    omega_S: float
-    omega_T: float
-    outcome: str
-    reason: str
-    gamma_opt: float
-    gamma_lower_bound: float
-    gamma: float
-    bandwidth: float
-    sensitivity_peak: float
-    sensitivity_peak_frequency: float
-    sensitivity_low: float
-    max_real_pole: float
-    norm: float
-    norm_bound: float
-    certified: bool
-    seconds: float
-    gradients: tuple[float, ...] | None = None
-    compliance: float = math.nan
-
-
-_COLUMNS = tuple(field.name for field in fields(Sample))
-_REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
-_TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
-_DAMAGED = "a row is damaged"
 _ADDED = "compliance"  # the one column that stores of before do not have
-_THETA, _CERTIFIED, _GRADIENTS = map(_COLUMNS.index, ("theta", "certified", "gradients"))
 _TABLES = """
 create table if not exists meta (name text primary key, value text not null);
 create table if not exists problems (hash text primary key, json text not null);
@@ -81,44 +42,6 @@ create table if not exists results (
 create index if not exists samples_of_problem on samples (problem);
 create index if not exists results_of_problem on results (problem);
 """
-
-
-def problem_hash(problem: Mapping[str, object]) -> str:
-    """SHA-256 of a mapping of plain values; exact in every float, blind to the mapping's order.
-
-    Raises ValueError for NaN and infinity, TypeError for what is no plain value.
-
-    >>> problem_hash({"a": 1, "b": 0.1}) == problem_hash({"b": 0.1, "a": 1.0})
-    True
-    """
-    text = json.dumps(_canonical(problem), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: float) -> str:
-    """The key of one synthesis of a problem, exact in every float."""
-    return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
-
-
-def _canonical(value: object) -> object:
-    if isinstance(value, Mapping):
-        if not all(isinstance(key, str) for key in value):
-            raise TypeError("a name that is no text cannot be part of a key")
-        return {key: _canonical(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_canonical(item) for item in value]
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return f"'{value}"  # the mark keeps a text apart from the number that it spells
-    if isinstance(value, Integral) and abs(int(value)) > 2**53:
-        return str(int(value))  # no float is exact
-    if isinstance(value, Integral | Real):
-        number = float(value) + 0.0  # -0.0 becomes 0.0
-        if not math.isfinite(number):
-            raise ValueError(f"{number} cannot be part of a key; give finite numbers")
-        return number.hex()
-    raise TypeError(f"{type(value).__name__} cannot be part of a key")
 
 
 class SampleStore:
@@ -162,7 +85,7 @@ class SampleStore:
         found = self._db.execute("select * from meta where name = 'schema'").fetchone()
         columns = self._columns() | {_ADDED}
         schema = None if found is None else found[1]
-        if schema != str(SCHEMA) or not set(_COLUMNS) <= columns:
+        if schema != str(SCHEMA) or not set(COLUMNS) <= columns:
             raise SampleStoreError(
                 f"{self.path}: is a sample store of schema {schema}, not {SCHEMA}; "
                 "choose another --out"
@@ -225,29 +148,29 @@ class SampleStore:
     def get(self, keys: Sequence[str]) -> dict[str, Sample]:
         """The samples known among `keys`."""
         found: dict[str, Sample] = {}
-        columns = ", ".join(_COLUMNS)
+        columns = ", ".join(COLUMNS)
         with self.worded():
             for i in range(0, len(keys), 500):
                 part = list(keys[i : i + 500])
                 marks = ", ".join("?" * len(part))
                 query = f"select {columns} from samples where key in ({marks})"
                 for row in self._db.execute(query, part):
-                    found[row[0]] = _from_row(row)
+                    found[row[0]] = from_row(row)
         return found
 
     def get_result(self, key: str) -> dict[str, Any] | None:
         """The payload of a unit of work, None where it is not known."""
         with self.worded():
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
-            return None if row is None else _decoded(row[0])
+            return None if row is None else decoded(row[0])
 
     def select(self, problem: str | None = None) -> list[Sample]:
         """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""
         where, given = _of(problem)
         with self.worded():
-            query = f"select {', '.join(_COLUMNS)} from samples {where}"
+            query = f"select {', '.join(COLUMNS)} from samples {where}"
             rows = self._db.execute(query, given).fetchall()
-            samples = [_from_row(row) for row in rows]
+            samples = [from_row(row) for row in rows]
         return sorted(samples, key=lambda s: (s.theta, s.omega_S, s.omega_T, s.key))
 
     def count(self, problem: str | None = None) -> int:
@@ -261,7 +184,7 @@ class SampleStore:
         """θ of every unit of work of one problem hash, oldest first."""
         query = "select theta from results where problem = ? order by rowid"
         with self.worded():
-            return [numbers_of(_decoded(row[0])) for row in self._db.execute(query, (problem,))]
+            return [numbers_of(decoded(row[0])) for row in self._db.execute(query, (problem,))]
 
     def keys_with_gradients(self, problem: str) -> list[str]:
         """Keys of the samples of one problem hash that have gradients, oldest first."""
@@ -270,12 +193,12 @@ class SampleStore:
             return [row[0] for row in self._db.execute(query, (problem,))]
 
     def _insert(self, samples: Iterable[Sample], problem: str | None) -> None:
-        marks = ", ".join("?" * (len(_COLUMNS) + 1))
+        marks = ", ".join("?" * (len(COLUMNS) + 1))
         self._db.executemany(
-            f"insert into samples ({', '.join(_COLUMNS)}, problem) values ({marks}) "
+            f"insert into samples ({', '.join(COLUMNS)}, problem) values ({marks}) "
             "on conflict (key) do update set gradients = excluded.gradients "
             "where samples.gradients is null and excluded.gradients is not null",
-            [(*_to_row(sample), problem) for sample in samples],
+            [(*to_row(sample), problem) for sample in samples],
         )
 
     @contextmanager
@@ -291,7 +214,7 @@ class SampleStore:
 
     def damaged(self) -> SampleStoreError:
         """What to raise where a row cannot be what was written."""
-        return SampleStoreError(f"{self.path}: {_DAMAGED}; move it away or choose another --out")
+        return SampleStoreError(f"{self.path}: {DAMAGED}; move it away or choose another --out")
 
     @contextmanager
     def worded(self) -> Iterator[None]:
@@ -316,49 +239,3 @@ class SampleStore:
 def _of(problem: str | None) -> tuple[str, tuple[str, ...]]:
     """The rows of one problem hash, or all: a condition that an index answers, and its values."""
     return ("", ()) if problem is None else ("where problem = ?", (problem,))
-
-
-def _to_row(sample: Sample) -> tuple[object, ...]:
-    row: list[object] = []
-    for name in _COLUMNS:
-        value = getattr(sample, name)
-        if name == "theta" or (name == "gradients" and value is not None):
-            value = json.dumps([None if math.isnan(item) else item for item in value])
-        elif name == "certified":
-            value = int(value)
-        elif isinstance(value, float) and math.isnan(value):
-            value = None
-        row.append(value)
-    return tuple(row)
-
-
-def _from_row(row: Sequence[Any]) -> Sample:
-    values: list[Any] = [
-        math.nan if value is None and name in _REALS else value
-        for name, value in zip(_COLUMNS, row, strict=True)
-    ]
-    values[_THETA] = numbers_of(_decoded(values[_THETA]))
-    values[_CERTIFIED] = bool(values[_CERTIFIED])
-    if values[_GRADIENTS] is not None:
-        values[_GRADIENTS] = numbers_of(_decoded(values[_GRADIENTS]))
-    for name, value in zip(_COLUMNS, values, strict=True):
-        if name in _TEXTS and not isinstance(value, str):
-            raise sqlite3.DatabaseError(_DAMAGED)
-    numbers_of([value for name, value in zip(_COLUMNS, values, strict=True) if name in _REALS])
-    return Sample(*values)
-
-
-def numbers_of(items: Any) -> tuple[float, ...]:
-    """A list of numbers (null: NaN) as it was stored. Raises sqlite3.DatabaseError for others."""
-    if not isinstance(items, list) or not all(
-        item is None or type(item) in (int, float) for item in items
-    ):
-        raise sqlite3.DatabaseError(_DAMAGED)
-    return tuple(math.nan if item is None else float(item) for item in items)
-
-
-def _decoded(text: Any) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise sqlite3.DatabaseError(_DAMAGED) from error

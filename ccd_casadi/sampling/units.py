@@ -12,8 +12,9 @@ from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
+from ccd_casadi.sampling.keys import sample_key
+from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import sample_of
-from ccd_casadi.sampling.store import Sample, sample_key
 from ccd_casadi.support.arrays import Array
 
 

@@ -1,0 +1,95 @@
+"""One true synthesis as a row of the store, and back; what nobody can have written is an error."""
+
+import json
+import math
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One synthesis, certified or not; SI, frequencies in rad/s, NaN where there is no figure.
+
+    `gradients` are the flattened total derivatives (4, n_θ + 2) of (ω_b, ln‖S‖∞,
+    ln σ_max(S(jω_low)), γ_opt) to (θ, ln ω_S, ln ω_T), where they were computed. With `compliance`
+    (‖GS‖∞, m/N) its logarithm stands before γ_opt.
+    """
+
+    key: str
+    theta: tuple[float, ...]
+    omega_S: float
+    omega_T: float
+    outcome: str
+    reason: str
+    gamma_opt: float
+    gamma_lower_bound: float
+    gamma: float
+    bandwidth: float
+    sensitivity_peak: float
+    sensitivity_peak_frequency: float
+    sensitivity_low: float
+    max_real_pole: float
+    norm: float
+    norm_bound: float
+    certified: bool
+    seconds: float
+    gradients: tuple[float, ...] | None = None
+    compliance: float = math.nan
+
+
+COLUMNS = tuple(field.name for field in fields(Sample))
+_REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
+_TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
+DAMAGED = "a row is damaged"
+_THETA, _CERTIFIED, _GRADIENTS = map(COLUMNS.index, ("theta", "certified", "gradients"))
+
+
+def to_row(sample: Sample) -> tuple[object, ...]:
+    """The values of COLUMNS as SQLite takes them: NaN as null, tuples as JSON."""
+    row: list[object] = []
+    for name in COLUMNS:
+        value = getattr(sample, name)
+        if name == "theta" or (name == "gradients" and value is not None):
+            value = json.dumps([None if math.isnan(item) else item for item in value])
+        elif name == "certified":
+            value = int(value)
+        elif isinstance(value, float) and math.isnan(value):
+            value = None
+        row.append(value)
+    return tuple(row)
+
+
+def from_row(row: Sequence[Any]) -> Sample:
+    """Its inverse. Raises sqlite3.DatabaseError for a row that `to_row` cannot have made."""
+    values: list[Any] = [
+        math.nan if value is None and name in _REALS else value
+        for name, value in zip(COLUMNS, row, strict=True)
+    ]
+    values[_THETA] = numbers_of(decoded(values[_THETA]))
+    values[_CERTIFIED] = bool(values[_CERTIFIED])
+    if values[_GRADIENTS] is not None:
+        values[_GRADIENTS] = numbers_of(decoded(values[_GRADIENTS]))
+    for name, value in zip(COLUMNS, values, strict=True):
+        if name in _TEXTS and not isinstance(value, str):
+            raise sqlite3.DatabaseError(DAMAGED)
+    numbers_of([value for name, value in zip(COLUMNS, values, strict=True) if name in _REALS])
+    return Sample(*values)
+
+
+def numbers_of(items: Any) -> tuple[float, ...]:
+    """A list of numbers (null: NaN) as it was stored. Raises sqlite3.DatabaseError for others."""
+    if not isinstance(items, list) or not all(
+        item is None or type(item) in (int, float) for item in items
+    ):
+        raise sqlite3.DatabaseError(DAMAGED)
+    return tuple(math.nan if item is None else float(item) for item in items)
+
+
+def decoded(text: Any) -> Any:
+    """A value from its JSON. Raises sqlite3.DatabaseError for what is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise sqlite3.DatabaseError(DAMAGED) from error
