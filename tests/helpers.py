@@ -15,7 +15,8 @@ from hypothesis import settings
 from scipy.linalg import sqrtm
 from scipy.optimize import brentq, minimize_scalar
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.kernels.design import assess
 from ccd_casadi.kernels.figures import Figure

@@ -24,7 +24,8 @@ from ccd_casadi.codesign.run import co_design, write_run
 from ccd_casadi.codesign.run import solve as solve_problem
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.compare import main as compare
-from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.sampling.sampler import Sampler

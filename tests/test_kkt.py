@@ -13,7 +13,8 @@ from ccd_casadi.codesign.outer_problem import (
     lifted_program,
     solve_program,
 )
-from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 
 

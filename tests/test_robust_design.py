@@ -10,7 +10,8 @@ from helpers import HZ, OMEGA_LOW, SUSPENSION, log_uniform, problem, random_plan
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.inner_problem.problem import CoDesignProblem, RobustSet, scaled_plant, true_design
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Plant, mechanics
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import HZ, INNER, problem
 
-from ccd_casadi.inner_problem.problem import PlantSource
+from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.sampling import sampler as module
 from ccd_casadi.sampling import units
 from ccd_casadi.sampling.sampler import CHUNK, Sampler

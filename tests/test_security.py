@@ -15,7 +15,8 @@ from test_sources import SOURCES
 
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.inner import main as inner
-from ccd_casadi.inner_problem.problem import _own_plant, plant_of
+from ccd_casadi.inner_problem.plant_source import _own_plant
+from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import permit_user_code, time_limit

@@ -22,13 +22,8 @@ from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import formulation_of, solve
 from ccd_casadi.codesign.survival import REACH, Survival, survival
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    RobustSet,
-    scaled_plant,
-    true_design,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics

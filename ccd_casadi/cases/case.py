@@ -24,7 +24,9 @@ from ccd_casadi.cases.kinds import (
 )
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.sections import SECTIONS, Case, RobustSection
-from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, RobustSet, plant_of
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension

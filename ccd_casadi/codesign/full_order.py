@@ -15,11 +15,11 @@ import numpy as np
 from ccd_casadi.fixed_structure import Bounds, SectionsDesign, certify
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
-    RobustSet,
     design_choices,
     scaled_plant,
     true_inner,
 )
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,

@@ -4,116 +4,27 @@ It is made of plain values, so that it can be sent to a worker process, hashed, 
 beside the samples that it determines.
 """
 
-import hashlib
-import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from importlib.machinery import SourceFileLoader
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
+from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
-from ccd_casadi.plants.differenced import own_plant
-from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
-from ccd_casadi.plants.plant import Mechanics, ModelFunction, Plant, build_plant, mechanics
-from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
+from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import Shown
-from ccd_casadi.support.user_code import limited, require_user_code
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
 NUMERICS = 7  # raised whenever a change of ours moves the numbers that a sample holds
-
-
-@dataclass(frozen=True)
-class PlantSource:
-    """Where the model comes from: a known name or `file.py:function`, and its options.
-
-    `fixed`: parameters that are not in θ, each with value and unit.
-    """
-
-    model: str | None
-    file: str | None
-    function: str | None
-    options: tuple[tuple[str, object], ...]
-    seconds: float = 60.0  # that a function may take; no part of what the plant is
-    content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
-    fixed: tuple[tuple[str, float, str], ...] = ()
-
-    @property
-    def held(self) -> dict[str, float]:
-        """The fixed parameters' values."""
-        return {name: value for name, value, _ in self.fixed}
-
-    def pinned(self) -> "PlantSource":
-        """The same, with the hash of its file's content: a process must not keep an older one."""
-        if self.file is None or self.content is not None:
-            return self
-        try:
-            content = hashlib.sha256(Path(self.file).read_bytes()).hexdigest()
-        except OSError as error:
-            raise PlantError(f"{self.file}: cannot be read: {error.strerror}") from None
-        return replace(self, content=content)
-
-    def identity(self) -> dict[str, object]:
-        """What determines the plant; a file counts by its content, not by where it lies."""
-        digest = self.pinned().content
-        options = dict(self.options)
-        data = DATA.get(self.model or "")
-        if data is not None:
-            digest = _digest(Path(str(options.pop(data, ""))))
-        return {
-            "model": self.model,
-            "function": self.function,
-            "source": digest,
-            "options": options,
-            **({"fixed": self.held} if self.fixed else {}),
-        }
-
-
-@dataclass(frozen=True)
-class RobustSet:
-    """Plants on which the loop has to be stable and ‖S‖∞ within S_max.
-
-    Frequencies of the flexible modes times 1 + s, `shifts` values of s evenly over ±`shift`, and
-    with every one of them damping times each factor of `damping`. The controller is designed on the
-    plant shifted by `design_shift`; None leaves that open: both ends and the middle are tried, see
-    `design_choices`.
-    """
-
-    shift: float
-    shifts: int
-    damping: tuple[float, ...]
-    design_shift: float | None
-
-    def perturbations(self, shifts: int | None = None) -> tuple[Perturbation, ...]:
-        """The set; `shifts` of them for a denser one."""
-        values = np.linspace(-self.shift, self.shift, self.shifts if shifts is None else shifts)
-        factors = sorted({1.0, *self.damping})
-        return tuple(Perturbation(float(s), z) for s in values for z in factors)
-
-    @property
-    def design_at(self) -> str:
-        """The plant that the controller is made on: "auto", "low", "nominal" or "high"."""
-        if self.design_shift is None:
-            return "auto"
-        return ("low", "nominal", "high")[1 + int(np.sign(self.design_shift))]
-
-    def scaled(self, share: float) -> "RobustSet":
-        """The set that reaches a share of this one's way, from the model alone (0) to it (1)."""
-        design = None if self.design_shift is None else share * self.design_shift
-        damping = tuple(factor**share for factor in self.damping)
-        return RobustSet(share * self.shift, self.shifts, damping, design)
 
 
 @dataclass(frozen=True)
@@ -191,87 +102,12 @@ class CoDesignProblem(Shown):
         }
 
 
-def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of every file in a folder, by name and content."""
-    found = hashlib.sha256()
-    for file in [path] if path.is_file() else sorted(item for item in path.glob("*")):
-        if file.is_file():
-            content = hashlib.sha256(file.read_bytes()).hexdigest()
-            found.update(f"{'' if file == path else file.name}\0{content}\n".encode())
-    return found.hexdigest()
-
-
 def plant_of(problem: CoDesignProblem) -> Plant:
     """The plant, built once in a process.
 
     Raises UserError where it cannot be, and UserCodeRefused where a user's function must not run.
     """
-    if problem.source.model is not None:
-        return _shipped_plant(problem.source, problem.names)
-    require_user_code(f"{problem.source.file}:{problem.source.function}")
-    return _own_plant(problem.source.pinned(), problem.names, problem.lower, problem.upper)
-
-
-@lru_cache(maxsize=8)
-def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
-    options, held = dict(source.options), source.held
-    if source.model in BUILDERS:
-        plant = BUILDERS[source.model]((*names, *held), **options)
-        return with_fixed(plant, held) if held else plant
-    assert source.model is not None
-    return build_plant(fixed_model(MODELS[source.model], held), names, options)
-
-
-@lru_cache(maxsize=8)
-def _own_plant(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> Plant:
-    function = fixed_model(_own_function(source), source.held)
-    return own_plant(function, names, dict(source.options), lower, upper)
-
-
-class _PlantFile(SourceFileLoader):
-    """A plant's file, read once: what runs is the text that was hashed.
-
-    Bytecode beside it is neither used nor written: it could be of an older text, or of another.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__("user_plant_" + path.stem, str(path))
-        self._text = path.read_bytes()
-        self.digest = hashlib.sha256(self._text).hexdigest()
-
-    def get_data(self, path: str) -> bytes:
-        return self._text
-
-    def path_stats(self, path: str) -> Mapping[str, Any]:
-        raise OSError("no bytecode")
-
-
-def _own_function(source: PlantSource) -> ModelFunction:
-    assert source.file is not None
-    assert source.function is not None
-    path = Path(source.file)
-    loader = _PlantFile(path)
-    if loader.digest != source.content:
-        raise UserError(f"{path}: was changed since the case was read; give the command again")
-    spec = importlib.util.spec_from_loader(loader.name, loader)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    late = PlantError(
-        f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
-        "mend it, or give it longer with plant_seconds in a table [limits]"
-    )
-    try:
-        limited(loader.exec_module, source.seconds, late)(module)
-        function = limited(getattr, source.seconds, late)(module, source.function, None)
-    except PlantError:
-        raise
-    except Exception as error:
-        raise UserError(f"{path}: cannot be loaded: {described(error)}") from error
-    if not callable(function):
-        raise UserError(f"{path}: defines no function {source.function}; check plant.function")
-    return limited(function, source.seconds, late)
+    return plant_from(problem.source, problem.names, problem.lower, problem.upper)
 
 
 def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlant:

@@ -14,7 +14,8 @@ from ccd_casadi.fixed_structure.decoupling import (
     given_decoupling,
 )
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.inner_problem.problem import CoDesignProblem, PlantSource, plant_of, scaled_plant
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
