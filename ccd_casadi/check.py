@@ -61,7 +61,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report
-    from ccd_casadi.codesign.result import clean
+    from ccd_casadi.support.json_files import clean
 
     case = load_case(options.case)
     problem = problem_of(case)

@@ -34,11 +34,11 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import load_case, problem_of
     from ccd_casadi.cases.toml_writer import case_to_toml
     from ccd_casadi.codesign.comparison import compare, comparison_dict
-    from ccd_casadi.codesign.result import write_json
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.support.errors import UserError
+    from ccd_casadi.support.json_files import write_json
 
     case = load_case(options.case)
     problem = problem_of(case)

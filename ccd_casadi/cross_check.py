@@ -55,8 +55,8 @@ def _problem(
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
-    from ccd_casadi.codesign.result import write_json
     from ccd_casadi.inner_problem.problem import scaled_plant
+    from ccd_casadi.support.json_files import write_json
     from ccd_casadi.synthesis.backends.judgement import verdicts
     from ccd_casadi.synthesis.backends.mixed import RICCATI, every_backend
 
@@ -124,7 +124,9 @@ def _json(
     point: tuple[float, float],
     found: "Sequence[Verdict]",
 ) -> dict[str, Any]:
-    from ccd_casadi.codesign.result import clean, figures_dict, versions
+    from ccd_casadi.codesign.result import figures_dict
+    from ccd_casadi.support.json_files import clean
+    from ccd_casadi.support.versions import versions
 
     return {
         "theta": dict(zip(problem.names, theta, strict=True)),

@@ -24,9 +24,9 @@ def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
     from ccd_casadi.cases.measured_case import measured_case
-    from ccd_casadi.codesign.result import write_json
     from ccd_casadi.inner_problem.problem import best_choice, plant_of
     from ccd_casadi.plants.plant import hardware_cost
+    from ccd_casadi.support.json_files import write_json
 
     measured = measured_case(options.case)
     if measured is not None:
@@ -87,9 +87,10 @@ def command(options: argparse.Namespace) -> ExitCode:
 def _measured(case: "MeasuredCase", options: argparse.Namespace) -> ExitCode:
     """Sections on a measured response: designed and judged on its lines."""
     from ccd_casadi.cases.case import CaseError
-    from ccd_casadi.codesign.result import controller_dict, write_json
+    from ccd_casadi.codesign.result import controller_dict
     from ccd_casadi.fixed_structure.measured_design import design_on_data
     from ccd_casadi.inner_problem.sections_words import sections_dict
+    from ccd_casadi.support.json_files import write_json
 
     given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
@@ -170,7 +171,6 @@ def _sections(
 
     from ccd_casadi.cases.run_folder import sections_kappa
     from ccd_casadi.codesign.budget_result import budget_entry
-    from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_result import (
         active_of,
         design_dict,
@@ -181,6 +181,7 @@ def _sections(
     from ccd_casadi.inner_problem.sections_error import least_error_at
     from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
     from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+    from ccd_casadi.support.json_files import write_json
 
     sections = replace(sections_of_problem(problem), seed=options.seed)
     asked = replace(with_range(replace(problem, sections=sections)), start=theta)
@@ -243,9 +244,10 @@ def _design(
     problem: "CoDesignProblem", theta: tuple[float, ...], point: tuple[float, float]
 ) -> tuple[ExitCode, dict[str, Any], dict[str, Any]]:
     from ccd_casadi.codesign.budget_result import budget_entry
-    from ccd_casadi.codesign.result import clean, compliance_dict, controller_dict, figures_dict
+    from ccd_casadi.codesign.result import compliance_dict, controller_dict, figures_dict
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.inner_problem.sweep import active_constraints
+    from ccd_casadi.support.json_files import clean
     from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
     from ccd_casadi.synthesis.statics import statics
     from ccd_casadi.synthesis.synthesis import synthesise
@@ -292,7 +294,9 @@ def _print(
     options: argparse.Namespace,
     began: float,
 ) -> None:
-    from ccd_casadi.codesign.result import clean, figures_dict, versions
+    from ccd_casadi.codesign.result import figures_dict
+    from ccd_casadi.support.json_files import clean
+    from ccd_casadi.support.versions import versions
 
     answer = answer | {
         "seconds": perf_counter() - began,

@@ -22,12 +22,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.insight import insight_dict
     from ccd_casadi.codesign.pareto import pareto_front
     from ccd_casadi.codesign.post_optimal import post_optimal
-    from ccd_casadi.codesign.result import write_json
     from ccd_casadi.codesign.sections_insight import sections_front, sections_responses
     from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
+    from ccd_casadi.support.json_files import write_json
 
     began = perf_counter()
     done = read_run(options.run)

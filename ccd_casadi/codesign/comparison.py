@@ -12,7 +12,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.conclusions import conclusions
 from ccd_casadi.codesign.published import PUBLISHED
-from ccd_casadi.codesign.result import clean, figures_dict, versions
+from ccd_casadi.codesign.result import figures_dict
 from ccd_casadi.codesign.run import co_design, formulation_of
 from ccd_casadi.codesign.sections_result import active_of, design_dict
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
@@ -25,9 +25,11 @@ from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.versions import versions
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import latin_hypercube
 

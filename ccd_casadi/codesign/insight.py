@@ -6,11 +6,11 @@ from typing import Any
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.result import versions
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.versions import versions
 
 
 def natural_hz(run: FinishedRun) -> tuple[float, ...]:

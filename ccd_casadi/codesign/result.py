@@ -1,43 +1,26 @@
 """The run folder's JSON files: result.json and controller.json."""
 
-import importlib.metadata
-import json
 import math
-import platform
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
+from ccd_casadi.codesign.mixed_verdict import verdict_of
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
-from ccd_casadi.codesign.verdict import (
-    KKT_LEVEL,
-    CloserModel,
-    Verdict,
-    certified,
-    deployable,
-    optimal,
-    predicted,
-    reason,
-    survives,
-    verdict_dict,
-)
+from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
 from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.versions import versions
 from ccd_casadi.synthesis.statics import compliance_words
 from ccd_casadi.synthesis.synthesis import DesignFigures
 from surrogates import Quality
-from surrogates.files import write_whole
-
-PACKAGES = ("casadi", "numpy", "scipy", "control", "slycot", "scikit-learn", "numba")
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
@@ -162,77 +145,6 @@ def _compliance(verified: VerifiedDesign) -> dict[str, Any]:
     )
 
 
-def verdict_of(
-    outcome: FormulationResult,
-    verified: VerifiedDesign,
-    problem: CoDesignProblem,
-    tolerance: float,
-    error: float,
-    quality: tuple[Quality, ...] = (),
-    look: BoxLook | None = None,
-) -> Verdict:
-    """The five lines on a verified design; `error` is that of its predicted bandwidth."""
-    figures, robust = verified.design.figures, verified.robust
-    solved = outcome.outer
-    at = quality[0].at_point if quality else None
-    return Verdict(
-        certified=certified(
-            certificate=figures.certified,
-            constraints=verified.feasible,
-            norm=figures.certificate.norm,
-            norm_bound=figures.certificate.norm_bound,
-            peak=figures.sensitivity_peak,
-            bounds=problem.inner.bounds,
-            compliance=figures.compliance,
-        ),
-        optimal=optimal(
-            residual=verified.kkt.stationarity,
-            second_order=verified.kkt.second_order,
-            inner_gap=verified.inner_gap,
-            tolerance=tolerance,
-            starts=0 if solved is None else solved.starts,
-            optima=0 if solved is None else len(solved.optima),
-            look=look,
-        ),
-        predicted=predicted(
-            error=error,
-            tolerance=tolerance,
-            left_out=None if at is None else abs(at[0]) / (figures.bandwidth / HZ),
-            left_out_size=None if at is None else abs(at[0]),
-            sigmas=None if at is None else at[1],
-            extrapolates=quality[0].extrapolates if quality else (),
-            surrogate=bool(outcome.surrogates),
-        ),
-        survives=survives(
-            verified.survival,
-            S_max=problem.inner.S_max,
-            robust=None if robust is None else robust.passed,
-            robust_words=_robust_words(robust),
-            closer=tuple(
-                CloserModel(
-                    check.name,
-                    check.figures.certificate.stable,
-                    check.figures.sensitivity_peak,
-                )
-                for check in verified.references
-            ),
-        ),
-        deployable=deployable(verified.survival),
-    )
-
-
-def _robust_words(check: RobustCheck | None) -> str:
-    if check is None:
-        return ""
-    at = f"at {100 * check.at.shift:+.2g} %, damping x {check.at.damping:.3g}"
-    if not check.worst.certificate.stable:
-        return f"unstable within its own robust set, {at}"
-    peak = f"peak of S {check.worst.sensitivity_peak:.4g} {at}"
-    if check.passed:
-        return f"its own robust set is kept ({check.plants} plants, worst {peak})"
-    return f"its own robust set is not kept: {peak}"
-
-
 def infeasible_dict(
     formulation: str, reason: str, *, syntheses: int, seconds: float, seed: int
 ) -> dict[str, Any]:
@@ -275,29 +187,8 @@ def controller_dict(controller: StateSpace) -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python and of what the numbers depend on."""
-    found = {"python": platform.python_version(), "ccd-casadi": _version("ccd-casadi")}
-    return found | {name: _version(name) for name in PACKAGES}
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
-    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
-
-
-def clean(value: Any) -> Any:
-    """Plain JSON values: tuples to lists, NumPy scalars to numbers, what is not finite to None."""
-    if isinstance(value, dict):
-        return {str(key): clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [clean(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
+    """The optimality certificate; a vertex has no second-order figure, and says so."""
     second = certificate.second_order
     return asdict(certificate) | {
         "second_order": None if second is None or math.isinf(second) else second,
@@ -340,10 +231,3 @@ def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
             for item in solution.optima
         ],
     }
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"

@@ -25,7 +25,6 @@ from ccd_casadi.codesign.result import (
     infeasible_dict,
     predicted_bandwidth,
     result_dict,
-    write_json,
 )
 from ccd_casadi.codesign.sections_result import beside_dict, sections_controller, sections_result
 from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
@@ -40,6 +39,7 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.progress import Progress
 from surrogates import design, save

@@ -8,14 +8,7 @@ import numpy as np
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, FullOrder
-from ccd_casadi.codesign.result import (
-    clean,
-    compliance_dict,
-    controller_dict,
-    globality_dict,
-    kkt_dict,
-    versions,
-)
+from ccd_casadi.codesign.result import compliance_dict, controller_dict, globality_dict, kkt_dict
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.sections_verdict import sections_verdict
 from ccd_casadi.codesign.surrogate_quality import quality_dict
@@ -27,7 +20,9 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
 BINDS = {

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.result import versions, write_json
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduced
@@ -12,7 +11,9 @@ from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
 from ccd_casadi.deployment.sections import Root, Section, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.versions import versions
 from ccd_casadi.synthesis.interchange import DesignFile, named_controller, named_plant, write_mat
 from ccd_casadi.synthesis.synthesis import DesignFigures
 

@@ -8,11 +8,7 @@ import numpy as np
 from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.bounds import ChannelBounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.decoupling import (
-    channel_bounds,
-    find_decoupling,
-    given_decoupling,
-)
+from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant

@@ -1,0 +1,26 @@
+"""Plain values as JSON files that any reader takes."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surrogates.files import write_whole
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write atomically; NaN and infinity become null, so that any JSON reader takes it."""
+    write_whole(path, json.dumps(clean(value), indent=2, allow_nan=False) + "\n")
+
+
+def clean(value: Any) -> Any:
+    """Plain JSON values: tuples to lists, NumPy scalars to numbers, what is not finite to None."""
+    if isinstance(value, dict):
+        return {str(key): clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [clean(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
