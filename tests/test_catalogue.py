@@ -20,8 +20,9 @@ from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
 from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.run import co_design, write_run
+from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
+from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.compare import main as compare
 from ccd_casadi.inner_problem.plant_source import PlantSource

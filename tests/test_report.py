@@ -17,7 +17,8 @@ from commands import changed
 from ccd_casadi.cases.case import load_case, problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.run import co_design, formulation_of
+from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner

@@ -17,10 +17,11 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.box_look import BoxLook, _starts
 from ccd_casadi.codesign.direct import acceptable, objective
+from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.run import formulation_of, solve
+from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, survival
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.robust_set import RobustSet

@@ -11,9 +11,10 @@ import numpy as np
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.conclusions import conclusions
+from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.codesign.result import figures_dict
-from ccd_casadi.codesign.run import co_design, formulation_of
+from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.sections_result import active_of, design_dict
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.codesign.solution import Solution

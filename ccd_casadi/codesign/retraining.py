@@ -24,7 +24,9 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.run import conclude, rescue, solution_of_sections, write_run
+from ccd_casadi.codesign.run import solution_of_sections
+from ccd_casadi.codesign.run_files import write_run
+from ccd_casadi.codesign.second_look import conclude, rescue
 from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.codesign.sections_run import conclude_sections
 from ccd_casadi.codesign.solution import Solution
