@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
-from ccd_casadi.support.process_pool import PATIENCE, Ahead
+from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case

@@ -24,7 +24,8 @@ from ccd_casadi import solve
 from ccd_casadi.sampling.cluster import Cluster
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.process_pool import WorkerLost, Workers
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.worker_process import WorkerLost
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
-from ccd_casadi.support.process_pool import _THREADS, Ahead, WorkerLost, Workers, usable_cores
+from ccd_casadi.support.process_pool import Workers, usable_cores
+from ccd_casadi.support.worker_process import THREADS, Ahead, WorkerLost
 
 HERE = Path(__file__).parent
 
@@ -28,7 +29,7 @@ def whereabouts(_: int) -> tuple[int, dict[str, str | None], int]:
     from threadpoolctl import threadpool_info
 
     blas = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
-    return os.getpid(), {name: os.environ.get(name) for name in _THREADS}, max(blas)
+    return os.getpid(), {name: os.environ.get(name) for name in THREADS}, max(blas)
 
 
 class TaskFailure(Exception):
@@ -83,7 +84,7 @@ def test_workers_are_other_processes_with_one_thread_each(monkeypatch: pytest.Mo
     pids = {pid for pid, _, _ in found}
     assert os.getpid() not in pids
     assert len(pids) <= 2
-    assert all(environment == dict.fromkeys(_THREADS, "1") for _, environment, _ in found)
+    assert all(environment == dict.fromkeys(THREADS, "1") for _, environment, _ in found)
     assert {threads for _, _, threads in found} == {1}
 
 

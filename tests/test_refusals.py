@@ -17,7 +17,7 @@ from helpers import (
 from ccd_casadi.inner import main as inner
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
-from ccd_casadi.support.process_pool import WorkerLost
+from ccd_casadi.support.worker_process import WorkerLost
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str], command: Any = main) -> str:

@@ -31,7 +31,8 @@ from ccd_casadi.reporting.page import Section, Table, number, page, table_html
 from ccd_casadi.reporting.solve_page import report_html, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.process_pool import Ahead, Workers
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.worker_process import Ahead
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.gaussian_process import mean_at_many
 

@@ -13,6 +13,7 @@ SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / nam
 # Pipes between the processes of one run.
 LIVE = {
     "ccd_casadi/support/process_pool.py",
+    "ccd_casadi/support/worker_process.py",
     "ccd_casadi/sampling/cluster.py",
     "ccd_casadi/support/deadline.py",
 }

@@ -41,8 +41,9 @@ from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantit
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import PATIENCE, WorkerLost
+from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.user_code import permit_user_code
+from ccd_casadi.support.worker_process import WorkerLost
 from surrogates import GaussianProcess
 from surrogates.truth import NAMES, Observations, TruthError, TruthInterrupted
 

@@ -60,8 +60,8 @@ from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
-from ccd_casadi.support.process_pool import Ahead, WorkerLost
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.worker_process import Ahead, WorkerLost
 from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 

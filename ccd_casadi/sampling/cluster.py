@@ -27,7 +27,8 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.inner_problem.problem import NUMERICS
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import Pool, R, T, WorkerLost, Workers, answered
+from ccd_casadi.support.process_pool import Pool, Workers
+from ccd_casadi.support.worker_process import R, T, WorkerLost, answered
 
 CONNECT_SECONDS = 10.0  # for the scheduler to answer at first, and for a worker to be there
 CLOSE_SECONDS = 1.0  # for a farewell that nobody needs: Ctrl-C ends within 2 s

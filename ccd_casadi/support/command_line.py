@@ -11,9 +11,10 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import WorkerLost, usable_cores
+from ccd_casadi.support.process_pool import usable_cores
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
+from ccd_casadi.support.worker_process import WorkerLost
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode as ExitCode
 from surrogates.options import Parser, one_line, whole

@@ -17,7 +17,7 @@ from typing import ParamSpec, Self, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.support.process_pool import answered
+from ccd_casadi.support.worker_process import answered
 
 P = ParamSpec("P")
 R = TypeVar("R")
