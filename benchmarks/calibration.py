@@ -15,7 +15,8 @@ from numba import njit
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import linprog, minimize
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import scaled_plant, true_inner
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import sweep_inner

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import brentq
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -27,7 +27,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.sampling.cluster import Cluster
 from ccd_casadi.sampling.sampler import CHUNK
 from ccd_casadi.sampling.store import SampleStore

@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import prepared
 from ccd_casadi.inner_problem.sections_error import least_error_at

@@ -44,7 +44,8 @@ FILES = ("controller.json", "surrogate.json", "case.toml")
 SAMPLING = f"""
 import sys
 import numpy as np
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.sampler import Sampler

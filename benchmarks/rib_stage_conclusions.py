@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.on_the_set import HEAD, sentences, stages_of, stored_rows, table
 
 ROOT = Path(__file__).resolve().parent.parent

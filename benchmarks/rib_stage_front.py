@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from rib_stage_built import DESIGN, HZ, theta_of
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.on_the_set import ON_THE_SET
 from ccd_casadi.codesign.sequential import first_resonance
 from ccd_casadi.fixed_structure import Structure

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler

@@ -144,7 +144,8 @@ def _smt(model, T):
 
 def lifted(designs):
     """The lifted data of case study 1: 128 samples, 1,000 unseen, with the issue's limits."""
-    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.outer_problem import lifted_bounds
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore

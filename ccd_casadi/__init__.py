@@ -46,7 +46,7 @@ _PUBLIC = {
     "load_case": "cases.case",
     "parse_case": "cases.case",
     "plant_from_control": "synthesis.interchange",
-    "problem_of": "cases.case",
+    "problem_of": "cases.case_problem",
     "read_frequency_response": "fixed_structure.measured",
     "read_run": "cases.run_folder",
     "robustness": "robust.study",

@@ -1,7 +1,7 @@
 # What ccd_casadi/__init__.py imports when it is first used, for editors and type checkers.
 from ccd_casadi.cases.case import load_case as load_case
 from ccd_casadi.cases.case import parse_case as parse_case
-from ccd_casadi.cases.case import problem_of as problem_of
+from ccd_casadi.cases.case_problem import problem_of as problem_of
 from ccd_casadi.cases.run_folder import read_run as read_run
 from ccd_casadi.codesign.comparison import compare as compare
 from ccd_casadi.codesign.direct import Direct as Direct

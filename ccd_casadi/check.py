@@ -57,7 +57,8 @@ def text(found: dict[str, Any]) -> str:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report

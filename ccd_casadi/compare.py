@@ -31,7 +31,8 @@ def table(comparison: "Comparison") -> str:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.toml_writer import case_to_toml
     from ccd_casadi.codesign.comparison import compare, comparison_dict
     from ccd_casadi.inner_problem.problem import plant_of

@@ -22,7 +22,8 @@ def _problem(
     options: argparse.Namespace,
 ) -> "tuple[CoDesignProblem, tuple[float, ...], tuple[float, float]]":
     """Problem, θ and (ω_S, ω_T) in rad/s of a case file with --theta, or of a finished run."""
-    from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+    from ccd_casadi.cases.case import CaseError, load_case, parse_theta
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.run_folder import read_run, refuse_sections
     from ccd_casadi.inner_problem.problem import true_inner
 

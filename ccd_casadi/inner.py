@@ -22,7 +22,8 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
-    from ccd_casadi.cases.case import CaseError, load_case, parse_theta, problem_of
+    from ccd_casadi.cases.case import CaseError, load_case, parse_theta
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.measured_case import measured_case
     from ccd_casadi.inner_problem.problem import best_choice, plant_of
     from ccd_casadi.plants.plant import hardware_cost

@@ -183,7 +183,8 @@ def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.case import load_case, problem_of
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.codesign.formulations import formulation_of
     from ccd_casadi.codesign.run import co_design
     from ccd_casadi.codesign.run_files import resolved, write_run

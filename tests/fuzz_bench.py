@@ -24,7 +24,8 @@ from fuzz_refute import refuted
 from fuzz_values import ROOT, Input
 
 import ccd_casadi.reporting.solve_page
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.inner import main as inner

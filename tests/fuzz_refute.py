@@ -13,7 +13,8 @@ import numpy as np
 from fuzz_exact import ExactLoop
 from helpers import HZ, dense_grid, reference_plant, sensitivity_gain, stack_gain
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.plant import constraint_values, mechanics
 from ccd_casadi.plants.scaling import StateSpace

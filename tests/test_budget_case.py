@@ -10,7 +10,8 @@ from case_documents import TWO_MASS
 
 from ccd_casadi.budget import Kind, ShapedSpectrum, TabulatedSpectrum
 from ccd_casadi.budget.quadrature import integrate
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.budget_result import budget_entry, budget_lines

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from benchmark_scripts import benchmark
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 
 ROOT = Path(__file__).parent.parent

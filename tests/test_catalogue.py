@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted

@@ -9,7 +9,8 @@ import jsonschema
 import pytest
 
 from ccd_casadi.__main__ import COMMANDS, OWN, main, overview
-from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from case_documents import TWO_MASS
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity, Topic
 from ccd_casadi.check import main as check

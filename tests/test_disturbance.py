@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import schur
 
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import true_inner
 from ccd_casadi.kernels.design import design, judge
 from ccd_casadi.kernels.disturbance import filter_solution, innovations_plant

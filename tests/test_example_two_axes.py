@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.case import parse_case, problem_of
+from ccd_casadi.cases.case import parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_result import active_of, design_dict
 from ccd_casadi.deployment.as_designed import _require_own_bounds

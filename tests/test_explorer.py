@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ccd_casadi import inner
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.explorer.background import Solve
 from ccd_casadi.explorer.curves import curves_of, sampled_of
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present

@@ -8,7 +8,8 @@ import pytest
 from benchmark_scripts import benchmark
 from scipy.signal import tf2ss
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_direct import polish_sections
 from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.codesign.sections_kkt import sections_kkt

@@ -15,7 +15,8 @@ from scipy.io import mmwrite, savemat
 from scipy.linalg import eigh
 from scipy.sparse import coo_array, csc_array, save_npz
 
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.plants.imported.frames import frames
 from ccd_casadi.plants.imported.interpolation import InterpolatedModes
 from ccd_casadi.plants.imported.matrices import modes_of, reduced_table

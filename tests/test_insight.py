@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import polish
 from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal

@@ -119,7 +119,8 @@ def test_killed_and_resumed_ends_as_if_undisturbed(
 POOL = f"""
 import sys
 import numpy as np
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.sampler import Sampler

@@ -10,7 +10,8 @@ from fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
 from ccd_casadi.budget.holding import Hold
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.least_error import RmsError, least_error
 from ccd_casadi.support.units import HZ

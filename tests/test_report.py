@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from commands import changed
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of

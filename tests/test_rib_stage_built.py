@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from benchmark_scripts import FOLDER, benchmark
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.on_the_set import sentences, stages_of, stored_rows
 from ccd_casadi.codesign.published import PUBLISHED

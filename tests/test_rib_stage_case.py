@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.closer_models import check_references
 from ccd_casadi.codesign.sequential import design_hardware, first_resonance
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_design

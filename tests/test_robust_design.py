@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from helpers import HZ, OMEGA_LOW, SUSPENSION, log_uniform, problem, random_plant, two_mass_model
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design

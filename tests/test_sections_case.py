@@ -9,7 +9,8 @@ import pytest
 from case_documents import TWO_MASS
 from helpers import SUSPENSION, random_plant
 
-from ccd_casadi.cases.case import CaseError, load_case, parse_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure

@@ -10,7 +10,8 @@ from helpers import HZ
 from test_sections_codesign import PID, quick
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source
-from ccd_casadi.cases.case import CaseError, load_case, problem_of
+from ccd_casadi.cases.case import CaseError, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from test_sources import SOURCES
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
 from ccd_casadi.inner_problem.plant_source import _own_plant
 from ccd_casadi.inner_problem.problem import plant_of

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs

@@ -12,7 +12,8 @@ from helpers import HZ, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
 from ccd_casadi.codesign.box_look import BoxLook, _starts

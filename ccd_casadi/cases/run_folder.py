@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of

@@ -17,7 +17,8 @@ import casadi as ca
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.cases.case import load_case, problem_of
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml

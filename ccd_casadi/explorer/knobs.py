@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ccd_casadi.cases.case import problem_of
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.controller_sections import LoopSection
 from ccd_casadi.cases.kinds import with_structure
 from ccd_casadi.cases.sections import Case

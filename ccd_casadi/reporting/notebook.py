@@ -5,7 +5,7 @@ from functools import singledispatch
 from itertools import count
 from typing import Any
 
-from ccd_casadi.cases.case import problem_of
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution

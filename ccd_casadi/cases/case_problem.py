@@ -1,0 +1,127 @@
+"""A case in SI: the co-design problem that the lower layers take."""
+
+from typing import Any
+
+from ccd_casadi.cases.budget import error_budget
+from ccd_casadi.cases.case import CaseError, options_in
+from ccd_casadi.cases.diagnosis import diagnose
+from ccd_casadi.cases.findings import Severity
+from ccd_casadi.cases.kinds import disturbance_of, require_channels, sections_problem, weights_of
+from ccd_casadi.cases.sections import Case, RobustSection
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.robust_set import RobustSet
+from ccd_casadi.inner_problem.sections_plant_set import with_options
+from ccd_casadi.inner_problem.sweep import InnerProblem
+from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.registry import DATA, SHIPPED
+from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.units import HZ
+from surrogates.options import one_line
+
+
+def problem_of(case: Case) -> CoDesignProblem:
+    """The case in SI, as the lower layers take it.
+
+    The plant is made once here, and one of the user's own is looked at over its box. Raises
+    CaseError where it is none.
+
+    >>> from ccd_casadi.cases.case import load_case
+    >>> problem = problem_of(load_case("runs/two_mass.toml"))
+    >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
+    (('m1', 'm2'), -0.995, 6.283)
+    """
+    inner, w = case.inner, case.weights
+    file = function = None
+    if case.plant.function is not None:
+        name, function = case.plant.function.rsplit(":", 1)
+        file = str((case.path.parent / name).resolve())
+    options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
+    problem = CoDesignProblem(
+        source=PlantSource(
+            case.plant.model,
+            file,
+            function,
+            options,
+            case.limits.plant_seconds,
+            fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
+        ).pinned(),
+        names=tuple(p.name for p in case.theta),
+        units=tuple(p.unit for p in case.theta),
+        lower=tuple(p.lower for p in case.theta),
+        upper=tuple(p.upper for p in case.theta),
+        start=tuple(p.start for p in case.theta),
+        listed=tuple((p.name, p.values) for p in case.theta if p.values),
+        w1=case.objective.w1,
+        w2=case.objective.w2,
+        cost_unit=case.objective.cost_unit,
+        weights=weights_of(w, inner, disturbance_of(case.controller, w)),
+        inner=InnerProblem(
+            S_max=inner.S_max,
+            S_low=inner.S_low,
+            omega_low=HZ * inner.omega_low_hz,
+            omega_S=(HZ * inner.omega_S_hz[0], HZ * inner.omega_S_hz[1]),
+            omega_T=(HZ * inner.omega_T_hz[0], HZ * inner.omega_T_hz[1]),
+            gamma_backoff=inner.gamma_backoff,
+            sweep_points=inner.sweep_points,
+            # sections bound it themselves, on every plant of theirs
+            compliance_max=None
+            if case.controller.structure == "sections"
+            else inner.compliance_max,
+        ),
+        suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
+        method=inner.method,
+        robust=None if case.controller.structure == "sections" else _robust(case.robust),
+        sections=sections_problem(
+            case.controller, case.loop, case.robust, inner, _option_sets(case)
+        ),
+        budget=error_budget(case.budget),
+    )
+    try:
+        plants = [plant_of(problem)]
+        if problem.sections is not None:
+            sets = problem.sections.uncertainty.options
+            plants += [plant_of(with_options(problem, item)) for item in sets]
+            require_channels(plants, problem.sections)
+        if case.plant.model not in SHIPPED:
+            for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
+                if finding.severity is Severity.ERROR:
+                    raise PlantError(finding.words)
+    except UserError as error:
+        raise CaseError(one_line(f"{case.path}: plant: {error}")) from error
+    except Exception as error:
+        if function is None:
+            raise
+        words = f"{function} raised {described(error)}; mend it"
+        raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
+    return problem
+
+
+def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
+    """The plant options of every file that [robust] names, data files by their absolute path."""
+    found = []
+    for file in case.robust.plants:
+
+        def fail(key: str, words: str) -> CaseError:
+            return CaseError(one_line(f"{case.path}: {key}: {words}"))
+
+        options = options_in(file, file, fail)
+        data = DATA.get(case.plant.model or "")
+        if data in options:
+            options[data] = str((case.path.parent / options[data]).resolve())
+        found.append(tuple(sorted((key, _frozen(value)) for key, value in options.items())))
+    return tuple(found)
+
+
+def _robust(section: RobustSection) -> RobustSet | None:
+    """The set of plants that [robust] names; None where it names no other than the model."""
+    shift = section.resonance_shift
+    if shift == 0.0 and not section.damping:
+        return None
+    ends = {"auto": None if shift else 0.0, "low": -shift, "nominal": 0.0, "high": shift}
+    design = ends[section.design_at]
+    return RobustSet(shift, section.shifts if shift else 1, section.damping, design)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
