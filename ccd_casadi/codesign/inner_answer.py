@@ -1,0 +1,119 @@
+"""The inner problem at one θ under the contract's keys: by mixed sensitivity, as JSON."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.budget_result import budget_entry
+from ccd_casadi.codesign.result import compliance_dict, controller_dict, figures_dict
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    best_choice,
+    design_choices,
+    plant_of,
+    scaled_plant,
+    true_design,
+)
+from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
+from ccd_casadi.synthesis.statics import statics
+from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+
+
+@dataclass(frozen=True)
+class InnerAnswer:
+    """What `inner` prints, and controller.json; `status` says "verified" or why there is none.
+
+    `controller` is None where the problem is infeasible; `rows` are the figures of a sweep.
+    """
+
+    status: str
+    figures: dict[str, Any]
+    controller: dict[str, Any] | None = None
+    rows: tuple[DesignFigures, ...] = ()
+
+
+def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
+    """θ by name, and what the hardware costs."""
+    return {
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "hardware_cost": hardware_cost(plant_of(problem), theta),
+    }
+
+
+def mixed_answer(
+    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float] | None = None
+) -> InnerAnswer:
+    """The true ω_b*(θ) by mixed sensitivity; at `point` (ω_S, ω_T), rad/s, that synthesis alone."""
+    head = head_of(problem, theta)
+    rows: tuple[DesignFigures, ...] = ()
+    if point is not None:
+        problem = _best_at(problem, theta, point)
+        syntheses = 1
+    else:
+        problem, found = best_choice(problem, theta)
+        syntheses, rows = found.syntheses, found.rows
+        if found.optimum is None:
+            head |= {"reason": found.shortfall, "syntheses": syntheses}
+            return InnerAnswer("infeasible", head, rows=rows)
+        point = (found.optimum.figures.omega_S, found.optimum.figures.omega_T)
+    if problem.robust is not None:
+        head["design_at"] = problem.robust.design_at
+    certified, figures, controller = _design(problem, theta, point)
+    figures = head | figures | {"syntheses": syntheses}
+    cost, bandwidth = head["hardware_cost"], HZ * (figures["bandwidth_hz"] or 0.0)
+    figures["objective"] = problem.w1 * cost + problem.w2 * bandwidth
+    return InnerAnswer("verified" if certified else "not_verified", figures, controller, rows)
+
+
+def _best_at(
+    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
+) -> CoDesignProblem:
+    """The problem with the design plant whose controller has the least peak of S there."""
+
+    def peak(choice: CoDesignProblem) -> float:
+        return float(np.nan_to_num(true_design(choice, theta, *point).values[1], nan=np.inf))
+
+    return min(design_choices(problem), key=peak)
+
+
+def _design(
+    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float]
+) -> tuple[bool, dict[str, Any], dict[str, Any]]:
+    """Whether the synthesis is certified, its figures, and controller.json."""
+    plant = scaled_plant(problem, theta)
+    made = synthesise(
+        plant,
+        problem.weights.at(*point),
+        omega_low=problem.inner.omega_low,
+        gamma_backoff=problem.inner.gamma_backoff,
+        compliance=True,
+    )
+    made = handed_out(plant, made, problem.inner.omega_low)
+    figures = made.figures
+    feasible = problem.inner.feasible(figures)
+    compliance: dict[str, Any] = {}
+    if figures.certified:
+        rest = statics(
+            plant.plant_si(), made.controller, bandwidth=figures.bandwidth,
+            omega_low=problem.inner.omega_low,
+        )  # fmt: skip
+        compliance = compliance_dict(figures.compliance, rest.compliance, rest.low, rest.low_hz)
+    answer = {
+        **clean(figures_dict(figures)),
+        **compliance,
+        "active": list(active_constraints(problem.inner, figures)) if feasible else [],
+        "feasible": feasible,
+        "local_peaks": [
+            {"hz": omega / HZ, "sensitivity": gain}
+            for omega, gain in local_peaks(plant, made.controller)
+        ],
+        "natural_hz": [float(omega) / HZ for omega in plant.natural],
+        **budget_entry(problem, theta, made.controller),
+    }
+    return figures.certified, answer, controller_dict(made.controller)

@@ -1,0 +1,86 @@
+"""The inner problem of a fixed structure at one θ: race, worst plants, judge and proof; as JSON."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import sections_kappa
+from ccd_casadi.codesign.budget_result import budget_entry
+from ccd_casadi.codesign.inner_answer import InnerAnswer, head_of
+from ccd_casadi.codesign.sections_result import (
+    active_of,
+    design_dict,
+    proof_dict,
+    sections_controller,
+)
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
+from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
+from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.units import HZ
+
+
+def sections_answer(
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    *,
+    seed: int,
+    workers: Pool,
+    begin_at: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> InnerAnswer:
+    """The largest bandwidth (or least error) of the structure at θ, judged over its box.
+
+    `begin_at`: the search goes on from the controller of that run folder alone, without a race.
+    """
+    head = head_of(problem, theta)
+    sections = replace(sections_of_problem(problem), seed=seed)
+    asked = replace(with_range(replace(problem, sections=sections)), start=theta)
+    if begin_at is not None:
+        anchors = (sections_kappa(begin_at, structure_of(asked)),)
+        asked = replace(asked, sections=replace(sections_of_problem(asked), anchors=anchors))
+    asked, made = prepared(asked, progress, workers, begin_at is not None)
+    if not made.certified:
+        return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
+    value = made.bandwidth
+    if sections.of_error:
+        slow = too_slow(asked, made)
+        if not slow.certified:
+            return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})
+        fastest = made.bandwidth
+        asked, least = least_error_at(asked, theta, made, progress)
+        made = least.design
+        value = least.error if problem.w2 > 0.0 else made.bandwidth
+        head["least_error"] = {
+            "error_rms_of_set": least.error,
+            "error_rms_at_largest_bandwidth": least.first_error,
+            "largest_bandwidth_hz": fastest / HZ,
+            "steps": least.steps,
+        }
+    worst = worst_members(asked, theta, made)[0]
+    assert made.controller is not None
+    wide, checked = judged_widely(asked, theta, made.controller, worst, workers)
+    proof = proof_of(asked, theta, made)
+    passed = wide.passed and not proof.refuted
+    figures = head | {
+        **design_dict(asked, made),
+        "active": active_of(made),
+        "feasible": True,
+        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * value,
+        "robust": {
+            "plants": checked,
+            "passed": wide.passed,
+            "words": wide.words,
+            "bandwidth_hz": wide.bandwidth / HZ,
+            "worst_excess": float(np.expm1(worst.value)),
+        },
+        "proof": proof_dict(proof),
+        "syntheses": 1,
+        **budget_entry(asked, theta, made.controller),
+    }
+    status = "verified" if passed else "not_verified"
+    return InnerAnswer(status, figures, sections_controller(asked, made))
