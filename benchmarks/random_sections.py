@@ -41,10 +41,11 @@ from sections_judge import Case, figures
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
 from ccd_casadi.fixed_structure.certificate import TOLERANCE
-from ccd_casadi.fixed_structure.design import MARGIN, RESTORING, designed, problem_for
+from ccd_casadi.fixed_structure.design import RESTORING, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
 from ccd_casadi.fixed_structure.race import FIRST
+from ccd_casadi.fixed_structure.sections_design import MARGIN, designed
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

@@ -31,7 +31,7 @@ _PUBLIC = {
     "Nested": "codesign.nested",
     "Plant": "plants.plant",
     "Sampling": "fixed_structure.hold_and_delay",
-    "SectionsDesign": "fixed_structure.design",
+    "SectionsDesign": "fixed_structure.sections_design",
     "Solution": "codesign.solution",
     "StateSpace": "plants.scaling",
     "Structure": "fixed_structure.structure",

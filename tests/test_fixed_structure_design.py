@@ -17,11 +17,12 @@ from ccd_casadi.fixed_structure import (
     synthesise_sections,
 )
 from ccd_casadi.fixed_structure.certificate import judged
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.race import distinct, run_race
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
 from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.trust_region import Point

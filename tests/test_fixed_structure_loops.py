@@ -13,11 +13,12 @@ from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, constraints, evaluate, to_theta
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import closed_on_zero
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
 from ccd_casadi.fixed_structure.structure import (
     response,

@@ -10,12 +10,13 @@ from helpers import HZ, SUSPENSION, two_mass_model
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, root, variable
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
 from ccd_casadi.fixed_structure.figures import evaluate
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.modal_sum import modal_sum
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice

@@ -16,7 +16,7 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.fixed_structure.design import SectionsOutcome
+from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.support.notebook import Shown
 from ccd_casadi.support.optional_packages import MissingPackage
 from ccd_casadi.support.progress import Progress

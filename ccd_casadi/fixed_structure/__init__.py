@@ -1,14 +1,16 @@
 """Controllers of fixed structure for sets of plants, continuous or sampled."""
 
+from ccd_casadi.fixed_structure.bandwidth_gradient import (
+    bandwidth_and_gradient as bandwidth_and_gradient,
+)
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.bounds import ChannelBounds as ChannelBounds
 from ccd_casadi.fixed_structure.certificate import Certificate as Certificate
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.channel_design import synthesise as synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure as ChannelStructure
-from ccd_casadi.fixed_structure.design import SectionsDesign as SectionsDesign
-from ccd_casadi.fixed_structure.design import SectionsOutcome as SectionsOutcome
-from ccd_casadi.fixed_structure.design import bandwidth_and_gradient as bandwidth_and_gradient
 from ccd_casadi.fixed_structure.design import synthesise_sections as synthesise_sections
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling as Sampling
+from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
+from ccd_casadi.fixed_structure.sections_design import SectionsOutcome as SectionsOutcome
 from ccd_casadi.fixed_structure.structure import Structure as Structure

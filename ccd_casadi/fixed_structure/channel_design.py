@@ -17,30 +17,19 @@ import numpy as np
 from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.composite import (
-    CompositeProblem,
-    answer_alike,
-    composite_problem,
-)
+from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import (
+from ccd_casadi.fixed_structure.design import Progress, synthesise_sections
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race, started
+from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
-    Progress,
     SectionsDesign,
     SectionsOutcome,
     designed,
     in_problem_units,
     span_of,
-    synthesise_sections,
-)
-from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
-from ccd_casadi.fixed_structure.race import (
-    LocalOptimum,
-    finished,
-    local_optima,
-    run_race,
-    started,
 )
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.trust_region import Point, ascend

@@ -5,89 +5,39 @@ design.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from time import perf_counter
 from typing import overload
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.certificate import Certificate, certify
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
-from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.optimality import Envelope, log_bandwidth_envelope, optimality
-from ccd_casadi.fixed_structure.race import (
-    LocalOptimum,
-    Runner,
-    distinct,
-    finished,
-    local_optima,
-    run_race,
+from ccd_casadi.fixed_structure.race import Runner, distinct, finished, local_optima, run_race
+from ccd_casadi.fixed_structure.sections_design import (
+    MARGIN,
+    SectionsDesign,
+    SectionsOutcome,
+    designed,
+    in_problem_units,
+    span_of,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept, redrawn
-from ccd_casadi.fixed_structure.structure import Kind, Structure
-from ccd_casadi.fixed_structure.trust_region import Point, ascend
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.trust_region import ascend
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.notebook import Shown
 from ccd_casadi.support.process_pool import Pool
 
-MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
 REDRAWS = 2  # races from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is raced
-LOWER_AT_MOST = 1e-3  # relative: what the judge's ω_b may be below the search's
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
-
-
-class SectionsOutcome(StrEnum):
-    """How a synthesis ended; only CERTIFIED designs are to be used."""
-
-    CERTIFIED = "certified"
-    NO_STABLE_START = "no start is stable on every plant of the set"
-    BOUND_NOT_MET = "no controller was found that meets every bound"
-    NOT_CERTIFIED = "the judge does not confirm what the search found"
-
-
-@dataclass(frozen=True)
-class SectionsDesign(Shown):
-    """A controller of fixed structure; SI, frequencies in rad/s.
-
-    `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state
-    space (sampled loops: to be discretised by Tustin's rule without prewarping). `bandwidth` holds
-    on every plant. `frequencies` bounded those of K's roots. `multipliers` by kind of bound: change
-    of ln ω_b per ln of it. `short` names the bounds that the nearest controller misses, with the
-    factor, where none meets all.
-    """
-
-    outcome: SectionsOutcome
-    words: str
-    structure: Structure | ChannelStructure
-    kappa: Array
-    frequencies: tuple[float, float]
-    controller: StateSpace | None
-    bandwidth: float
-    certificate: Certificate | None
-    multipliers: dict[str, float]
-    at_box: tuple[tuple[str, str, float], ...]
-    kkt_residual: float
-    short: dict[str, float]
-    local_optima: tuple[LocalOptimum, ...]
-    starts: int
-    evaluations: int
-    seed: int
-    seconds: float
-
-    @property
-    def certified(self) -> bool:
-        """Whether the design may be used."""
-        return self.outcome is SectionsOutcome.CERTIFIED
 
 
 Progress = Callable[[str], None]
@@ -206,65 +156,6 @@ def synthesise_sections(
     return best
 
 
-def bandwidth_envelope(
-    plants: Sequence[ScaledPlant],
-    bounds: Bounds,
-    design: SectionsDesign,
-    sampling: Sampling | None = None,
-) -> Envelope | None:
-    """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
-
-    None where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
-    """
-    problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
-    kappa = in_problem_units(problem, design.kappa)
-    tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
-    envelope = log_bandwidth_envelope(problem, kappa, found)
-    return None if envelope is None else envelope.times(design.bandwidth)
-
-
-def bandwidth_and_gradient(
-    plants: Sequence[ScaledPlant],
-    bounds: Bounds,
-    design: SectionsDesign,
-    sampling: Sampling | None = None,
-) -> tuple[float, Array]:
-    """ω_b* in rad/s and dω_b*/dθ at a design that is optimal on these plants (envelope theorem).
-
-    Of one side where ω_b* has a kink; NaN where the point is not stationary to 1e-3.
-    """
-    envelope = bandwidth_envelope(plants, bounds, design, sampling)
-    unknown = np.full(len(plants[0].dA), np.nan)
-    return design.bandwidth, unknown if envelope is None else envelope.gradient
-
-
-def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
-    """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
-    assessment = assess(problem, kappa, tau)
-    peaks = assessment.peaks
-    if peaks is not None:
-        rising = peaks.to_tau > 0.0
-        room = float((-peaks.value[rising] / peaks.to_tau[rising]).min(initial=np.inf))
-        if abs(room) < LOWER_AT_MOST:
-            tau += room
-            assessment = assess(problem, kappa, tau)
-    return Point(kappa, tau, assessment)
-
-
-def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
-    """SI parameters κ in the units of the problem."""
-    P = problem.plants
-    return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
-
-
-def span_of(problem: LoopProblem) -> tuple[float, float]:
-    """The bounds of frequencies of K's roots in rad/s."""
-    index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
-    low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
-    return float(low), float(high)
-
-
 def _initial(
     problem: Problem, initial: Sequence[Array | StateSpace], rng: np.random.Generator
 ) -> Array:
@@ -309,43 +200,3 @@ def _nearest(problem: Problem, kappa: Array, count: int) -> Array:
     tau = float(np.log(0.1))
     misses = [assess(problem, one, tau).violation for one in kappa]
     return kappa[np.argsort(misses)[:count]]
-
-
-def designed(
-    problem: LoopProblem,
-    plants: Sequence[ScaledPlant],
-    sampling: Sampling | None,
-    point: Point,
-    optima: tuple[LocalOptimum, ...],
-    starts: int,
-    evaluations: int,
-    seed: int,
-    seconds: float,
-) -> SectionsDesign:
-    structure, bounds, P = problem.structure, problem.bounds, problem.plants
-    kappa = structure.in_units(point.kappa, P.omega_0, P.force)
-    controller = controller_of(structure, kappa)
-    found = optimality(problem, point)
-    bandwidth = float(np.exp(point.tau)) * P.omega_0
-    judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
-    short: dict[str, float] = {}
-    peaks = point.assessment.peaks
-    assert peaks is not None
-    for name, value in zip(kinds_of_rows(problem, peaks), peaks.value, strict=True):
-        if value > 2.0 * MARGIN:
-            short[name] = max(short.get(name, 0.0), float(np.exp(value)))
-    outcome, words = SectionsOutcome.CERTIFIED, judged.words
-    if short:
-        outcome = SectionsOutcome.BOUND_NOT_MET
-        missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
-        words = f"the nearest controller misses {missed}"
-    elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
-        outcome = SectionsOutcome.NOT_CERTIFIED
-        words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"
-    if outcome is SectionsOutcome.CERTIFIED:
-        bandwidth = min(bandwidth, judged.bandwidth)
-    return SectionsDesign(
-        outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
-        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
-        seconds,
-    )  # fmt: skip

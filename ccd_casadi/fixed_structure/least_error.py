@@ -28,17 +28,16 @@ from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.descent import Point, descend
-from ccd_casadi.fixed_structure.design import (
-    Progress,
-    SectionsDesign,
-    SectionsOutcome,
-    in_problem_units,
-    problem_for,
-)
+from ccd_casadi.fixed_structure.design import Progress, problem_for
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.sections_design import (
+    SectionsDesign,
+    SectionsOutcome,
+    in_problem_units,
+)
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array

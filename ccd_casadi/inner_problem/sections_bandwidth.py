@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.channel_design import synthesise
-from ccd_casadi.fixed_structure.design import Progress, SectionsOutcome, bandwidth_envelope
+from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,

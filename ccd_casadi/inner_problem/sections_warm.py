@@ -6,8 +6,9 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Structure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.race import started
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

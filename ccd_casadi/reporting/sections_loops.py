@@ -8,9 +8,10 @@ import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.composite import CompositeProblem, largest_gains
-from ccd_casadi.fixed_structure.design import in_problem_units, problem_for
+from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import evaluate
 from ccd_casadi.fixed_structure.loop_problem import Problem
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.reporting.force_step import force_step

@@ -1,0 +1,120 @@
+"""A controller of fixed structure as it was found, judged and put in words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.certificate import Certificate, certify
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.composite import kinds_of_rows
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem
+from ccd_casadi.fixed_structure.optimality import optimality
+from ccd_casadi.fixed_structure.race import LocalOptimum
+from ccd_casadi.fixed_structure.structure import Kind, Structure
+from ccd_casadi.fixed_structure.trust_region import Point
+from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.notebook import Shown
+
+MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
+
+
+class SectionsOutcome(StrEnum):
+    """How a synthesis ended; only CERTIFIED designs are to be used."""
+
+    CERTIFIED = "certified"
+    NO_STABLE_START = "no start is stable on every plant of the set"
+    BOUND_NOT_MET = "no controller was found that meets every bound"
+    NOT_CERTIFIED = "the judge does not confirm what the search found"
+
+
+@dataclass(frozen=True)
+class SectionsDesign(Shown):
+    """A controller of fixed structure; SI, frequencies in rad/s.
+
+    `kappa` are the logarithms of its parameters in rad/s and N/m, `controller` the same as a state
+    space (sampled loops: to be discretised by Tustin's rule without prewarping). `bandwidth` holds
+    on every plant. `frequencies` bounded those of K's roots. `multipliers` by kind of bound: change
+    of ln ω_b per ln of it. `short` names the bounds that the nearest controller misses, with the
+    factor, where none meets all.
+    """
+
+    outcome: SectionsOutcome
+    words: str
+    structure: Structure | ChannelStructure
+    kappa: Array
+    frequencies: tuple[float, float]
+    controller: StateSpace | None
+    bandwidth: float
+    certificate: Certificate | None
+    multipliers: dict[str, float]
+    at_box: tuple[tuple[str, str, float], ...]
+    kkt_residual: float
+    short: dict[str, float]
+    local_optima: tuple[LocalOptimum, ...]
+    starts: int
+    evaluations: int
+    seed: int
+    seconds: float
+
+    @property
+    def certified(self) -> bool:
+        """Whether the design may be used."""
+        return self.outcome is SectionsOutcome.CERTIFIED
+
+
+def in_problem_units(problem: LoopProblem, kappa: Array) -> Array:
+    """SI parameters κ in the units of the problem."""
+    P = problem.plants
+    return problem.structure.in_units(np.asarray(kappa, float), 1.0 / P.omega_0, 1.0 / P.force)
+
+
+def span_of(problem: LoopProblem) -> tuple[float, float]:
+    """The bounds of frequencies of K's roots in rad/s."""
+    index = problem.structure.kinds.index(Kind.FREQUENCY) if len(problem.box[0]) > 1 else 0
+    low, high = np.exp(problem.box[:, index]) * problem.plants.omega_0
+    return float(low), float(high)
+
+
+def designed(
+    problem: LoopProblem,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    point: Point,
+    optima: tuple[LocalOptimum, ...],
+    starts: int,
+    evaluations: int,
+    seed: int,
+    seconds: float,
+) -> SectionsDesign:
+    """The design at an end of a race: certified where the judge confirms what the search found."""
+    structure, bounds, P = problem.structure, problem.bounds, problem.plants
+    kappa = structure.in_units(point.kappa, P.omega_0, P.force)
+    controller = controller_of(structure, kappa)
+    found = optimality(problem, point)
+    bandwidth = float(np.exp(point.tau)) * P.omega_0
+    judged = certify(plants, controller, bounds, sampling, integrator=structure.integrator)
+    short: dict[str, float] = {}
+    peaks = point.assessment.peaks
+    assert peaks is not None
+    for name, value in zip(kinds_of_rows(problem, peaks), peaks.value, strict=True):
+        if value > 2.0 * MARGIN:
+            short[name] = max(short.get(name, 0.0), float(np.exp(value)))
+    outcome, words = SectionsOutcome.CERTIFIED, judged.words
+    if short:
+        outcome = SectionsOutcome.BOUND_NOT_MET
+        missed = ", ".join(f"{name} by a factor {ratio:.6g}" for name, ratio in short.items())
+        words = f"the nearest controller misses {missed}"
+    elif not judged.passed or abs(judged.bandwidth / bandwidth - 1.0) > 1e-3:
+        outcome = SectionsOutcome.NOT_CERTIFIED
+        words = f"judged {judged.bandwidth:.6g} rad/s, searched {bandwidth:.6g}: {judged.words}"
+    if outcome is SectionsOutcome.CERTIFIED:
+        bandwidth = min(bandwidth, judged.bandwidth)
+    return SectionsDesign(
+        outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
+        found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
+        seconds,
+    )  # fmt: skip
