@@ -15,9 +15,10 @@ from helpers import (
     random_plant,
     scaled,
     sensitivity_gain,
+    state_response,
     two_mass,
 )
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
@@ -28,6 +29,20 @@ from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
 LEVEL = 1.0 / np.sqrt(2.0)
+
+
+def schur_error(system: StateSpace, K: StateSpace, omega: float) -> float:
+    """What eps ‖A_K‖ in A_K changes of S at jω, relative, to first order: ‖S G‖ ‖C R‖ ‖R B‖ of it.
+
+    S(jω_low) is read off the controller's Schur form, whose backward error is normwise. In 1160
+    draws under five sets of kernels it was wrong by half of this at most, and by 7e-8.
+    """
+    R = np.linalg.inv(1j * omega * np.eye(len(K.A)) - K.A)
+    G = state_response(system, np.array([omega]))[0]
+    S = np.linalg.inv(np.eye(len(G)) + G @ (K.C @ R @ K.B + K.D))
+    parts = (K.C @ R, R @ K.B, S @ G)
+    change = np.prod([np.linalg.norm(part, 2) for part in parts])
+    return float(np.finfo(float).eps * np.linalg.norm(K.A) * change)
 
 
 def check_figures(plant: ScaledPlant, weights: Weights, per_decade: int) -> None:
@@ -41,10 +56,9 @@ def check_figures(plant: ScaledPlant, weights: Weights, per_decade: int) -> None
 
     grid = dense_grid(system, design.controller, per_decade=per_decade)
     assert figures.bandwidth == pytest.approx(first_crossing(gain, grid, LEVEL), rel=1e-8)
-    # read off the controller's Schur form, whose backward error is normwise (4.6e-8 was seen)
-    backward = np.finfo(float).eps * np.linalg.norm(design.controller.A) / OMEGA_LOW
     low = float(gain(OMEGA_LOW)[0])
-    assert figures.sensitivity_low == pytest.approx(low, rel=1e-8 + 30.0 * backward)
+    rounding = 1e-9 + min(schur_error(system, design.controller, OMEGA_LOW), 1e-6)
+    assert figures.sensitivity_low == pytest.approx(low, rel=rounding)
     top, at = highest(gain, grid)
     assert figures.sensitivity_peak == pytest.approx(top, rel=1e-8)
     # its place: the root of the slope, taken from differences of the response
@@ -70,6 +84,7 @@ def test_figures_of_the_two_mass_plant(m1: float, m2: float, S: float, T: float)
 
 
 @few(max_examples=8)
+@example(1638, 1, 2.625)  # 1.3e-8 in S(jω_low) under Zen's kernels
 @given(st.integers(0, 10**6), st.integers(1, 2), st.floats(1.0, 3.0))
 def test_figures_of_small_plants_with_two_channels(seed: int, rigid: int, S: float) -> None:
     model = random_plant(seed, rigid=rigid, flexible=4, inputs=2, outputs=2)
