@@ -6,9 +6,11 @@ damping ζ an error δ of the frequency shows in dγ_jω/dθ as δ/ζ². So the 
 
 import numpy as np
 
+from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import BACKWARD
 from ccd_casadi.kernels.generalized_plant import squared_weights
 
+EPS = 2.0**-52
 DEVIATIONS = 4.0  # standard deviations of the rounding that `bound_error` admits
 
 
@@ -29,15 +31,20 @@ def _least_direction(A, B, C, ω):
 def bound_error(A, B, C, w, ω):
     """δγ_jω/γ_jω that rounding leaves in the bound attained at ω, through σ_p(G(jω)).
 
-    δσ = u* C (jω - A)⁻¹ δA (jω - A)⁻¹ B v with |δA| = BACKWARD |A| of the Schur form, spread evenly
-    over the entries. Next to a transmission zero of small damping σ is small and its error is not.
+    δσ = l δT r, l = u* C (jω - T)⁻¹, r = (jω - T)⁻¹ B v, in coordinates of the Schur form T of A.
+    Its own backward error is |δT| = BACKWARD |T|, spread evenly over the entries; the solves at ω
+    leave eps |T_ij| in each, which is more where eigenvalues stand in an unlucky order. Next to a
+    transmission zero of small damping σ is small and its error is not.
     """
-    n = A.shape[0]
-    M, right, σ, u, v = _least_direction(A, B, C, ω)
+    T, B, C = prepare(A, B, C)
+    n = T.shape[0]
+    M, right, σ, u, v = _least_direction(T, B, C, ω)
     if σ == 0.0:
         return 0.0  # fewer inputs than outputs, or none that acts: the bound is |W1|
     left = np.linalg.solve(M.T, u.conj() @ C)
-    dσ = BACKWARD * np.linalg.norm(A) / n * np.linalg.norm(left) * np.linalg.norm(right @ v)
+    form = BACKWARD * np.linalg.norm(T) / n * np.linalg.norm(left) * np.linalg.norm(right @ v)
+    squares = [np.abs(part) ** 2 for part in (left, M, right, v)]
+    dσ = np.hypot(form, EPS * np.sqrt(np.linalg.multi_dot(squares)))
     W1, W2, W3 = squared_weights(w, ω)
     force = W2 / σ**2
     return DEVIATIONS * W1 / (W1 + force + W3) * force / (force + W3) * dσ / σ

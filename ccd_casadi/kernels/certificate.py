@@ -10,10 +10,11 @@ import numpy as np
 from ccd_casadi.kernels.compiled import compiled
 from ccd_casadi.kernels.frequency import response, responses
 from ccd_casadi.kernels.generalized_plant import squared_weights
-from ccd_casadi.kernels.refine import narrow, next_trial
+from ccd_casadi.kernels.refine import narrow, next_trial, promised
 from ccd_casadi.kernels.sensitivity import axis_frequencies
 from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
 
+HOPELESS = 0.95  # of the largest gain on the grid: a peak that no point of it shows is not so high
 REFINEMENTS = 40  # trials a peak; some six are used
 
 
@@ -73,15 +74,16 @@ def stack_norm(G, K, Dk, w, grid):
         left, right = values[i - 1], values[i + 1]
         if values[i] < left or values[i] <= right:
             continue
-        # A parabola through three points tells how much a peak can gain.
-        bend = 2.0 * values[i] - left - right
-        if bend > 0.0 and values[i] + 0.25 * (right - left) ** 2 / bend < 0.9999 * top:
-            continue
         a, x, b = np.log(grid[i - 1]), np.log(grid[i]), np.log(grid[i + 1])
         fa, fx, fb = left, values[i], right
-        for _ in range(REFINEMENTS):
+        for trial in range(REFINEMENTS):
+            # The parabola's promise is trusted to half, and not at all while the points stand
+            # wide: between two of the grid a peak was 1.2 % higher where it promised 0.06 %.
+            promise = fx + 2.0 * promised(a, fa, x, fx, b, fb)
+            if promise < 0.9999 * top and (trial > 1 or fx < HOPELESS * top):
+                break
             new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)
-            if room == 0.0 or fx + room < best:
+            if room == 0.0:
                 break
             f = stack_gain(G, K, Dk, w, np.exp(new))
             a, fa, x, fx, b, fb = narrow(a, fa, x, fx, b, fb, new, f)

@@ -1,5 +1,7 @@
 """Closing a bracket around a local maximum of a gain over frequency."""
 
+import numpy as np
+
 from ccd_casadi.kernels.compiled import compiled
 
 
@@ -9,6 +11,17 @@ def _vertex(a, fa, x, fx, b, fb):
     left, right = (fx - fa) / (x - a), (fb - fx) / (b - x)
     bend = (left - right) / (b - a)
     return x + 0.5 * (left / bend - (x - a)) if bend > 0.0 else x
+
+
+@compiled
+def promised(a, fa, x, fx, b, fb):
+    """How far the parabola through three points, a < x < b, rises above fx; inf: it bends upwards.
+
+    Points beside a pole are not evenly spread: a formula for even steps would promise too little.
+    """
+    left, right = (fx - fa) / (x - a), (fb - fx) / (b - x)
+    bend = (left - right) / (b - a)
+    return 0.25 * (left - bend * (x - a)) ** 2 / bend if bend > 0.0 else np.inf
 
 
 @compiled
