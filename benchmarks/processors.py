@@ -5,6 +5,7 @@ OpenBLAS picks its kernels by the processor; OPENBLAS_CORETYPE overrules it, and
     python benchmarks/processors.py                          # the whole suite, three times each
     python benchmarks/processors.py --times 1 --kernels Haswell tests/test_balance.py
     python benchmarks/processors.py --other                  # CI: numerical tests, one other kernel
+    python benchmarks/processors.py --times 1 --examples 10  # property tests, ten times as many
 
 Every run has a seed of its own, which the table names: `pytest --hypothesis-seed=SEED` with
 HYPOTHESIS_PROFILE=study and OPENBLAS_CORETYPE as in its line draws the same examples again. Ends
@@ -90,13 +91,17 @@ def available() -> dict[str, str]:
     return {name: found for name, found in asked.items() if found}
 
 
-def run_tests(kernels: str, seed: int, jobs: int, tests: Sequence[str]) -> Run:
+def run_tests(
+    kernels: str, seed: int, jobs: int, tests: Sequence[str], examples: int | None = None
+) -> Run:
     """The suite, or the tests named, in a process of its own."""
     env = os.environ | {"OPENBLAS_CORETYPE": kernels, "HYPOTHESIS_PROFILE": "study"}
+    env |= {"HYPOTHESIS_TIMES": str(examples or 1)}
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         words = [sys.executable, "-m", "pytest", "-n", str(jobs), "--dist", "worksteal"]
         words += ["-p", "no:cacheprovider", f"--hypothesis-seed={seed}", f"--junitxml={report}"]
+        words += ["-m", "hypothesis and not slow"] if examples else []
         words += tests
         began = time.monotonic()
         done = subprocess.run(words, cwd=ROOT, env=env, capture_output=True, text=True, check=False)
@@ -137,6 +142,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first run (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes of pytest (default: 2)")
     parser.add_argument(
+        "--examples", type=int, help="property tests alone, with that many times the examples"
+    )
+    parser.add_argument(
         "--other", action="store_true", help="the numerical tests once, under one other kernel"
     )
     options = parser.parse_args()
@@ -154,7 +162,7 @@ def main() -> int:
     for number in range(times):
         for place, name in enumerate(names):
             seed = options.seed + number * len(names) + place
-            runs.append(run_tests(name, seed, options.jobs, tests))
+            runs.append(run_tests(name, seed, options.jobs, tests, options.examples))
             print(table(runs[-1:]).splitlines()[-1], flush=True)
     if len(runs) > 1:
         print(table(runs))

@@ -11,7 +11,7 @@ from functools import cache
 import casadi as ca
 import control
 import numpy as np
-from hypothesis import settings
+from draws import few as few
 from scipy.linalg import sqrtm
 from scipy.optimize import brentq, minimize_scalar
 
@@ -34,7 +34,6 @@ SUSPENSION = Suspension()
 # Rounding K alone moves a rigid-body mode by eps·(ω_max/ω_r)²: comparisons between dense
 # matrices to 1e-9 need it nearer to the flexible modes than the default 0.1 Hz.
 STIFF_SUSPENSION = Suspension(2.0, 0.7)
-few = settings  # what else holds is the profile's, see conftest.py
 
 PAPER = Weights(
     M_S=2.0, A_S=1e-4, omega_S=800.0 * HZ, c_K=1e4, omega_K=100.0 * HZ, M_K=2e7,

@@ -2,19 +2,16 @@
 
 from functools import partial
 
+import draws
 import numpy as np
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 
-from surrogates import (
-    Hyperparameters,
-    Kernel,
-)
+from surrogates import Hyperparameters, Kernel
 
 KERNELS = pytest.mark.parametrize("kernel", list(Kernel))
 BOX = {"lower": [-2.0, -2.0], "upper": [2.0, 2.0]}
-few = partial(settings, max_examples=10)
+few = partial(draws.few, max_examples=10)
 seeds = st.integers(0, 10**6)
 
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from draws import few
 from helpers import HZ
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ortho_group
 
@@ -54,7 +55,7 @@ def blocks(seed: int, sizes: tuple[int, ...]) -> ModalPlant:
     )  # fmt: skip
 
 
-@settings(max_examples=20)
+@few(max_examples=20)
 @given(seed=st.integers(0, 10**6), sizes=st.sampled_from([(1, 1), (2, 1), (1, 1, 1, 1), (2, 2)]))
 def test_hidden_blocks_are_found(seed: int, sizes: tuple[int, ...]) -> None:
     plant = blocks(seed, sizes)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from draws import few
+from hypothesis import given
 from hypothesis import strategies as st
 
 from surrogates import corners, design, grid, latin_hypercube, sobol
@@ -11,7 +12,7 @@ LOW, HIGH = np.array([-1.0, 10.0, 0.1]), np.array([2.0, 11.0, 0.3])
 KINDS = st.sampled_from(["sobol", "lhs"])
 
 
-@settings(max_examples=25)
+@few(max_examples=25)
 @given(KINDS, st.integers(1, 70), st.integers(0, 2**31))
 def test_plans_fill_the_box_and_depend_on_the_seed_alone(kind: str, n: int, seed: int) -> None:
     X = design(kind, LOW, HIGH, n, seed)
@@ -22,7 +23,7 @@ def test_plans_fill_the_box_and_depend_on_the_seed_alone(kind: str, n: int, seed
     assert not np.array_equal(X, design(kind, LOW, HIGH, n, seed + 1))
 
 
-@settings(max_examples=15)
+@few(max_examples=15)
 @given(st.integers(1, 60), st.integers(0, 1000))
 def test_latin_hypercube_has_one_point_in_every_slice(n: int, seed: int) -> None:
     unit = latin_hypercube(np.zeros(3), np.ones(3), n, seed)
@@ -30,7 +31,7 @@ def test_latin_hypercube_has_one_point_in_every_slice(n: int, seed: int) -> None
     np.testing.assert_array_equal(slices, np.tile(np.arange(n)[:, None], 3))
 
 
-@settings(max_examples=10)
+@few(max_examples=10)
 @given(st.integers(0, 1000))
 def test_sobol_is_balanced_and_nested(seed: int) -> None:
     X = sobol([0, 0], [1, 1], 16, seed)

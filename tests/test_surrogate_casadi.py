@@ -7,7 +7,8 @@ from time import process_time
 import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from draws import few
+from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
@@ -39,7 +40,7 @@ def sampled(gp: GaussianProcess) -> np.ndarray:
 
 
 @KERNELS
-@settings(max_examples=10)
+@few(max_examples=10)
 @given(seed=st.integers(0, 1000))
 def test_equals_scikit_learns_prediction(kernel: Kernel, seed: int) -> None:
     gp = process(kernel, False, seed=seed)
@@ -60,7 +61,7 @@ def test_equals_scikit_learns_prediction(kernel: Kernel, seed: int) -> None:
 
 @KERNELS
 @pytest.mark.parametrize("gradients", [False, True])
-@settings(max_examples=25)
+@few(max_examples=25)
 @given(
     exponents=st.lists(st.floats(-0.3, 3.0), min_size=1, max_size=5),
     signal=st.floats(0.0, 6.0),

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from draws import few
+from hypothesis import given
 from hypothesis import strategies as st
 
 from surrogates import (
@@ -38,7 +39,7 @@ def process(gradients: bool = False, seed: int = 0, kernel: str = "matern52") ->
     )
 
 
-@settings(max_examples=15)
+@few(max_examples=15)
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from(["matern52", "rbf"]))
 def test_round_trip_is_bit_exact(
     tmp_path_factory: pytest.TempPathFactory, seed: int, gradients: bool, kernel: str
