@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kernel_draws import complex_matrix, random_system, seeds
 
 from ccd_casadi.kernels import frequency, small
-from ccd_casadi.kernels.refine import _vertex, narrow, next_trial
+from ccd_casadi.kernels.refine import _vertex, narrow, next_trial, promised
 
 
 @few(max_examples=40)
@@ -73,6 +73,9 @@ def test_the_vertex_of_a_parabola_is_found(top: float, bend: float, left: float,
     a, b = x - left, x + right
     assert _vertex(a, f(a), x, f(x), b, f(b)) == pytest.approx(top, abs=1e-10)
     assert _vertex(a, -f(a), x, -f(x), b, -f(b)) == x  # it bends upwards
+    points = (a, f(a), x, f(x), b, f(b))
+    assert promised(*points) == pytest.approx(3.0 - f(x), rel=1e-6, abs=1e-9)
+    assert promised(a, -f(a), x, -f(x), b, -f(b)) == np.inf
 
 
 @few(max_examples=60)
