@@ -8,7 +8,7 @@ import control
 import numpy as np
 import pytest
 from helpers import few
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.deployment.anti_windup import limited
@@ -172,6 +172,7 @@ def pair(hz: float, damping: float) -> list[complex]:
 
 
 @few(max_examples=60)
+@example(510510, 3, 3, 3, 1)  # the slowest zero 8 % off under Haswell's kernels
 @given(
     seed=st.integers(0, 10**6), pole_pairs=st.integers(0, 3), pole_reals=st.integers(1, 3),
     zero_pairs=st.integers(0, 3), zero_reals=st.integers(0, 2),

@@ -19,7 +19,8 @@ from ccd_casadi.support.optional_packages import require
 from ccd_casadi.support.units import HZ
 
 NEAR = 1.5  # ratio of zero to pole frequency up to which a pair is a notch
-STEPS, SHORT = 5, 0.05  # Newton steps for a zero, and the longest relative to it
+STEPS = 5  # of Newton's for a zero
+SHORT, LONG = 0.05, 0.3  # the longest relative to it; where no other zero is near
 FAR = 5.0  # ratio beyond which a complex pair of zeros and one of poles are not one section
 RESONANT = 0.3  # damping ratio of a pole pair under which it is no roll-off
 SLOW = 0.02  # share of ω_b under which a pole acts as an integrator
@@ -105,7 +106,7 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
 def _zeros(K: StateSpace) -> np.ndarray:
     """Finite zeros: SLICOT's AB08ND takes what is infinite out of the balanced system matrix.
 
-    Far below the poles they come out to a hundredth at worst: Newton steps on K(s) follow.
+    Far below the poles they come out to a tenth at worst: Newton steps on K(s) follow.
     """
     slycot = require("slycot", "slicot")
     n = len(K.A)
@@ -114,11 +115,18 @@ def _zeros(K: StateSpace) -> np.ndarray:
     found = slycot.ab08nd(n, 1, 1, A, B, C, K.D, equil="S")
     count, left, right = found[0], found[8], found[9]
     zeros = eig(left[:count, :count], right[:count, :count], right=False)
-    return np.array([_polished(K, complex(zero)) for zero in zeros], complex)
+    return np.array(
+        [_polished(K, complex(zero), np.delete(zeros, i)) for i, zero in enumerate(zeros)], complex
+    )
 
 
-def _polished(K: StateSpace, zero: complex) -> complex:
-    """A zero of K(s) = C (s - A)⁻¹ B + D by Newton's method, steps that help and are short only."""
+def _polished(K: StateSpace, zero: complex, others: np.ndarray) -> complex:
+    """A zero of K(s) = C (s - A)⁻¹ B + D by Newton's method, steps that help and are short only.
+
+    A longer one is taken where the other zeros are twice as far as it reaches.
+    """
+    free = 0.5 * float(np.abs(others - zero).min(initial=np.inf))
+    most = max(SHORT * abs(zero), min(LONG * abs(zero), free))
 
     def at(s: complex) -> tuple[complex, complex]:
         matrix = s * np.eye(len(K.A)) - K.A
@@ -127,7 +135,7 @@ def _polished(K: StateSpace, zero: complex) -> complex:
 
     value, slope = at(zero)
     for _ in range(STEPS):
-        if slope == 0.0 or not abs(value / slope) < SHORT * abs(zero):
+        if slope == 0.0 or not abs(value / slope) < most:
             break
         closer = zero - value / slope
         new, slope = at(closer)
