@@ -8,7 +8,7 @@ import control
 import numpy as np
 import pytest
 from helpers import few
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.deployment.anti_windup import limited
@@ -199,8 +199,10 @@ def test_sections_multiply_to_the_controller(
     omega = HZ * np.geomspace(0.1, 5e3, 80)
     s = 1j * omega
     exact = 1e3 * np.prod([s - z for z in zeros], axis=0) / np.prod([s - p for p in poles], axis=0)
-    # poles decades above the zeros: the matrices themselves may hold K to 3e-4 only
+    # poles decades above the zeros: the matrices themselves may hold K to 3e-4 only, and rarely
+    # to 2e-2 (one draw of some 4,000): then they are no such controller, whatever reads them
     lost = float(np.abs(response(K, omega) / exact - 1.0).max())
+    assume(lost < 1e-3)
     np.testing.assert_allclose(found.response(omega), exact, rtol=1e-5 + 5.0 * lost)
     kept = sum((s.zero is not None) * (1 + (s.zero.damping is not None)) for s in found.sections
                if s.zero)  # fmt: skip
