@@ -1,4 +1,4 @@
-"""One co-design from a case: sample, fit, solve with IPOPT, verify; and its run folder."""
+"""One co-design: sample, fit, solve with IPOPT, verify."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -14,7 +14,7 @@ from ccd_casadi.kernels.refine import narrow, next_trial, promised
 from ccd_casadi.kernels.sensitivity import axis_frequencies
 from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
 
-HOPELESS = 0.95  # of the largest gain on the grid: a peak that no point of it shows is not so high
+REFINED_FROM = 0.95  # of the largest gain on the grid: a peak this high is refined in any case
 REFINEMENTS = 40  # trials a peak; some six are used
 
 
@@ -80,7 +80,7 @@ def stack_norm(G, K, Dk, w, grid):
             # The parabola's promise is trusted to half, and not at all while the points stand
             # wide: between two of the grid a peak was 1.2 % higher where it promised 0.06 %.
             promise = fx + 2.0 * promised(a, fa, x, fx, b, fb)
-            if promise < 0.9999 * top and (trial > 1 or fx < HOPELESS * top):
+            if promise < 0.9999 * top and (trial > 1 or fx < REFINED_FROM * top):
                 break
             new, room = next_trial(a, fa, x, fx, b, fb, 1e-9)
             if room == 0.0:

@@ -37,12 +37,8 @@ def four_block_norm(G, K, Dk, w, delta, grid):
     i = int(np.argmax(values))
     best, at = float(values[i]), float(grid[i])
     left, here, right = values[:-2], values[1:-1], values[2:]
-    steps = np.diff(np.log(grid))
     with np.errstate(all="ignore"):  # a parabola through three points tells what a peak can gain
-        slopes = np.diff(values) / steps
-        before, after = slopes[:-1], slopes[1:]
-        bend = (before - after) / (steps[:-1] + steps[1:])
-        room = 0.5 * (before - bend * steps[:-1]) ** 2 / bend  # trusted to half
+        room = 0.25 * (right - left) ** 2 / (2.0 * here - left - right)
     peaks = (here >= left) & (here > right) & ~(here + room < 0.9999 * best)
     for i in np.flatnonzero(peaks):
         low, high = grid[i], grid[i + 2]
