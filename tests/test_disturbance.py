@@ -8,7 +8,7 @@ import pytest
 from case_documents import TWO_MASS
 from differences import difference
 from helpers import HZ, PAPER, few, random_plant, scaled, two_mass
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.linalg import schur
 
@@ -63,6 +63,7 @@ def made(plant: ScaledPlant, weights: Weights, **options: float) -> Design:
 
 
 @few(max_examples=8)
+@example(326, 1)  # a peak between two uneven points of the grid, 0.5 % higher than a parabola says
 @given(seeds, sizes)
 def test_what_is_certified_keeps_its_norm_in_a_loop_built_otherwise(seed: int, p: int) -> None:
     plant, weights = drawn(seed, p)
@@ -71,8 +72,9 @@ def test_what_is_certified_keeps_its_norm_in_a_loop_built_otherwise(seed: int, p
     assert figures.certificate.passed, figures.outcome
     norm = norm_of(plant, weights, done.controller)
     assert norm <= figures.certificate.norm_bound * (1.0 + 1e-9)
-    assert norm >= figures.gamma * (1.0 - 1e-9)
-    assert norm == pytest.approx(figures.gamma, rel=1e-3)
+    # peaks that cannot pass 0.9999 of the highest are left as they are; in 6,400 draws under two
+    # sets of kernels the norm was 3e-9 below to 5.5e-5 above the one named
+    assert -1e-8 <= norm / figures.gamma - 1.0 <= 1.1e-4
     assert figures.gamma_lower_bound <= figures.gamma_opt * (1.0 + 1e-9)
     # a controller of another problem cannot pass the bound either
     other = made(plant, replace(weights, disturbance=0.0)).controller

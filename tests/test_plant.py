@@ -12,6 +12,7 @@ from helpers import (
     STIFF_SUSPENSION,
     few,
     random_plant,
+    reference_matrices,
     reference_response,
     relative,
     scaled,
@@ -19,7 +20,7 @@ from helpers import (
     two_mass,
     two_mass_model,
 )
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -48,16 +49,34 @@ def scaled_system(plant: ScaledPlant) -> StateSpace:
 # ---- frequency response -----------------------------------------------------------------------
 
 
+def rounding_of_stiffness(system: Mechanics, omega: np.ndarray) -> np.ndarray:
+    """What eps ‖K‖ in K changes of G, relative, to first order: ‖C Z⁻¹‖ ‖Z⁻¹ B‖/|G| of it, (k,).
+
+    Soft suspensions stand beside stiff bodies: this is up to 6e-10. In 7,400 draws under two sets
+    of kernels it was met to three quarters.
+    """
+    M, D, K = reference_matrices(system, STIFF_SUSPENSION)
+    s = 1j * omega[:, None, None]
+    inverse = np.linalg.inv(s**2 * M + s * D + K)
+    left = np.linalg.norm(system.C @ inverse, 2, axis=(1, 2))
+    right = np.linalg.norm(inverse @ system.B, 2, axis=(1, 2))
+    size = np.abs(system.C @ inverse @ system.B).max(axis=(1, 2))
+    return np.finfo(float).eps * np.linalg.norm(K, 2) * left * right / size
+
+
 @few(max_examples=40)
+@example(1, {"rigid": 2, "flexible": 5, "inputs": 1, "outputs": 1, "modal": False}, [0.5, 0.5], 3.0)
 @given(seeds, shapes, thetas, st.floats(3.0, 8.0))
 def test_scaled_plant_has_the_response_of_the_si_matrices(seed, shape, theta, exponent) -> None:
     system = mechanics(random_plant(seed, **shape), theta)
     M_K = 10.0**exponent
     plant = scaled(system, M_K, STIFF_SUSPENSION)
     expected = reference_response(system, GRID, STIFF_SUSPENSION)
+    allowed = 1e-12 + 2.0 * rounding_of_stiffness(system, GRID)
     scaled_response = state_response(scaled_system(plant), GRID / plant.omega_0) / M_K
-    assert relative(scaled_response, expected) < 1e-10
-    assert relative(state_response(plant.plant_si(), GRID), expected) < 1e-10
+    for response in (scaled_response, state_response(plant.plant_si(), GRID)):
+        error = np.abs(response - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
+        assert (error < allowed).all()
 
 
 @few(max_examples=25)

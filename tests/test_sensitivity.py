@@ -20,6 +20,7 @@ from helpers import (
 )
 from hypothesis import example, given
 from hypothesis import strategies as st
+from scipy.linalg import matrix_balance
 from scipy.optimize import brentq
 
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -34,15 +35,15 @@ LEVEL = 1.0 / np.sqrt(2.0)
 def schur_error(system: StateSpace, K: StateSpace, omega: float) -> float:
     """What eps ‖A_K‖ in A_K changes of S at jω, relative, to first order: ‖S G‖ ‖C R‖ ‖R B‖ of it.
 
-    S(jω_low) is read off the controller's Schur form, whose backward error is normwise. In 1160
-    draws under five sets of kernels it was wrong by half of this at most, and by 7e-8.
+    Responses are read off the Schur form of the balanced A_K, whose backward error is normwise.
     """
-    R = np.linalg.inv(1j * omega * np.eye(len(K.A)) - K.A)
+    A, (scale, _) = matrix_balance(K.A, permute=False, separate=True)
+    R = np.linalg.inv(1j * omega * np.eye(len(A)) - A)
     G = state_response(system, np.array([omega]))[0]
-    S = np.linalg.inv(np.eye(len(G)) + G @ (K.C @ R @ K.B + K.D))
-    parts = (K.C @ R, R @ K.B, S @ G)
+    S = np.linalg.inv(np.eye(len(G)) + G @ (K.C * scale @ R @ (K.B / scale[:, None]) + K.D))
+    parts = (K.C * scale @ R, R @ (K.B / scale[:, None]), S @ G)
     change = np.prod([np.linalg.norm(part, 2) for part in parts])
-    return float(np.finfo(float).eps * np.linalg.norm(K.A) * change)
+    return float(np.finfo(float).eps * np.linalg.norm(A) * change)
 
 
 def check_figures(plant: ScaledPlant, weights: Weights, per_decade: int) -> None:
@@ -55,14 +56,19 @@ def check_figures(plant: ScaledPlant, weights: Weights, per_decade: int) -> None
         return sensitivity_gain(system, design.controller, omega)
 
     grid = dense_grid(system, design.controller, per_decade=per_decade)
-    assert figures.bandwidth == pytest.approx(first_crossing(gain, grid, LEVEL), rel=1e-8)
+
+    def rounding(omega: float) -> float:
+        """In 1,100 draws under two sets of kernels half of this was met, and 3e-7 at most."""
+        return 1e-9 + min(schur_error(system, design.controller, omega), 1e-6)
+
+    crossing = first_crossing(gain, grid, LEVEL)
+    assert figures.bandwidth == pytest.approx(crossing, rel=1e-8 + rounding(crossing))
     low = float(gain(OMEGA_LOW)[0])
-    rounding = 1e-9 + min(schur_error(system, design.controller, OMEGA_LOW), 1e-6)
-    assert figures.sensitivity_low == pytest.approx(low, rel=rounding)
+    assert figures.sensitivity_low == pytest.approx(low, rel=rounding(OMEGA_LOW))
     top, at = highest(gain, grid)
-    assert figures.sensitivity_peak == pytest.approx(top, rel=1e-8)
+    assert figures.sensitivity_peak == pytest.approx(top, rel=rounding(at))
     # its place: the root of the slope, taken from differences of the response
-    h = 1e-3
+    h = 3e-4  # three times as far, the next terms of flat peaks move it by 1e-6
 
     def slope(omega: float) -> float:
         up, down, up2, down2 = gain(omega * (1.0 + h * np.array([1.0, -1.0, 2.0, -2.0])))
@@ -84,7 +90,10 @@ def test_figures_of_the_two_mass_plant(m1: float, m2: float, S: float, T: float)
 
 
 @few(max_examples=8)
-@example(1638, 1, 2.625)  # 1.3e-8 in S(jω_low) under Zen's kernels
+@example(1638, 1, 2.625)  # 1.3e-8 in S(jω_low) under Zen's kernels, before A_K was balanced
+@example(364, 2, 2.375)  # 1.6e-8 in the peak, likewise
+@example(277435, 2, 2.7478841496263806)  # 7.5e-7 in the peak, likewise
+@example(44542, 2, 2.951099814318609)  # ill conditioned however scaled: 3e-7
 @given(st.integers(0, 10**6), st.integers(1, 2), st.floats(1.0, 3.0))
 def test_figures_of_small_plants_with_two_channels(seed: int, rigid: int, S: float) -> None:
     model = random_plant(seed, rigid=rigid, flexible=4, inputs=2, outputs=2)

@@ -8,9 +8,11 @@ nor the spectral factor. Plain NumPy around compiled responses and eigenvalues.
 
 import numpy as np
 
+from ccd_casadi.kernels.certificate import REFINED_FROM
 from ccd_casadi.kernels.closed_loop import loop_matrices
 from ccd_casadi.kernels.frequency import responses
 from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
+from ccd_casadi.kernels.refine import promised
 from ccd_casadi.kernels.sensitivity import axis_frequencies
 
 ZOOMS, POINTS = 8, 9  # each narrows the bracket of a peak to a quarter
@@ -36,11 +38,13 @@ def four_block_norm(G, K, Dk, w, delta, grid):
     values = four_block_gains(G, K, Dk, w, delta, grid)
     i = int(np.argmax(values))
     best, at = float(values[i]), float(grid[i])
+    top, x = best, np.log(grid)
     left, here, right = values[:-2], values[1:-1], values[2:]
-    with np.errstate(all="ignore"):  # a parabola through three points tells what a peak can gain
-        room = 0.25 * (right - left) ** 2 / (2.0 * here - left - right)
-    peaks = (here >= left) & (here > right) & ~(here + room < 0.9999 * best)
-    for i in np.flatnonzero(peaks):
+    for i in np.flatnonzero((here >= left) & (here > right)):
+        # as in `certificate.stack_norm`: no parabola is trusted with the highest peaks
+        room = promised(x[i], left[i], x[i + 1], here[i], x[i + 2], right[i])
+        if here[i] < REFINED_FROM * top and here[i] + 2.0 * room < 0.9999 * top:
+            continue
         low, high = grid[i], grid[i + 2]
         for _ in range(ZOOMS):
             trial = np.linspace(low, high, POINTS)

@@ -8,16 +8,20 @@ vector instructions.
 import numpy as np
 
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.lapack import schur
+from ccd_casadi.kernels.lapack import balanced, schur
 
 CHUNK = 32  # frequencies at a time: the working rows stay in the first-level cache
 
 
 @compiled
 def prepare(A, B, C):
-    """(T, QᵀB, CQ) with A = Q T Qᵀ: each frequency then costs O(n²)."""
+    """(T, QᵀD⁻¹B, CDQ) with D⁻¹AD = Q T Qᵀ: each frequency then costs O(n²).
+
+    T is off by eps ‖D⁻¹AD‖, and a controller's A is up to 3000 times as large as that.
+    """
+    A, scale = balanced(A)
     T, Q, _, _, _ = schur(A)
-    return T, Q.T.copy() @ B, C @ Q
+    return T, Q.T.copy() @ (B / scale.reshape(-1, 1)), (C * scale) @ Q
 
 
 @compiled

@@ -24,6 +24,8 @@ def _external(name: str, *args: types.Type) -> types.ExternalFunction:
     return types.ExternalFunction(symbol, types.void(*args))
 
 
+# job n a lda ilo ihi scale info
+_dgebal = _external("dgebal", _C, _I, _F, _I, _I, _I, _F, _I)
 # jobvs sort select n a lda sdim wr wi vs ldvs work lwork bwork info
 _dgees = _external("dgees", _C, _C, _I, _I, _F, _I, _I, _F, _F, _F, _I, _F, _I, _I, _I)
 # job compq select n t ldt q ldq wr wi m s sep work lwork iwork liwork info
@@ -70,6 +72,19 @@ def schur(A):
     F = A.T.copy()
     V, wr, wi, info = _schur(F)
     return F.T.copy(), V.T.copy(), wr, wi, info
+
+
+@compiled
+def balanced(A):
+    """D⁻¹ A D with rows and columns of one size, and D's diagonal, powers of the radix (dgebal)."""
+    F = A.T.copy()
+    n = F.shape[0]
+    N, low, high, info, scale = _int(n), _int(0), _int(0), _int(0), np.ones(n)
+    _dgebal(
+        _char(83).ctypes, N.ctypes, F.ctypes, N.ctypes, low.ctypes, high.ctypes, scale.ctypes,
+        info.ctypes,
+    )  # fmt: skip
+    return F.T.copy(), scale
 
 
 @compiled
