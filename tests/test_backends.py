@@ -11,7 +11,7 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
-from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass
+from helpers import HZ, OMEGA_LOW, PAPER, few, flexible_case, two_mass, well_conditioned
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -90,7 +90,7 @@ def test_hidden_unstable_mode_is_an_obstacle_and_a_reachable_one_is_not(
     plant, _ = random_plant(seed)
     assert not obstacles(plant)
     n = len(plant.A)
-    T = np.random.default_rng(seed).standard_normal((n + 1, n + 1)) + 3.0 * np.eye(n + 1)
+    T = well_conditioned(np.random.default_rng(seed), n + 1)
     A = np.zeros((n + 1, n + 1))
     A[:n, :n], A[n, n] = plant.A, pole
     B2 = np.linalg.solve(T, np.vstack([plant.B2, np.zeros((1, plant.B2.shape[1]))]))
