@@ -82,12 +82,17 @@ def test_what_is_certified_keeps_its_norm_in_a_loop_built_otherwise(seed: int, p
 
 
 def stable_solution(H: np.ndarray) -> np.ndarray | None:
+    """None where eigenvalues lie on the axis, which rounding may well part N to N."""
+    poles = np.linalg.eigvals(H)
     _, Z, count = schur(H, sort="lhp")
     N = len(H) // 2
-    return None if count != N else Z[N:, :N] @ np.linalg.inv(Z[:N, :N])
+    if count != N or (np.abs(poles.real) <= 1e-9 * np.abs(poles)).any():
+        return None
+    return np.asarray(Z[N:, :N] @ np.linalg.inv(Z[:N, :N]))
 
 
 @few(max_examples=6)
+@example(543, 2)  # below γ_opt four eigenvalues on the axis, parted N to N
 @given(seeds, sizes)
 def test_one_riccati_equation_stands_for_two_and_their_coupling(seed: int, p: int) -> None:
     """X̂ = X(I - YX/γ²)⁻¹ with X of the four-block problem; ρ(XY) < γ² above γ_opt only."""

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import few
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, solve_program
@@ -41,6 +41,7 @@ def numbers_only(theta):
 
 
 @few(max_examples=20)
+@example(0.17419198495041546, 0.1796875)
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_differences_are_the_exact_derivatives_up_to_the_bounds(a: float, b: float) -> None:
     theta = [
@@ -61,8 +62,10 @@ def test_differences_are_the_exact_derivatives_up_to_the_bounds(a: float, b: flo
     curve = [ca.Function("curve", [x], [ca.hessian(value[0], x)[0]]) for value in f]
     box = np.outer(np.subtract(UPPER, LOWER), np.subtract(UPPER, LOWER))
     np.testing.assert_allclose(curve[1](theta) * box, curve[0](theta) * box, atol=1e-5)
-    assert hardware_cost(plant, theta) == hardware_cost(exact, theta)
-    assert constraint_values(plant, theta) == constraint_values(exact, theta)
+    # CasADi and Python multiply in an order and by a power of their own
+    last = {"rel": 1e-14, "abs": 1e-14}
+    assert hardware_cost(plant, theta) == pytest.approx(hardware_cost(exact, theta), **last)
+    assert constraint_values(plant, theta) == pytest.approx(constraint_values(exact, theta), **last)
 
 
 def test_the_function_is_never_asked_outside_the_bounds() -> None:
