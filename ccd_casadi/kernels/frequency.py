@@ -1,8 +1,8 @@
 """Frequency responses of state-space systems through their real Schur form, and their slopes.
 
-With A = Q T Qᵀ, T quasi upper triangular, C (jω - A)⁻¹ B = (CQ)(jω - T)⁻¹(QᵀB): one real
-back-substitution a frequency, with no row exchanges, so that a whole grid runs through it in
-vector instructions.
+With D⁻¹AD = Q T Qᵀ, D diagonal and T quasi upper triangular, C (jω - A)⁻¹ B =
+(CDQ)(jω - T)⁻¹(QᵀD⁻¹B): one real back-substitution a frequency, with no row exchanges, so that a
+whole grid runs through it in vector instructions.
 """
 
 import numpy as np
