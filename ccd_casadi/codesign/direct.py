@@ -10,6 +10,7 @@ import numpy as np
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate, other_peaks
+from ccd_casadi.codesign.newton import newton_step
 from ccd_casadi.codesign.outer_problem import (
     LocalOptimum,
     OuterFailure,
@@ -27,7 +28,10 @@ from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import design
 
 ON_EDGE = 1e-4  # ln: so close to a kink or a jump IPOPT, which knows one gradient alone, stalls
-STATIONARY = 1e-7  # scaled KKT residual below which a polish has nothing to do
+STATIONARY = 1e-7  # scaled KKT residual below which a descent has nothing to do
+SETTLED = 1e-9  # the same of Newton's steps, which gradients alone lead
+NEWTON = 1e-4  # the largest residual that they start from
+LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,15 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
 
     Returns the start itself where IPOPT finds nothing better that is certified and feasible.
     """
-    problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = TrueQuantities(sampler.problem, sampler.record)
+    x, design, solution = _descended(sampler.problem, quantities, x)
+    return *_settled(sampler.problem, quantities, x, design), solution
+
+
+def _descended(
+    problem: CoDesignProblem, quantities: TrueQuantities, x: Array
+) -> tuple[Array, Sensitivities, OuterSolution | None]:
+    """As far as J falls."""
     program = lifted_program(problem, quantities, exact_hessian=False)
     start = quantities.at(x)
     if acceptable(problem, x, start) and _stationary(problem, x, start):
@@ -102,6 +113,28 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     return x, start, solution
 
 
+def _settled(
+    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
+) -> tuple[Array, Sensitivities]:
+    """Newton's steps as long as the residual falls, where no other peak is near."""
+    if not acceptable(problem, x, design):
+        return x, design
+    for _ in range(3):
+        kkt = kkt_certificate(problem, x, design)
+        residual = max(kkt.stationarity, kkt.complementarity)
+        if not SETTLED < residual <= NEWTON or other_peaks(problem, x, design, ON_EDGE):
+            break
+        end = newton_step(problem, quantities, x, kkt)
+        found = None if end is None else quantities.at(end)
+        if end is None or found is None or not acceptable(problem, end, found):
+            break
+        gain = objective(problem, x, design) - objective(problem, end, found)
+        if _residual(problem, end, found) >= residual or gain < -_level(problem, x, design):
+            break
+        x, design = end, found
+    return x, design
+
+
 def _past_kinks(
     problem: CoDesignProblem, quantities: TrueQuantities, x: Array, design: Sensitivities
 ) -> tuple[Array, Sensitivities]:
@@ -113,9 +146,10 @@ def _past_kinks(
     if not acceptable(problem, x, design):
         return end, found
     before, after = (objective(problem, *item) for item in ((x, design), (end, found)))
-    if after < before - 1e-9 * abs(before):
+    margin = _level(problem, x, design)
+    if after < before - margin:
         return end, found
-    level = after <= before + 1e-9 * abs(before)
+    level = after <= before + margin
     better = _residual(problem, end, found) < _residual(problem, x, design)
     return (end, found) if level and better else (x, design)
 
@@ -146,4 +180,10 @@ def _no_worse(
     problem: CoDesignProblem, candidate: LocalOptimum, x: Array, start: Sensitivities
 ) -> bool:
     before = objective(problem, x, start)
-    return candidate.objective <= before + 1e-9 * abs(before)
+    return candidate.objective <= before + _level(problem, x, start)
+
+
+def _level(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
+    """What J may differ by and still be the same."""
+    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
+    return LEVEL * (abs(problem.w1 * cost) + abs(problem.w2 * design.figures.bandwidth))

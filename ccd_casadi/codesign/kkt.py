@@ -141,13 +141,29 @@ def other_peaks(
     return tuple(found)
 
 
-def _first_order(
+@dataclass(frozen=True)
+class ActiveSet:
+    """∇J and the constraints within `ACTIVE` of their bounds at one x, in unit-box variables.
+
+    rows: (m, n) gradients, slack: (m,) values (<= 0 inside), one each per label; the first
+    `constraints` are of g, the rest bounds. violation: the largest of all, 0 where none is.
+    """
+
+    gradient: Array
+    rows: Array
+    slack: Array
+    labels: tuple[str, ...]
+    constraints: int
+    violation: float
+
+
+def active_set(
     problem: CoDesignProblem,
     x: Array,
     design: Sensitivities,
-    others: tuple[PeakConstraint, ...],
-    true_at: Callable[[Array], Sensitivities] | None,
-) -> KktCertificate:
+    others: tuple[PeakConstraint, ...] = (),
+) -> ActiveSet:
+    """The active constraints and bounds at x, with `others` besides the problem's own."""
     lower, upper = lifted_bounds(problem)
     width = upper - lower
     gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
@@ -155,38 +171,49 @@ def _first_order(
         g = np.append(g, [peak.value for peak in others])
         jacobian = np.vstack([jacobian, *(peak.row for peak in others)])
         names = (*names, *(peak.name for peak in others))
-        true_at = None  # a difference of gradients would mix one peak with another
-    slack_low, slack_high = (x - lower) / width, (upper - x) / width
     rows, labels, slack = [], [], []
     for value, row, name in zip(g, jacobian, names, strict=True):
         if value >= -ACTIVE:
             rows.append(row)
             labels.append(name)
             slack.append(value)
+    count = len(rows)
+    low, high = (lower - x) / width, (x - upper) / width
     for i, name in enumerate((*problem.names, "omega_S", "omega_T")):
-        for end, gap, sign in (("lower", slack_low[i], -1.0), ("upper", slack_high[i], 1.0)):
-            if gap <= ACTIVE:
+        for end, value, sign in (("lower", low[i], -1.0), ("upper", high[i], 1.0)):
+            if value >= -ACTIVE:
                 rows.append(sign * np.eye(x.size)[i])
                 labels.append(f"{name} {end}")
-                slack.append(-gap)
+                slack.append(value)
+    violation = max(0.0, float(low.max()), float(high.max()), float(np.max(g, initial=0.0)))
+    matrix = np.array(rows).reshape(-1, x.size)
+    return ActiveSet(gradient, matrix, np.array(slack), tuple(labels), count, violation)
+
+
+def _first_order(
+    problem: CoDesignProblem,
+    x: Array,
+    design: Sensitivities,
+    others: tuple[PeakConstraint, ...],
+    true_at: Callable[[Array], Sensitivities] | None,
+) -> KktCertificate:
+    at = active_set(problem, x, design, others)
+    gradient, A, slack = at.gradient, at.rows, at.slack
+    if others:
+        true_at = None  # a difference of gradients would mix one peak with another
     size = max(float(np.abs(gradient).max()), 1e-300)
-    if rows:
-        A = np.array(rows)
+    mu, residual, complementarity = np.empty(0), gradient, 0.0
+    if at.labels:
         mu, _ = nnls(A.T, -gradient)
         residual = gradient + A.T @ mu
-        complementarity = float(np.abs(mu * np.array(slack)).max()) / size
-    else:
-        A, mu, residual, complementarity = np.empty((0, x.size)), np.empty(0), gradient, 0.0
-    primal = max(0.0, float(-slack_low.min()), float(-slack_high.min()))
-    if g.size:
-        primal = max(primal, float(g.max()))
-    second = _second_order(problem, x, A[mu > 0.0], size, mu, labels, true_at)
+        complementarity = float(np.abs(mu * slack).max()) / size
+    second = _second_order(problem, x, A[mu > 0.0], size, mu, at.labels, true_at)
     return KktCertificate(
         stationarity=float(np.abs(residual).max()) / size,
-        primal=primal,
+        primal=at.violation,
         complementarity=complementarity,
-        multipliers={name: float(value) for name, value in zip(labels, mu, strict=True)},
-        active=tuple(labels),
+        multipliers={name: float(value) for name, value in zip(at.labels, mu, strict=True)},
+        active=at.labels,
         second_order=second,
         objective_gradient=tuple(float(value) for value in gradient),
     )
@@ -223,7 +250,7 @@ def _second_order(
     strong: Array,
     size: float,
     mu: Array,
-    labels: list[str],
+    labels: tuple[str, ...],
     true_at: Callable[[Array], Sensitivities] | None,
 ) -> float | None:
     """Least eigenvalue of Zᵀ∇²L Z, Z spanning the null space of the strongly active gradients."""
