@@ -25,8 +25,9 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, objective
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import HALF_POWER, kkt_certificate
+from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost

@@ -9,7 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate, other_peaks
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.newton import newton_step
 from ccd_casadi.codesign.outer_problem import (
     LocalOptimum,
@@ -19,6 +19,7 @@ from ccd_casadi.codesign.outer_problem import (
     lifted_program,
     solve_program,
 )
+from ccd_casadi.codesign.peak_constraints import other_peaks
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import constraint_values, hardware_cost

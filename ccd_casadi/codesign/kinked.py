@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.codesign.kkt import OTHER_PEAK, lagrangian_parts, other_peaks
+from ccd_casadi.codesign.kkt import lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.quasi_newton import damped_bfgs
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities

@@ -21,19 +21,16 @@ from scipy.linalg import null_space
 from scipy.optimize import nnls
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 
 # The polish stops where steps no longer change J by more than rounding; a constraint closer
 # than this (in logarithm, or share of the box) is one that it runs along.
 ACTIVE = 1e-6
 STEP = 1e-4  # of the box: differences of true gradients
 SMOOTH = 1e-6  # residual up to which nothing speaks of a kink
-HALF_POWER = -0.5 * np.log(2.0)
-OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
 
 
 @dataclass(frozen=True)
@@ -90,55 +87,6 @@ def kkt_certificate(
         return plain
     others = other_peaks(problem, x, design, ACTIVE)
     return _first_order(problem, x, design, others, true_at) if others else plain
-
-
-@dataclass(frozen=True)
-class PeakConstraint:
-    """A local peak of S as a constraint: its name, ln of it minus ln of its bound, unit-box slope.
-
-    `omega` in rad/s and `member` of the robust set tell which peak it is.
-    """
-
-    name: str
-    value: float
-    row: Array
-    omega: float
-    member: int
-
-
-def other_peaks(
-    problem: CoDesignProblem, x: Array, design: Sensitivities, band: float
-) -> tuple[PeakConstraint, ...]:
-    """Local peaks of S besides the largest that are within `band` (ln) of what they must not pass.
-
-    That is S_max anywhere, on every plant of a robust set, and -3 dB below ω_b, which is the first
-    crossing only as long as they do not pass it.
-    """
-    figures, width = design.figures, np.subtract(*lifted_bounds(problem)[::-1])
-    peaks = local_peaks_with_gradients(
-        scaled_plant(problem, tuple(x[:-2])),
-        problem.weights.at(figures.omega_S, figures.omega_T),
-        gamma_backoff=problem.inner.gamma_backoff,
-        least=float(np.exp(min(HALF_POWER, np.log(problem.inner.S_max)) - band)),
-    )
-    S_max, largest, found = np.log(problem.inner.S_max), False, []
-    for peak in peaks:
-        on = f" on plant {peak.member} of the set" if peak.member else ""
-        place = f"{peak.omega / HZ:.4g} Hz{on}"
-        if not largest and abs(peak.ln_gain - design.values[1]) <= 1e-7:
-            largest = True  # the row S_max itself
-        elif peak.ln_gain >= S_max - band:
-            level, name = S_max, OTHER_PEAK + place
-            row = peak.gradient * width
-            found.append(PeakConstraint(name, peak.ln_gain - level, row, peak.omega, peak.member))
-        elif (
-            peak.member == 0
-            and peak.omega < figures.bandwidth
-            and abs(peak.ln_gain - HALF_POWER) <= band
-        ):
-            row, value = peak.gradient * width, peak.ln_gain - HALF_POWER
-            found.append(PeakConstraint(f"-3 dB at {place}", value, row, peak.omega, 0))
-    return tuple(found)
 
 
 @dataclass(frozen=True)

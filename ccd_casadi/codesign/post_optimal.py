@@ -22,14 +22,13 @@ from scipy.linalg import null_space
 
 from ccd_casadi.codesign.kkt import (
     ACTIVE,
-    OTHER_PEAK,
     KktCertificate,
     kkt_certificate,
     lagrangian_hessian,
     lagrangian_parts,
-    other_peaks,
 )
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array

@@ -1,0 +1,68 @@
+"""Local peaks of S as constraints, for where the largest one alone has no gradient.
+
+‖S‖∞ = max over its local peaks, and each of these is smooth in x = (θ, ln ω_S, ln ω_T). Below ω_b a
+peak that reaches -3 dB makes ω_b jump, so that it is a constraint as well.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
+
+HALF_POWER = -0.5 * np.log(2.0)
+OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
+
+
+@dataclass(frozen=True)
+class PeakConstraint:
+    """A local peak of S as a constraint: its name, ln of it minus ln of its bound, unit-box slope.
+
+    `omega` in rad/s and `member` of the robust set tell which peak it is.
+    """
+
+    name: str
+    value: float
+    row: Array
+    omega: float
+    member: int
+
+
+def other_peaks(
+    problem: CoDesignProblem, x: Array, design: Sensitivities, band: float
+) -> tuple[PeakConstraint, ...]:
+    """Local peaks of S besides the largest that are within `band` (ln) of what they must not pass.
+
+    That is S_max anywhere, on every plant of a robust set, and -3 dB below ω_b, which is the first
+    crossing only as long as they do not pass it.
+    """
+    figures, width = design.figures, np.subtract(*lifted_bounds(problem)[::-1])
+    peaks = local_peaks_with_gradients(
+        scaled_plant(problem, tuple(x[:-2])),
+        problem.weights.at(figures.omega_S, figures.omega_T),
+        gamma_backoff=problem.inner.gamma_backoff,
+        least=float(np.exp(min(HALF_POWER, np.log(problem.inner.S_max)) - band)),
+    )
+    S_max, largest, found = np.log(problem.inner.S_max), False, []
+    for peak in peaks:
+        on = f" on plant {peak.member} of the set" if peak.member else ""
+        place = f"{peak.omega / HZ:.4g} Hz{on}"
+        if not largest and abs(peak.ln_gain - design.values[1]) <= 1e-7:
+            largest = True  # the row S_max itself
+        elif peak.ln_gain >= S_max - band:
+            level, name = S_max, OTHER_PEAK + place
+            row = peak.gradient * width
+            found.append(PeakConstraint(name, peak.ln_gain - level, row, peak.omega, peak.member))
+        elif (
+            peak.member == 0
+            and peak.omega < figures.bandwidth
+            and abs(peak.ln_gain - HALF_POWER) <= band
+        ):
+            row, value = peak.gradient * width, peak.ln_gain - HALF_POWER
+            found.append(PeakConstraint(f"-3 dB at {place}", value, row, peak.omega, 0))
+    return tuple(found)
