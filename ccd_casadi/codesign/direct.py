@@ -81,7 +81,8 @@ def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> Formulation
 def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolution | None]:
     """From a design nearly optimal to the nearest stationary point of the true problem.
 
-    Returns the start itself where IPOPT finds nothing better that is certified and feasible.
+    A descent past kinks, IPOPT where that leaves a residual, then Newton's steps. Returns the
+    start itself where none of them finds better that is certified and feasible.
     """
     quantities = TrueQuantities(sampler.problem, sampler.record)
     x, design, solution = _descended(sampler.problem, quantities, x)
