@@ -30,7 +30,7 @@ from surrogates import design
 
 ON_EDGE = 1e-4  # ln: so close to a kink or a jump IPOPT, which knows one gradient alone, stalls
 STATIONARY = 1e-7  # scaled KKT residual below which a descent has nothing to do
-SETTLED = 1e-9  # the same of Newton's steps, which gradients alone lead
+SETTLED = 1e-9  # stationarity below which Newton's steps, led by gradients alone, have nothing
 NEWTON = 1e-4  # the largest residual that they start from
 LEVEL = 1e-8  # of the terms of J, which may cancel: what ω_b is good to
 
@@ -121,19 +121,19 @@ def _settled(
     """Newton's steps as long as the residual falls, where no other peak is near."""
     if not acceptable(problem, x, design):
         return x, design
+    kkt = kkt_certificate(problem, x, design)
     for _ in range(3):
-        kkt = kkt_certificate(problem, x, design)
-        residual = max(kkt.stationarity, kkt.complementarity)
-        if not SETTLED < residual <= NEWTON or other_peaks(problem, x, design, ON_EDGE):
+        if not SETTLED < kkt.stationarity <= NEWTON or other_peaks(problem, x, design, ON_EDGE):
             break
         end = newton_step(problem, quantities, x, kkt)
         found = None if end is None else quantities.at(end)
         if end is None or found is None or not acceptable(problem, end, found):
             break
-        gain = objective(problem, x, design) - objective(problem, end, found)
-        if _residual(problem, end, found) >= residual or gain < -_level(problem, x, design):
+        after = kkt_certificate(problem, end, found)
+        rise = objective(problem, end, found) - objective(problem, x, design)
+        if after.stationarity >= kkt.stationarity or rise > _level(problem, x, design):
             break
-        x, design = end, found
+        x, design, kkt = end, found, after
     return x, design
 
 
@@ -158,8 +158,13 @@ def _past_kinks(
 
 def objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
     """J of a true design at x."""
+    return sum(_terms(problem, x, design))
+
+
+def _terms(problem: CoDesignProblem, x: Array, design: Sensitivities) -> tuple[float, float]:
+    """w1 f and w2 ω_b."""
     cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
-    return problem.w1 * cost + problem.w2 * design.figures.bandwidth
+    return problem.w1 * cost, problem.w2 * design.figures.bandwidth
 
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
@@ -187,5 +192,4 @@ def _no_worse(
 
 def _level(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
     """What J may differ by and still be the same."""
-    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
-    return LEVEL * (abs(problem.w1 * cost) + abs(problem.w2 * design.figures.bandwidth))
+    return LEVEL * sum(map(abs, _terms(problem, x, design)))

@@ -10,11 +10,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.kinked import INSIDE
-from ccd_casadi.codesign.kkt import (
-    KktCertificate,
-    active_set,
-    lagrangian_hessian,
-)
+from ccd_casadi.codesign.kkt import KktCertificate, active_set, lagrangian_hessian
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -37,8 +33,10 @@ def newton_step(
     inside = np.array([INSIDE * (name in problem.inner.bounds) for name in here.labels])
     aim = np.where(np.arange(held.size) < here.constraints, -(here.slack + inside), 0.0)[held]
     Z = null_space(A) if A.size else np.eye(x.size)
+    if Z.shape[1] == 0:  # a vertex
+        return None
     columns = lagrangian_hessian(problem, x, Z, kkt.multipliers, quantities.at)
-    if Z.shape[1] == 0 or columns is None:
+    if columns is None:
         return None
     H = Z.T @ columns
     H = 0.5 * (H + H.T)
