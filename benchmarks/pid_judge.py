@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import Mechanics
 
@@ -135,11 +135,13 @@ class Table:
         return out
 
     def _bandwidth(self, m: np.ndarray) -> np.ndarray:
-        """The largest ω_b with |S|² <= min(1, (shape ω/ω_b)²)/2 below it, m = 1/|S|² (N, F)."""
+        """The largest ω_b with |S|² <= 1/2 below it and within the shape, m = 1/|S|² (N, F)."""
         w, shape = self.w, self.loop.bounds.shape
         room = np.full(m.shape, np.inf)
         if shape is not None:
             room = np.minimum.accumulate(shape * w * np.sqrt(0.5 * m), axis=1)
+            if self.loop.bounds.shape_ends is ShapeEnd.S_MAX:
+                room[:] = room[:, -1:]
         bad = (m < 2.0) | (room < w)
         i = np.argmax(bad, axis=1)
         rows = np.arange(len(m))

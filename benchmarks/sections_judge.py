@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
+from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 
 HZ = 2.0 * np.pi
@@ -102,9 +102,12 @@ def figures(asked: Case, point: np.ndarray, design: SectionsDesign) -> dict[str,
     low = int(np.argmin(np.abs(w - bounds.omega_low)))
     found = {"S_MAX": np.abs(S).max() / bounds.S_max, "S_LOW": abs(S[low]) / bounds.S_low}
     counted = w if asked.structure.integrator else np.maximum(w, bounds.omega_low)
-    slope = np.ones_like(w) if bounds.shape is None else bounds.shape * counted / bandwidth
     below = w <= bandwidth
-    found["SHAPE"] = (np.abs(S) * np.sqrt(2.0) / np.minimum(1.0, slope))[below].max()
+    size = np.abs(S) * np.sqrt(2.0)
+    found["LEVEL"] = size[below].max()
+    if bounds.shape is not None:
+        shaped = below if bounds.shape_ends is ShapeEnd.CROSSING else slice(None)
+        found["SHAPE"] = (size / (bounds.shape * counted / bandwidth))[shaped].max()
     if bounds.weighted_level is not None and bounds.weights is not None:
         v = bounds.weights
         W_KS = v.c_K / v.M_K * (s + v.omega_K) / (s + v.c_K * v.omega_K)

@@ -64,7 +64,7 @@ def test_derivatives_of_the_rows(seed: int, sampling: Sampling | None, skewed: b
     peaks = assess(model, kappa, TAU, depth=-2.0).peaks
     assert peaks is not None
     alone = peaks.plant // 2 >= model.own.first
-    kinds = {Curve.S_MAX, Curve.SHAPE, Curve.CROSSING, Curve.KS}
+    kinds = {Curve.S_MAX, Curve.LEVEL, Curve.SHAPE, Curve.CROSSING, Curve.KS}
     assert set(peaks.curve[alone]) == kinds
     seen = assert_derivatives(
         lambda theta: as_one(whole, sampling, 0.3, theta), kappa,

@@ -10,7 +10,7 @@ from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, loop, plant
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.design import problem_for
@@ -114,8 +114,12 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sampling", [None, FAST])
-def test_peaks_are_the_suprema_of_dense_grids(seed: int, sampling: Sampling | None) -> None:
+@pytest.mark.parametrize("ends", ShapeEnd)
+def test_peaks_are_the_suprema_of_dense_grids(
+    seed: int, sampling: Sampling | None, ends: ShapeEnd
+) -> None:
     problem, kappa = loop(seed, Structure(), sampling, (-0.03, 0.03))
+    problem = replace(problem, bounds=replace(problem.bounds, shape_ends=ends))
     tau = np.log(0.08)
     found = assess(problem, kappa, tau, depth=-60.0).peaks
     assert found is not None
@@ -124,13 +128,12 @@ def test_peaks_are_the_suprema_of_dense_grids(seed: int, sampling: Sampling | No
     for i in range(2):
         dense = evaluate(problem, kappa, tau, np.full(len(v), i), v, order=0)
         for curve in (*problem.curves, Curve.CROSSING):
-            own = (found.plant == i) & (found.curve == curve)
-            values = dense.levels[curve] + problem.margin
-            if curve in (Curve.SHAPE, Curve.CROSSING):
-                values = values[v <= edge]
-                own = (found.plant == i) & np.isin(found.curve, (Curve.SHAPE, Curve.CROSSING))
+            kinds, values = [curve], dense.levels[curve] + problem.margin
+            if curve is Curve.CROSSING or problem.ends_at_crossing(curve):
+                values, kinds = values[v <= edge], [curve, Curve.LEVEL, Curve.CROSSING]
+            own = (found.plant == i) & np.isin(found.curve, kinds)
             assert found.value[own].max() >= values.max() - 1e-9
-            if curve is not Curve.CROSSING:
+            if not problem.ends_at_crossing(curve) and curve is not Curve.CROSSING:
                 assert found.value[own].max() <= values.max() + 1e-2
 
 

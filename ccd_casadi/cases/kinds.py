@@ -9,7 +9,7 @@ from typing import Any
 from ccd_casadi.budget import Kind
 from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
 from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.sections_problem import (
     ChannelProblem,
@@ -30,7 +30,7 @@ _OF_SECTIONS = {
     "controller": tuple(f.name for f in fields(ControllerSection) if f.name != "structure"),
     "loop": ("rate_hz", "delay_us"),
     "robust": ("mode_shift", "gain", "plants"),
-    "inner": ("shape", "minimise", "bandwidth_least_hz"),
+    "inner": ("shape", "shape_ends", "minimise", "bandwidth_least_hz"),
 }
 # What [controller.channel.NAME] bounds besides the whole loop.
 _OF_CHANNELS = ("S_max", "M_K", "bandwidth_ratio")
@@ -220,6 +220,7 @@ def sections_problem(
     return SectionsProblem(
         structure=structure_of(controller),
         shape=SHAPE if inner.shape is None else inner.shape,
+        shape_ends=ShapeEnd(inner.shape_ends),
         weighted_level=controller.weighted_level,
         compliance_max=inner.compliance_max,
         sampling=None if loop.rate_hz is None else Sampling(loop.rate_hz, loop.delay_us),

@@ -17,7 +17,7 @@ from typing import Any
 
 from ccd_casadi.cases.case import CaseError, read_toml, section_of
 from ccd_casadi.cases.checks import count, shown, text
-from ccd_casadi.cases.kinds import check_kind, structure_of, weights_of
+from ccd_casadi.cases.kinds import SHAPE, check_kind, structure_of, weights_of
 from ccd_casadi.cases.sections import (
     SECTIONS,
     BudgetSection,
@@ -25,7 +25,7 @@ from ccd_casadi.cases.sections import (
     ObjectiveSection,
     RobustSection,
 )
-from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
@@ -132,12 +132,12 @@ def _check(sections: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -
 
 
 def _bounds(inner: InnerSection, level: float | None, weights: Any) -> Bounds:
-    shape = 1.1 if inner.shape is None else inner.shape
     return Bounds(
         S_max=inner.S_max,
         S_low=inner.S_low,
         omega_low=HZ * inner.omega_low_hz,
-        shape=shape,
+        shape=SHAPE if inner.shape is None else inner.shape,
+        shape_ends=ShapeEnd(inner.shape_ends),
         weighted_level=level,
         weights=weights,
         compliance_max=inner.compliance_max,

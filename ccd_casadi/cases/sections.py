@@ -32,6 +32,7 @@ from ccd_casadi.cases.run_sections import (
     OuterSection,
     SamplingSection,
 )
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.support.notebook import Shown
 
 
@@ -161,7 +162,13 @@ class InnerSection:
     shape: float | None = key(
         number(1.0, 10.0, "give 1 to 10", closed=True),
         None,
-        says="with sections: below ω_b, |S| stays under this times (ω/ω_b)/√2; absent: no bound",
+        says="with sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
+    )
+    shape_ends: str = key(
+        choice(*ShapeEnd),
+        ShapeEnd.S_MAX.value,
+        says="with sections: the shape holds up to S_max, or up to ω_b only, which lets a narrow "
+        "filter at ω_b buy bandwidth",
     )
     compliance_max: float | None = key(
         POSITIVE,

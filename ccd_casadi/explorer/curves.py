@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.explorer.designs import Look, Standing
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.fixed_structure import Sampling, ShapeEnd
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of
 from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of
@@ -97,8 +97,10 @@ def bounds_of(look: Look, hz: Array) -> Array:
         return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
     level = np.nan if sections.weighted_level is None else sections.weighted_level
     shape = np.nan if sections.shape is None else sections.shape
-    below = np.where(hz <= look.bandwidth_hz, shape * hz / look.bandwidth_hz * 2.0**-0.5, np.nan)
-    return np.array([below, *(level / size[1:])])
+    rising = shape * hz / look.bandwidth_hz * 2.0**-0.5
+    ends = look.bandwidth_hz if sections.shape_ends is ShapeEnd.CROSSING else np.inf
+    below = (hz <= ends) & (rising <= look.problem.inner.S_max)
+    return np.array([np.where(below, rising, np.nan), *(level / size[1:])])
 
 
 def grid_of(look: Look) -> Array:

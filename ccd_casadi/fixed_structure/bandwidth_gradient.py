@@ -26,12 +26,15 @@ def bandwidth_envelope(
 ) -> Envelope | None:
     """The gradients of ω_b*(θ) in rad/s at a design that is optimal on these plants.
 
-    None where the point is not stationary to 1e-3. Plants carry dA, dB, dC.
+    None where a loop is unstable or the point is not stationary to 1e-3. Plants carry dA, dB, dC.
     """
     problem = problem_for(plants, design.structure, bounds, sampling, design.frequencies)
     kappa = in_problem_units(problem, design.kappa)
     tau = float(np.log(design.bandwidth / problem.plants.omega_0))
-    found = optimality(problem, _at_the_bounds(problem, kappa, tau))
+    point = _at_the_bounds(problem, kappa, tau)
+    if not point.assessment.stable:
+        return None
+    found = optimality(problem, point)
     envelope = log_bandwidth_envelope(problem, kappa, found)
     return None if envelope is None else envelope.times(design.bandwidth)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from math import log
 from typing import Protocol
 
@@ -18,6 +19,13 @@ def kind_and_channel(name: str) -> tuple[str, str]:
     return kind, channel
 
 
+class ShapeEnd(StrEnum):
+    """Up to where the shape bounds |S|."""
+
+    S_MAX = "S_max"  # at every frequency: up to where it meets S_max
+    CROSSING = "crossing"  # below ω_b only
+
+
 @dataclass(frozen=True)
 class ChannelBounds:
     """What one channel keeps besides the whole loop; None, or a ratio of 1: nothing of its own.
@@ -25,7 +33,7 @@ class ChannelBounds:
     `output` u makes its error uᵀe of the plant's, `force` w its force wᵀf. For references of
     length 1 in any direction, with ω_i = bandwidth_ratio ω_b,
 
-        ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ <= min(1, shape ω/ω_i)/√2 for ω <= ω_i
+        ‖uᵀS(jω)‖ <= S_max,   ‖uᵀS(jω)‖ <= shape (ω/ω_i)/√2,   ‖uᵀS(jω)‖ <= 1/√2 for ω <= ω_i
         |W_KS| ‖wᵀKS‖ <= weighted_level,   W_KS with this M_K, N/m
     """
 
@@ -52,18 +60,21 @@ class Bounds:
     """Constraints on every plant; SI, frequencies in rad/s, None: no such bound.
 
         |S(jω)| <= S_max,   |S(jω_low)| <= S_low
-        |S(jω)| <= min(1, shape ω/ω_b)/√2           for ω <= ω_b
+        |S(jω)| <= 1/√2                             for ω <= ω_b
+        |S(jω)| <= shape (ω/ω_b)/√2                 for all ω; or for ω <= ω_b by `shape_ends`
         |W_KS KS|, |W_T T| <= weighted_level        with W_KS, W_T of `weights`
         |GS| <= compliance_max                      m/N
 
-    Without an integrator S does not fall to zero: the shape then counts from ω_low on. `channels`:
-    empty, or tighter bounds for each channel, in the order of the structure.
+    The shape makes ω_b a bandwidth: a narrow filter at ω_b could hold |S| at 1/√2 up to there and
+    let it leap to S_max above. Without an integrator S does not fall to zero: the shape then counts
+    from ω_low on. `channels`: empty, or tighter bounds for each channel, in the structure's order.
     """
 
     S_max: float
     S_low: float
     omega_low: float
     shape: float | None = None
+    shape_ends: ShapeEnd = ShapeEnd.S_MAX
     weighted_level: float | None = None
     weights: Weights | None = None
     compliance_max: float | None = None

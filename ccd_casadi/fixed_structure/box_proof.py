@@ -176,7 +176,8 @@ def _first(family: LoopFamily, box: Array) -> Boxes:
     if family.period is not None:
         scale, top = family.period, np.pi
     edges = np.geomspace(10.0**-DECADES, 1.0, int(2 * DECADES) + 1) * top
-    edges = np.unique(np.concatenate([[0.0], edges, [low * scale, band * scale]]))
+    corner = min(family.corner / family.unit, 1.0)
+    edges = np.unique(np.concatenate([[0.0], edges, np.array([low, band, corner]) * scale]))
     edges = edges[edges <= top]
     cells = [(Chart.LOW if family.period is None else Chart.SAMPLED, a, b)
              for a, b in itertools.pairwise(edges)]  # fmt: skip

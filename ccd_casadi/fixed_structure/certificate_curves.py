@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -188,11 +188,11 @@ def crossing_and_bandwidth(
         low, high = float(points[first]), float(points[first + 1])
     if bounds.shape is None:
         return low, low
-    # Every dip of the room h(ω) = shape ω/(√2|S|), closed in on; ω_b <= h(ω) for all ω <= ω_b.
-    omega = np.unique(np.concatenate([grid[: above[0]], np.geomspace(low / 30.0, low, 1000)]))
-    omega = omega[omega <= low]
-
-    shape = bounds.shape
+    # Every dip of the room h(ω) = shape ω/(√2|S|), closed in on: ω_b <= h(ω) for all ω, or only
+    # for all ω <= ω_b.
+    shape, short = bounds.shape, bounds.shape_ends is ShapeEnd.CROSSING
+    omega = np.unique(np.concatenate([grid, np.geomspace(low / 30.0, 3.0 * low, 1500)]))
+    omega = omega[omega <= (low if short else grid[-1])]
 
     def room(x: Array) -> Array:
         counted = x if integrator else np.maximum(x, bounds.omega_low)
@@ -205,6 +205,8 @@ def crossing_and_bandwidth(
         points, least, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
                                    omega[inner - 1], omega[inner + 1])  # fmt: skip
         dips += zip((-least).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
+    if not short:
+        return low, min(low, min(height for height, _ in dips))
     bandwidth = low
     while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
         height, at = min(broken)

@@ -11,13 +11,12 @@ from functools import singledispatch
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.fixed_structure.figures import OF_S, evaluate
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem, Problem
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
 
 STEP = 1e-5  # of ln v
-OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
 
 
 @singledispatch

@@ -20,7 +20,7 @@ from enum import IntEnum
 import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, variable
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.hold_and_delay import INSTANT
 from ccd_casadi.fixed_structure.modal_sum import ModalSum
 from ccd_casadi.fixed_structure.structure import Structure
@@ -105,10 +105,12 @@ class LoopFamily:
         found = [
             ("S_MAX", S, b.S_max * inside),
             ("S_LOW", S, np.where(point, b.S_low, np.inf)),
-            ("SHAPE", S, np.sqrt(0.5) * below),
+            ("LEVEL", S, np.sqrt(0.5) * below),
         ]
         if b.shape is not None:
-            found.append(("SHAPE", *self._risen(S, P * D * over, x, y, low, high, below)))
+            counts = inside if b.shape_ends is ShapeEnd.S_MAX else below
+            counts = np.where(low >= self.corner * (1.0 - 1e-12), np.inf, counts)
+            found.append(("SHAPE", *self._risen(S, P * D * over, x, y, low, high, counts)))
         if b.weighted_level is not None and b.weights is not None:
             w, level = b.weights, b.weighted_level * inside
             a, c = (y, x) if self.period is None else (s, 1.0)
@@ -214,9 +216,11 @@ class LoopFamily:
         y: Affine,
         low: Array,
         high: Array,
-        below: Array,
+        counts: Array,
     ) -> tuple[Affine, Array]:
-        """|S| x/y and its limit, shape ω/(√2 ω_b v); |S| itself where the shape is level."""
+        """|S| x/y and its limit, shape ω/(√2 ω_b v); |S| and the box's lowest limit where ω counts
+        as ω_low, and near half the sampling rate, where x is 0.
+        """
         assert self.bounds.shape is not None
         n = len(S.slope)
         v = np.ones(len(low))
@@ -225,12 +229,21 @@ class LoopFamily:
             angle *= self.period / self.unit
             v = np.where(angle > 0.0, angle / np.tan(np.maximum(angle, 1e-300)), 1.0)
         top = self.bounds.shape * np.sqrt(0.5) / self.bandwidth
+        late = v < 0.5
         if self.structure.integrator:
-            return without * x.of(n), top * self.unit * v * below
-        level = high <= self.bounds.omega_low * (1.0 + 1e-12)
+            limit = np.where(late, top * low, top * self.unit * v)
+            return _either(late, S, without * x.of(n)), limit * counts
+        omega_low = self.bounds.omega_low
+        level = late | (high <= omega_low * (1.0 + 1e-12))
         rising = S * x.of(n) * inverse(_either(level, x, y)).of(n)
-        limit = np.where(level, top * self.bounds.omega_low, top * self.unit * v)
-        return _either(level, S, rising), limit * below
+        limit = np.where(level, top * np.maximum(low, omega_low), top * self.unit * v)
+        return _either(level, S, rising), limit * counts
+
+    @property
+    def corner(self) -> float:
+        """The ω in rad/s from which on the shape is above S_max; infinite without a shape."""
+        b = self.bounds
+        return np.inf if b.shape is None else b.S_max * np.sqrt(2.0) / b.shape * self.bandwidth
 
 
 def _weight(y: Affine, x: Affine | float, zero: float, pole: float) -> Affine:

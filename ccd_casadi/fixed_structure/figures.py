@@ -34,6 +34,7 @@ from ccd_casadi.support.arrays import Array
 
 RELEVANT = -1.0  # ln of the share of its bound under which a peak is none of ours
 HALF_POWER = 0.5 * np.log(2.0)
+OF_S = (Curve.S_MAX, Curve.LEVEL, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def assess(
     good = stable(poles)
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
-    v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles, tau)
+    v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles)
     P, k = v.shape
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
     loops = evaluate(problem, kappa, tau, which, v, order=0)
@@ -77,21 +78,23 @@ def assess(
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     for curve in problem.curves:
         value = loops.levels[curve]
-        if curve is Curve.SHAPE:
+        short = problem.ends_at_crossing(curve)
+        if short:
             value = np.where(v <= crossing, value, -np.inf)
         left, right = np.full((2, P, k), -np.inf)
         left[:, 1:], right[:, :-1] = value[:, :-1], value[:, 1:]
         rows, at = np.nonzero((value > depth) & (value >= left) & (value > right))
         low, high = v[rows, np.maximum(at - 1, 0)], v[rows, np.minimum(at + 1, k - 1)]
-        if curve is Curve.SHAPE:
+        if short:
             high = np.minimum(high, crossing)
         found.append((np.full(len(rows), curve), rows, v[rows, at], low, high))
         rows, at = np.nonzero(regular & (value > -within))
         near.append((np.full(len(rows), curve), rows, v[rows, at]))
     kind, rows, start, low, high = (np.concatenate(part) for part in zip(*found, strict=True))
     top, closed = _closed(problem, kappa, tau, kind, rows, start, low, high)
-    # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
-    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing)
+    # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
+    ending = [curve for curve in problem.curves if problem.ends_at_crossing(curve)]
+    whole = closed | ~np.isin(kind, ending) | (start < 0.1 * crossing)
     kind, rows, top = kind[whole], rows[whole], top[whole]
     plants = np.arange(P)
     low_v = float(problem.plants.variable(np.array([problem.low]))[0])
@@ -117,13 +120,10 @@ def constraints(
         chosen = curve == code
         value[chosen] = loops.levels[Curve(code)][chosen] + problem.margin
     T = 1.0 - loops.S
-    of_s = np.isin(curve, (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS))
+    of_s = np.isin(curve, OF_S)
     factor = np.where(of_s, -T, loops.S)
     to_kappa = (factor[:, None] * loops.to_kappa).real
-    omega = problem.plants.frequency(v)
-    if problem.bounds.shape is not None:
-        rising = shaped_at(problem, omega) * problem.bounds.shape < np.exp(tau)
-        to_tau[(curve == Curve.SHAPE) & rising] = 1.0
+    to_tau[curve == Curve.SHAPE] = 1.0
     end = curve == Curve.CROSSING
     to_tau[end] = (loops.slopes[Curve.CROSSING] / chain_of(problem, v))[end]
     return Constraints(curve, which, v, value, to_kappa, to_tau)
@@ -158,9 +158,6 @@ def evaluate(
     gradients: dict[Curve, Array] = {}
     with np.errstate(divide="ignore", invalid="ignore"):
         shaped = shaped_at(problem, omega)
-        under = np.zeros(v.shape)
-        if bounds.shape is not None:
-            under = np.minimum(np.log(bounds.shape * shaped) - tau, 0.0)
         if weighted:
             assert bounds.weights is not None
             W, dW = log_weights(bounds.weights, omega * plants.omega_0)
@@ -174,8 +171,11 @@ def evaluate(
                 Curve.S_MAX: ln_S - np.log(bounds.S_max),
                 Curve.S_LOW: ln_S - np.log(bounds.S_low),
                 Curve.CROSSING: ln_S + HALF_POWER,
-                Curve.SHAPE: ln_S + HALF_POWER - under,
+                Curve.LEVEL: ln_S + HALF_POWER,
             }
+            if bounds.shape is not None:
+                under = np.log(bounds.shape * shaped) - tau
+                levels[Curve.SHAPE] = ln_S + HALF_POWER - under
             if bounds.weighted_level is not None:
                 ln_level = np.log(bounds.weighted_level)
                 ln_K, ln_L = np.log(np.abs(K)), np.log(np.abs(L))
@@ -187,8 +187,10 @@ def evaluate(
         if order:
             chain = chain_of(problem, v)
             slope = -(S * (K * dG + L * K_slope)).real
-            gradients = dict.fromkeys((Curve.S_MAX, Curve.S_LOW, Curve.CROSSING), slope)
-            gradients[Curve.SHAPE] = slope - ((under < 0.0) & (shaped == omega)) * chain
+            gradients = dict.fromkeys(
+                (Curve.S_MAX, Curve.S_LOW, Curve.CROSSING, Curve.LEVEL), slope
+            )
+            gradients[Curve.SHAPE] = slope - (shaped == omega) * chain
             if weighted:
                 gradients[Curve.KS] = K_slope.real + slope + dW[0] * chain
                 gradients[Curve.T] = (K_slope + dG / G).real + slope + dW[1] * chain

@@ -1,7 +1,8 @@
 """What is asked of the loops of a set, as constraints on logarithms of gains over their bounds.
 
-    S_max   ln|S| - ln S_max                        every local peak
-    shape   ln|S| + ½ ln 2 - min(0, ln(shape ω/ω_b))    every local peak on ω <= ω_b, and ω_b itself
+    S_max   ln|S| - ln S_max                    every local peak
+    level   ln|S| + ½ ln 2                      every local peak on ω <= ω_b, and ω_b itself
+    shape   ln|S| + ½ ln 2 - ln(shape ω/ω_b)    every local peak, or those on ω <= ω_b
     S_low   ln|S(jω_low)| - ln S_low
     KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
 
@@ -14,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import (
@@ -36,7 +37,8 @@ class Curve(IntEnum):
     KS = 3
     T = 4
     GS = 5
-    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the shape
+    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
+    LEVEL = 7  # |S| <= 1/√2 below ω_b
 
 
 @dataclass(frozen=True)
@@ -84,12 +86,19 @@ class LoopProblem:
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
         """Those of which all peaks count."""
-        found = [Curve.S_MAX, Curve.SHAPE]
+        found = [Curve.S_MAX, Curve.LEVEL]
+        if self.bounds.shape is not None:
+            found.append(Curve.SHAPE)
         if self.bounds.weighted_level is not None:
             found += [Curve.KS, Curve.T]
         if self.bounds.compliance_max is not None:
             found.append(Curve.GS)
         return tuple(found)
+
+    def ends_at_crossing(self, curve: Curve) -> bool:
+        """Whether a curve is bounded on ω <= ω_b only."""
+        short = self.bounds.shape_ends is ShapeEnd.CROSSING
+        return curve is Curve.LEVEL or (curve is Curve.SHAPE and short)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.io import loadmat
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
@@ -302,7 +302,7 @@ def winding(
 
 
 def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
-    """The largest ω_b with |S| <= min(1, shape ω/ω_b)/√2 on the lines below it."""
+    """The largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape."""
     level = np.log(HALF_POWER)
     above = np.flatnonzero(ln_S > level)
     crossing = float(omega[-1])
@@ -315,6 +315,7 @@ def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> f
     if bounds.shape is None:
         return crossing
     counted = omega if integrator else np.maximum(omega, bounds.omega_low)
-    below = omega <= crossing
-    allowed = bounds.shape * counted[below] * HALF_POWER / np.exp(ln_S[below])
+    allowed = bounds.shape * counted * HALF_POWER / np.exp(ln_S)
+    if bounds.shape_ends is ShapeEnd.CROSSING:
+        allowed = allowed[omega <= crossing]
     return float(min(crossing, allowed.min()))

@@ -1,7 +1,8 @@
 """The largest bandwidth of a fixed structure on a measured frequency response, without a model.
 
     max ω_b   s.t.  1 + GK winds as a stable loop does, and on every line
-                    |S| <= S_max,  |S| <= min(1, shape ω/ω_b)/√2 below ω_b,  |S(jω_low)| <= S_low,
+                    |S| <= S_max,  |S| <= 1/√2 below ω_b,  |S| <= shape (ω/ω_b)/√2,
+                    |S(jω_low)| <= S_low,
                     |W_KS KS|, |W_T T| <= weighted_level,  |GS| <= compliance_max
 
 Every line is a row of its own, with exact derivatives to κ; ω_b and ω_low lie between lines, where
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.descent import Point, descend
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
@@ -161,15 +162,15 @@ class _OnLines:
         lines = np.arange(len(omega))
         parts = [(Curve.S_MAX, lines, ln_S - np.log(bounds.S_max), of_s, np.zeros(len(omega)))]
         below = lines[np.log(omega) <= tau]
-        shaped, rising = np.zeros(len(below)), np.zeros(len(below), bool)
+        level = ln_S + HALF_POWER
+        parts.append((Curve.LEVEL, below, level[below], of_s[below], np.zeros(len(below))))
         if bounds.shape is not None:
-            counted = omega[below]
+            at = lines if bounds.shape_ends is ShapeEnd.S_MAX else below
+            counted = omega[at]
             if not self.structure.integrator:
                 counted = np.maximum(counted, bounds.omega_low)
-            shaped = np.minimum(np.log(bounds.shape * counted) - tau, 0.0)
-            rising = shaped < 0.0
-        parts.append((Curve.SHAPE, below, ln_S[below] + HALF_POWER - shaped, of_s[below],
-                      rising.astype(float)))  # fmt: skip
+            shaped = np.log(bounds.shape * counted) - tau
+            parts.append((Curve.SHAPE, at, level[at] - shaped, of_s[at], np.ones(len(at))))
         ends = (
             (Curve.CROSSING, tau, -HALF_POWER),
             (Curve.S_LOW, np.log(bounds.omega_low), np.log(bounds.S_low)),

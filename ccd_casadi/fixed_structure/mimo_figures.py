@@ -32,7 +32,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
     Curve,
     chain_of,
     plant_of_row,
-    shaped_at,
 )
 from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, levels, offsets
 from ccd_casadi.fixed_structure.mimo_loop import whole_closed_loops
@@ -135,11 +134,7 @@ def whole_constraints(
     """Values and derivatives of these rows at these v."""
     found = evaluate_rows(problem, kappa, tau, curve, row, v)
     to_tau = np.zeros(len(v))
-    if problem.bounds.shape is not None:
-        omega = problem.plants.frequency(v)
-        end_of_rise = np.exp(tau + problem.own.lead[row // len(problem.plants.plants)])
-        rising = shaped_at(problem, omega) * problem.bounds.shape < end_of_rise
-        to_tau[(curve == Curve.SHAPE) & rising] = 1.0
+    to_tau[curve == Curve.SHAPE] = 1.0
     end = curve == Curve.CROSSING
     to_tau[end] = (found.slope / chain_of(problem, v))[end]
     return Constraints(curve, row, v, found.value + problem.margin, found.to_kappa, to_tau)
@@ -160,21 +155,20 @@ def _(
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     own = problem.own
-    v, regular = frequency_grid(
-        problem, problem.structure.roots(kappa), poles, np.unique(tau + own.lead)
-    )
+    v, regular = frequency_grid(problem, problem.structure.roots(kappa), poles)
     P, count = v.shape
     crossing = problem.plants.variable(np.exp(tau + own.lead))  # by number
     found, near = [], []
     which = np.broadcast_to(np.arange(P)[:, None], v.shape)
     for curve, value in levels(problem, kappa, tau, which, v, min(depth, -within)).items():
-        if curve is Curve.SHAPE:
+        short = problem.ends_at_crossing(curve)
+        if short:
             value = np.where(v[..., None] <= crossing, value, -np.inf)
         left = np.pad(value, ((0, 0), (1, 0), (0, 0)), constant_values=-np.inf)[:, :-1]
         right = np.pad(value, ((0, 0), (0, 1), (0, 0)), constant_values=-np.inf)[:, 1:]
         i, at, k = np.nonzero((value > depth) & (value >= left) & (value > right))
         low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
-        if curve is Curve.SHAPE:
+        if short:
             high = np.minimum(high, crossing[k])
         brackets = (np.full(len(i), curve), i + k * P, v[i, at], low, high)
         found.append(_split(problem, kappa, tau, brackets, value[i, at, k]))
@@ -186,8 +180,9 @@ def _(
         return evaluate_rows(problem, kappa, tau, kind[of], rows[of], np.exp(x)).slope
 
     top, closed = closed_on_zero(slope, start, low, high)
-    # Of the shape an open end at ω_b is the crossing; one at the lowest frequency is its own.
-    whole = closed | (kind != Curve.SHAPE) | (start < 0.1 * crossing[rows // P])
+    # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
+    ending = [curve for curve in problem.curves if problem.ends_at_crossing(curve)]
+    whole = closed | ~np.isin(kind, ending) | (start < 0.1 * crossing[rows // P])
     kind, rows, top = kind[whole], rows[whole], top[whole]
     every = np.arange(P * own.first)
     faster = (own.first + own.bounded(Curve.CROSSING))[:, None] * P + np.arange(P)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.figures import HALF_POWER
+from ccd_casadi.fixed_structure.figures import HALF_POWER, OF_S
 from ccd_casadi.fixed_structure.loop_problem import (
     Curve,
     LoopProblem,
@@ -48,18 +48,21 @@ def levels(
     plants, own = problem.plants, problem.own
     S, KS, T = loop_matrices(problem, kappa, which, v)
     found: dict[Curve, Array] = {}
-    for curve in problem.curves:
+    whole = {
+        curve: offsets(problem, tau, np.full(v.shape, curve), np.zeros(v.shape, int), v)[0]
+        for curve in problem.curves
+    }
+    of_s = [curve for curve in problem.curves if curve in OF_S and curve is not Curve.GS]
+    gains = _log_gains(S, np.max([whole[curve] for curve in of_s], axis=0), least)
+    for curve, offset in whole.items():
         kind = np.full(v.shape, curve)
-        offset, _ = offsets(problem, tau, kind, np.zeros(v.shape, int), v)
-        if curve is Curve.KS:
-            M = KS
-        elif curve is Curve.T:
-            M = T
-        elif curve is Curve.GS:
-            M = S @ plants.values(which, v, free=True)
+        if curve in of_s:
+            M, own_gains = S, gains
         else:
-            M = S
-        found[curve] = _log_gains(M, offset, least)
+            others = {Curve.KS: KS, Curve.T: T}
+            M = others[curve] if curve in others else S @ plants.values(which, v, free=True)
+            own_gains = _log_gains(M, offset, least)
+        found[curve] = own_gains + offset[..., None]
         if own.count:
             alone = np.full((*v.shape, own.count), -np.inf)
             lengths = np.linalg.norm(own.of_curve(curve) @ M, axis=-1)
@@ -83,11 +86,12 @@ def loop_matrices(
 
 
 def _log_gains(M: np.ndarray, offset: Array, least: float) -> Array:
+    """ln σ where ln σ + offset may be above `least`, else -inf."""
     square = np.abs(np.conj(np.swapaxes(M, -1, -2)) @ M).sum(-1).max(-1)
     with np.errstate(divide="ignore"):
         chosen = 0.5 * np.log(square) + offset > least
         out = np.full((*offset.shape, min(M.shape[-2:])), -np.inf)
-        out[chosen] = np.log(np.linalg.svd(M[chosen], compute_uv=False)) + offset[chosen][:, None]
+        out[chosen] = np.log(np.linalg.svd(M[chosen], compute_uv=False))
     return out
 
 
@@ -102,14 +106,13 @@ def offsets(
     peak = curve == Curve.S_MAX
     out[peak] = -own.ln_S_max[number[peak]]
     out[curve == Curve.S_LOW] = -np.log(bounds.S_low)
-    out[curve == Curve.CROSSING] = HALF_POWER
+    out[(curve == Curve.CROSSING) | (curve == Curve.LEVEL)] = HALF_POWER
     shape = curve == Curve.SHAPE
-    out[shape] = HALF_POWER
     if bounds.shape is not None and shape.any():
         counted = shaped_at(problem, omega)
-        under = np.minimum(np.log(bounds.shape * counted) - (tau + own.lead[number]), 0.0)
-        out[shape] -= under[shape]
-        slope[shape] = np.where((under < 0.0) & (counted == omega), -chain, 0.0)[shape]
+        under = np.log(bounds.shape * counted) - (tau + own.lead[number])
+        out[shape] = HALF_POWER - under[shape]
+        slope[shape] = np.where(counted == omega, -chain, 0.0)[shape]
     if bounds.weighted_level is not None and bounds.weights is not None:
         W, dW = log_weights(bounds.weights, omega * plants.omega_0)
         level = own.ln_level[number]

@@ -40,6 +40,7 @@ class OwnRows:
         """The channels with a bound of their own on a curve."""
         given = {
             Curve.S_MAX: ~np.isnan(self.ln_S_max),
+            Curve.LEVEL: self.lead > 0.0,
             Curve.SHAPE: self.lead > 0.0,
             Curve.CROSSING: self.lead > 0.0,
             Curve.KS: ~np.isnan(self.ln_level),

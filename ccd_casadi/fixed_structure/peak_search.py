@@ -15,7 +15,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
 )
 from ccd_casadi.support.arrays import Array
 
-AROUND_THE_KINK = np.array([0.97, 0.99, 0.997, 1.0, 1.003, 1.01, 1.03])
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
 FLAT = 1e-9  # slope at a maximum
@@ -26,21 +25,14 @@ def frequency_grid(
     problem: LoopProblem,
     controller: tuple[np.ndarray, np.ndarray],
     poles: np.ndarray,
-    tau: float | Array,
 ) -> tuple[Array, np.ndarray]:
     """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
 
-    `controller`: the zeros and the poles of K. Where the shape turns level its curve has a kink,
-    and may have a peak on either side of it; so for each of several τ.
+    `controller`: the zeros and the poles of K.
     """
     own = np.concatenate(controller)
     own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
-    parts = [problem.fixed, flanked(own), flanked(poles)]
-    if problem.bounds.shape is not None:
-        level = np.exp(np.atleast_1d(tau)) / problem.bounds.shape
-        kink = np.outer(level, AROUND_THE_KINK).ravel()
-        parts.append(np.tile(problem.plants.variable(kink), (len(poles), 1)))
-    joint = np.concatenate(parts, axis=1)
+    joint = np.concatenate([problem.fixed, flanked(own), flanked(poles)], axis=1)
     bottom, top = problem.base[0], problem.base[-1]
     # Points that fall together would hide a peak between them: spares go below the base instead.
     spare = np.broadcast_to(bottom * np.linspace(0.5, 0.99, joint.shape[1]), joint.shape)

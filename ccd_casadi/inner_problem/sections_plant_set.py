@@ -33,6 +33,7 @@ def bounds_of(problem: CoDesignProblem) -> Bounds:
         S_low=inner.S_low,
         omega_low=inner.omega_low,
         shape=sections.shape,
+        shape_ends=sections.shape_ends,
         weighted_level=sections.weighted_level,
         weights=problem.weights if weighted else None,
         compliance_max=sections.compliance_max,

@@ -1,8 +1,8 @@
 """The second kind of inner problem: a controller of fixed structure on a set of plants.
 
     ω_b*(θ) = max ω_b over κ  s.t. on every plant: stable, ‖S‖∞ <= S_max, σ_max(S(jω_low)) <= S_low,
-              |S(jω)| <= shape (ω/ω_b)/√2 below ω_b, |W_KS KS| and |W_T T| <= weighted_level,
-              |GS| <= compliance_max
+              |S(jω)| <= 1/√2 below ω_b, |S(jω)| <= shape (ω/ω_b)/√2 at every ω, or below ω_b,
+              |W_KS KS| and |W_T T| <= weighted_level, |GS| <= compliance_max
 
 Everything is plain values, as in `problem`: it is hashed, sent to workers and kept in the store.
 """
@@ -10,7 +10,7 @@ Everything is plain values, as in `problem`: it is hashed, sent to workers and k
 from dataclasses import dataclass, field
 from typing import Any
 
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 
 Options = tuple[tuple[str, object], ...]
 Member = tuple[int, tuple[float, ...]]
@@ -72,6 +72,7 @@ class SectionsProblem:
 
     structure: Structure = field(default_factory=Structure)
     shape: float | None = 1.1
+    shape_ends: ShapeEnd = ShapeEnd.S_MAX
     weighted_level: float | None = None
     compliance_max: float | None = None
     sampling: Sampling | None = None
@@ -108,6 +109,8 @@ class SectionsProblem:
             "anchors": self.anchors,
             "members": self.members,
         }
+        if self.shape_ends is not ShapeEnd.CROSSING:  # which stores knew first
+            found["shape_ends"] = self.shape_ends.value
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
         if self.of_error:

@@ -83,7 +83,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
     gain = "lower the RMS error" if sections_of_problem(problem).of_error else "raise ω_b"
-    names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S below ω_b", "S_LOW": "|S| at ω_low",
+    names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
+             "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
     over_kappa = []
     for kind, words in names.items():
