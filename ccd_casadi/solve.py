@@ -26,6 +26,7 @@ _CODES = {
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
+    from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.reporting.verdict import terminal_lines
 
@@ -46,6 +47,7 @@ def summary(solution: "Solution") -> str:
         f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
         f"compliance    {result.get('compliance_words', 'not known')}",
+        *loop_lines(result),
         f"certificate   {'passed' if result['certificate']['passed'] else 'FAILED'}: norm "
         f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
         f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
@@ -92,6 +94,7 @@ def _gains(controller: Mapping[str, Any]) -> str:
 
 def sections_summary(result: Mapping[str, Any]) -> str:
     """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
+    from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words
     from ccd_casadi.reporting.verdict import terminal_lines
@@ -111,6 +114,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
         *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
         f"compliance    {result['compliance_words']}",
+        *loop_lines(result),
         f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
         f"{counted(certificate['plants'], 'plant')}: {certificate['norm']:.7g} of a bound at most, "
         f"poles left of {certificate['max_real_pole']:.4g} 1/s",

@@ -249,7 +249,8 @@ def _figures(
     """The contract's keys for a design that no formulation made."""
     cost = hardware_cost(plant_of(problem), theta)
     if isinstance(design, SectionsDesign):
-        own, feasible, bandwidth = design_dict(problem, design), design.certified, design.bandwidth
+        own = design_dict(problem, theta, design)
+        feasible, bandwidth = design.certified, design.bandwidth
         active = active_of(design)
     else:
         figures = design.figures

@@ -7,7 +7,12 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.result import compliance_dict, controller_dict, figures_dict
+from ccd_casadi.codesign.result import (
+    compliance_dict,
+    controller_dict,
+    figures_dict,
+    loop_of_design,
+)
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -107,6 +112,7 @@ def _design(
     answer = {
         **clean(figures_dict(figures)),
         **compliance,
+        **clean(loop_of_design(problem, theta, made)),
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [

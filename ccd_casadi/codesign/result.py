@@ -1,9 +1,11 @@
 """The run folder's JSON files: result.json and controller.json."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -13,13 +15,13 @@ from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
 from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
 from ccd_casadi.synthesis.statics import compliance_words
-from ccd_casadi.synthesis.synthesis import DesignFigures
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 from surrogates import Quality
 
 
@@ -87,6 +89,7 @@ def result_dict(
     why = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
     result = {
         **figures_dict(figures),
+        **loop_of_design(problem, verified.theta, verified.design),
         **_compliance(verified),
         "status": "not_verified" if failed else "verified",
         "reason": "; ".join(part for part in (why, outcome.message) if part) if failed else "",
@@ -133,6 +136,21 @@ def result_dict(
     result["surrogate_quality"] = quality_dict(quality)
     result |= budget_entry(problem, verified.theta, verified.design.controller)
     return clean(result)
+
+
+def loop_of_design(
+    problem: CoDesignProblem, theta: Sequence[float], design: Design
+) -> dict[str, Any]:
+    """Margins and steps on the plant and those of its robust set; nothing of an unstable loop."""
+    figures = design.figures
+    if not figures.certified:
+        return {}
+    plant = scaled_plant(problem, theta)
+    members = (plant, *(() if plant.family is None else plant.family.perturbed))
+    return loop_entry(
+        [member.plant_si() for member in members], design.controller, None, figures.bandwidth,
+        figures.sensitivity_peak,
+    )  # fmt: skip
 
 
 def _compliance(verified: VerifiedDesign) -> dict[str, Any]:

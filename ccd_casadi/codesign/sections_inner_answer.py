@@ -67,7 +67,7 @@ def sections_answer(
     proof = proof_of(asked, theta, made)
     passed = wide.passed and not proof.refuted
     figures = head | {
-        **design_dict(asked, made),
+        **design_dict(asked, theta, made),
         "active": active_of(made),
         "feasible": True,
         "objective": problem.w1 * head["hardware_cost"] + problem.w2 * value,

@@ -1,10 +1,12 @@
 """result.json and controller.json of a co-design with a controller of fixed structure."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, FullOrder
@@ -17,7 +19,7 @@ from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.json_files import clean
@@ -28,6 +30,7 @@ from surrogates import Quality
 BINDS = {
     "S_MAX": "S_max",
     "SHAPE": "shape",
+    "LEVEL": "-3 dB below omega_b",
     "S_LOW": "S_low",
     "KS": "weighted_level of KS",
     "T": "weighted_level of T",
@@ -36,7 +39,9 @@ BINDS = {
 WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
 
 
-def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
+def design_dict(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+) -> dict[str, Any]:
     """A certified design's figures under the contract's keys, the worst of its plants."""
     judged = made.certificate
     assert judged is not None
@@ -65,6 +70,7 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
             problem.inner.omega_low / HZ,
         ),
         "KS_max": max(plant.KS for plant in judged.plants),
+        **_loop_entry(problem, theta, made),
         **_channel_entry(bounds_of(problem), judged),
         "certificate": {
             "stable": all(plant.stable for plant in judged.plants),
@@ -87,6 +93,21 @@ def design_dict(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any
             "kkt_residual": made.kkt_residual,
         },
     }
+
+
+def _loop_entry(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+) -> dict[str, Any]:
+    """Margins and steps on the plants of the set; nothing of an unstable loop."""
+    judged = made.certificate
+    assert judged is not None
+    assert made.controller is not None
+    if not all(plant.stable for plant in judged.plants):
+        return {}
+    plants = [plant.plant_si() for plant in plants_of(problem, theta)]
+    peak = max(plant.S_peak for plant in judged.plants)
+    sampling = sections_of_problem(problem).sampling
+    return loop_entry(plants, made.controller, sampling, made.bandwidth, peak)
 
 
 def active_of(made: SectionsDesign) -> list[str]:
@@ -203,7 +224,7 @@ def sections_result(
     bounds = [name for name in verified.kkt.active if name not in plant.constraint_names]
     met = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
     result = {
-        **design_dict(verified.problem, made),
+        **design_dict(verified.problem, verified.theta, made),
         "status": "not_verified" if failed else "verified",
         "verdict": verdict_dict(verdict),
         "reason": "; ".join(part for part in (words, outcome.message) if part),

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_figures import force_step
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.composite import CompositeProblem, largest_gains
 from ccd_casadi.fixed_structure.design import problem_for
@@ -14,7 +15,6 @@ from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
-from ccd_casadi.reporting.force_step import force_step
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden
 from ccd_casadi.reporting.page import Table, figure_html, number
@@ -23,7 +23,8 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.sections_run import VerifiedSections
+    from ccd_casadi.analysis.loop_figures import force_step
+from ccd_casadi.codesign.sections_run import VerifiedSections
 
 POINTS = 700
 ROWS = 40  # of the tables
@@ -173,7 +174,8 @@ def force_step_html(verified: "VerifiedSections") -> str:
         slow = -float(np.log1p(-slow)) / sampling.period
     times = np.geomspace(0.02 / verified.design.bandwidth, SETTLED / slow, STEPS)
     plants = plants_of(verified.problem, verified.theta)
-    steps = [force_step(p, verified.design.controller, sampling, times) for p in plants]
+    K = verified.design.controller
+    steps = [force_step(p.plant_si(), K, sampling, times) for p in plants]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
     step = Panel("time (ms)", "y after a step of 1 N (µm)", (Curve(1e3 * t, y[0], "the model"),),

@@ -1,0 +1,215 @@
+"""What a loop-shaper reads first: crossover, margins, a step, and where the loop is too sharp.
+
+Margins are of the loops cut one at a time at the plant's inputs, the least over the plants that
+are given; steps are of the model and of the plants where the margins are least.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.analysis.loop import Loop, zeros
+from ccd_casadi.fixed_structure.hold_and_delay import Sampling
+from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
+
+PERIODS = 160.0  # of ω_b that a step is followed for
+PER_PERIOD = 100  # points of a continuous loop's step
+BAND = 0.02  # about its end, in which a step has settled
+SHARP = 1.5  # growth of |S| within OCTAVE above ω_b that is worth a word
+OCTAVE = 0.1
+LIGHT = 0.1  # damping of a root of K that is worth a word within NEAR of ω_b
+NEAR = 0.2
+
+
+@dataclass(frozen=True)
+class StepFigures:
+    """A unit step of each reference: overshoot and the last time outside 2 %, s (inf: not within
+    the time that was looked at); the largest displacement after 1 N, m, that at rest included."""
+
+    overshoot: float
+    settling: float
+    by_force: float
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """Crossover of the model in rad/s; the least margins of all plants: phase in degrees, `gain` as
+    a factor either way, delay in s; the worst step.
+
+    `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
+    `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b.
+    """
+
+    crossover: float
+    phase_deg: float
+    gain: float
+    delay: float
+    step: StepFigures
+    growth: float
+    light_roots: tuple[tuple[float, float, str], ...]
+
+
+def loop_figures(
+    plants: Sequence[StateSpace],
+    controller: StateSpace,
+    sampling: Sampling | None,
+    bandwidth: float,
+) -> LoopFigures:
+    """Of a stable loop on every plant, the model first; SI, ω_b in rad/s."""
+    loops = [Loop(plant, controller, sampling) for plant in plants]
+    margins = [_least_margins(loop) for loop in loops]
+    gain = [min(m.gain_up, 1.0 / m.gain_down if m.gain_down else np.inf) for m in margins]
+    worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
+    steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
+    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
+    sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
+    return LoopFigures(
+        crossover=margins[0].crossover,
+        phase_deg=min(m.phase_deg for m in margins),
+        gain=min(gain),
+        delay=min(m.delay for m in margins),
+        step=StepFigures(
+            max(s.overshoot for s in steps),
+            max(s.settling for s in steps),
+            max(s.by_force for s in steps),
+        ),
+        growth=max(float((size / size[0]).max()) for size in sizes),
+        light_roots=light_roots(controller, bandwidth),
+    )
+
+
+def _least_margins(loop: Loop) -> ClassicalMargins:
+    omega = loop.grid()
+    each = [
+        classical_margins(partial(loop.open_at_input, i), omega)
+        for i in range(loop.plant.B.shape[1])
+    ]
+    return ClassicalMargins(
+        max(m.gain_down for m in each),
+        min(m.gain_up for m in each),
+        min(m.phase_deg for m in each),
+        min(m.delay for m in each),
+        min(m.crossover for m in each),
+    )
+
+
+def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
+    """Of each reference and each force in turn, the worst."""
+    duration = PERIODS * HZ / bandwidth
+    steps = loop.over_a_step(duration / (PERIODS * PER_PERIOD))
+    count = int(duration / steps.period) + 1
+    time = np.arange(count) * steps.period
+    overshoot, settling = 0.0, 0.0
+    for i, drive in enumerate(steps.B_r.T):
+        y = steps.outputs(drive, count)[i]
+        overshoot = max(overshoot, float(y.max()) - 1.0)
+        outside = np.flatnonzero(np.abs(y - 1.0) > BAND)
+        last = int(outside[-1]) + 1 if len(outside) else 0
+        settling = max(settling, float(time[last]) if last < count else np.inf)
+    rest = steps.C @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
+    moved = [float(np.abs(steps.outputs(drive, count)).max()) for drive in steps.B_d.T]
+    return StepFigures(overshoot, settling, max(*moved, float(np.abs(rest).max())))
+
+
+def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, float, str], ...]:
+    """Poles and zeros of K with damping below 0.1 within 20 % of ω_b, ascending."""
+    found = []
+    for word, roots in (
+        ("zero", zeros(controller, bandwidth)),
+        ("pole", np.linalg.eigvals(controller.A)),
+    ):
+        size = np.abs(roots)
+        damping = -roots.real / np.maximum(size, 1e-300)
+        near = (np.abs(size / bandwidth - 1.0) <= NEAR) & (np.abs(damping) < LIGHT)
+        chosen = near & (roots.imag > 0.0)
+        found += [
+            (float(w), float(d), word) for w, d in zip(size[chosen], damping[chosen], strict=True)
+        ]
+    return tuple(sorted(found))
+
+
+def force_step(
+    plant: StateSpace, controller: StateSpace, sampling: Sampling | None, times: Array
+) -> tuple[Array, Array]:
+    """Times in s near the given ones, and y of the first output in m after 1 N, exact at them.
+
+        y_n = C (I - A)⁻¹ (I - Aⁿ) B
+
+    of the loop over one step: a period, or where the loop is continuous the first of the times.
+    """
+    steps = Loop(plant, controller, sampling).over_a_step(float(times[0]))
+    counts = np.unique(np.maximum(np.round(times / steps.period), 1.0).astype(int))
+    A, C = steps.A, steps.C[0]
+    final = np.linalg.solve(np.eye(len(A)) - A, steps.B_d[:, 0])
+    y = [float(C @ (final - np.linalg.matrix_power(A, int(n)) @ final)) for n in counts]
+    return np.asarray(steps.period * counts, float), np.array(y)
+
+
+def loop_warnings(found: LoopFigures, bandwidth: float) -> list[str]:
+    """By name, what an engineer would not build: ω_b that is held by something narrow."""
+    hz = bandwidth / HZ
+    words = []
+    if found.growth > SHARP:
+        words.append(
+            f"|S| grows by a factor of {found.growth:.3g} within a tenth of an octave above "
+            f"{hz:.4g} Hz: the bandwidth is held by something narrow"
+        )
+    words += [
+        f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
+        f"bandwidth"
+        for w, d, word in found.light_roots
+    ]
+    return words
+
+
+def loop_entry(
+    plants: Sequence[StateSpace],
+    controller: StateSpace,
+    sampling: Sampling | None,
+    bandwidth: float,
+    sensitivity_peak: float,
+) -> dict[str, Any]:
+    """The figures under the keys of `result.json`; the modulus margin is 1/‖S‖∞."""
+    found = loop_figures(plants, controller, sampling, bandwidth)
+    return {
+        "crossover_hz": found.crossover / HZ,
+        "phase_margin_deg": found.phase_deg,
+        "gain_margin": found.gain,
+        "delay_margin_us": 1e6 * found.delay,
+        "modulus_margin": 1.0 / sensitivity_peak,
+        "step_overshoot": found.step.overshoot,
+        "settling_ms": 1e3 * found.step.settling,
+        "force_step_max": found.step.by_force,
+        "loop_warnings": loop_warnings(found, bandwidth),
+    }
+
+
+def loop_lines(result: Mapping[str, Any]) -> list[str]:
+    """Margins and step for the terminal; nothing of a result without them."""
+    if "phase_margin_deg" not in result:
+        return []
+
+    def shown(value: float | None, unit: str) -> str:
+        return "unlimited" if value is None else f"{value:.3g}{unit}"
+
+    r = result
+    lines = [
+        f"margins       phase {shown(r['phase_margin_deg'], ' deg')}, gain "
+        f"{shown(r['gain_margin'], '')}, delay {shown(r['delay_margin_us'], ' us')}, modulus "
+        f"{shown(r['modulus_margin'], '')}; crossover {shown(r['crossover_hz'], ' Hz')}"
+    ]
+    if "step_overshoot" in r:
+        settled = "does not settle" if r["settling_ms"] is None else (
+            f"within 2 % after {r['settling_ms']:.3g} ms"
+        )  # fmt: skip
+        lines.append(
+            f"steps         overshoot {100.0 * r['step_overshoot']:.3g} %, {settled}; "
+            f"1 N moves {1e6 * r['force_step_max']:.3g} um at most"
+        )
+    return lines + [f"warning       {words}" for words in r.get("loop_warnings", ())]

@@ -1,0 +1,132 @@
+"""Margins, steps and warnings of a loop against what they mean."""
+
+import numpy as np
+import pytest
+from fixed_structure_loops import FAST, LATE, loop, plant
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccd_casadi.analysis.loop import Loop, tustin, zeros
+from ccd_casadi.analysis.loop_figures import loop_figures, loop_warnings, step_figures
+from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure.structure import roots, state_space
+from ccd_casadi.plants.scaling import StateSpace
+
+HZ = 2.0 * np.pi
+
+
+def pair(seed: int, sampling: Sampling | None) -> tuple[StateSpace, StateSpace]:
+    """Case study 1 with a stable random controller, SI."""
+    problem, kappa = loop(seed, Structure(), sampling)
+    unit = problem.plants
+    si = problem.structure.in_units(kappa, unit.omega_0, unit.force)
+    return plant().plant_si(), state_space(problem.structure, si)
+
+
+def turned(K: StateSpace, factor: float) -> StateSpace:
+    return StateSpace(K.A, K.B, factor * K.C, factor * K.D)
+
+
+def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
+    return bool(Loop(G, K, sampling).poles().real.max() < 0.0)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST, LATE])
+@pytest.mark.parametrize("seed", range(3))
+def test_stability_is_lost_at_the_margins(seed: int, sampling: Sampling | None) -> None:
+    """The gain margin by eigenvalues; a delay added to the loop likewise, sampled where it is."""
+    G, K = pair(seed, sampling)
+    found = loop_figures([G], K, sampling, 20.0 * HZ)
+    assert is_stable(G, K, sampling)
+    ends = [is_stable(G, turned(K, f), sampling) for f in (found.gain, 1.0 / found.gain)]
+    beyond = [1.001 * found.gain, 0.999 / found.gain]
+    inside = [0.999 * found.gain, 1.001 / found.gain]
+    assert not all(is_stable(G, turned(K, f), sampling) for f in beyond), ends
+    assert all(is_stable(G, turned(K, f), sampling) for f in inside)
+    if sampling is not None:
+        late = [
+            Sampling(sampling.rate_hz, sampling.delay_us + 1e6 * f * found.delay)
+            for f in (0.999, 1.001)
+        ]
+        assert [is_stable(G, K, other) for other in late] == [True, False]
+
+
+@pytest.mark.parametrize("sampling", [None, LATE])
+def test_responses_are_those_of_the_matrices(sampling: Sampling | None) -> None:
+    """S by the modal forms against the closed loop over a step, in z."""
+    G, K = pair(1, sampling)
+    made = Loop(G, K, sampling)
+    step = 1e-5 if sampling is None else sampling.period
+    steps = made.over_a_step(step)
+    omega = np.geomspace(1.0, 0.9 * np.pi / step if sampling else 2000.0, 50)
+    z = np.exp(1j * omega * steps.period)
+    n = len(steps.A)
+    T = (steps.C @ np.linalg.solve(z[:, None, None] * np.eye(n) - steps.A, steps.B_r + 0j))[:, 0, 0]
+    # A continuous loop's reference is held over a step here: half a step late, to first order.
+    late = 1.0 if sampling else np.exp(-0.5j * omega * step) * np.sinc(0.5 * omega * step / np.pi)
+    size = np.abs(T).max()
+    np.testing.assert_allclose(1.0 - made.sensitivity(omega)[:, 0, 0],
+                               T / late, atol=size * (1e-9 if sampling else 1e-2))  # fmt: skip
+
+
+@given(st.floats(0.3, 0.9), st.floats(5.0, 50.0))
+def test_a_second_order_loop_has_the_textbook_s_step(damping: float, hz: float) -> None:
+    """T = ω²/(s² + 2ζωs + ω²): overshoot exp(-πζ/√(1 - ζ²)); 1 N moves 1/(m ω²) and overshoots."""
+    w, mass = hz * HZ, 3.0
+    # G = 1/(m s (s + 2ζω)), K = m ω²: the plant's pole at 0 is a soft one here
+    soft = 1e-4 * w
+    A = np.array([[0.0, 1.0], [-soft * 2.0 * damping * w, -2.0 * damping * w - soft]])
+    G = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(1, 2), np.zeros((1, 1)))
+    K = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[mass * w**2]]))
+    found = step_figures(Loop(G, K), w)
+    expected = np.exp(-np.pi * damping / np.sqrt(1.0 - damping**2))
+    assert found.overshoot == pytest.approx(expected, abs=1e-3)
+    assert found.by_force == pytest.approx((1.0 + expected) / (mass * w**2), rel=2e-3)
+    # the envelope exp(-ζωt)/√(1-ζ²) is inside 2 % then, and was outside half an oscillation ago
+    inside = np.log(0.02 * np.sqrt(1.0 - damping**2)) / (-damping * w)
+    assert found.settling <= inside * 1.01
+    assert found.settling >= inside - np.pi / (w * np.sqrt(1.0 - damping**2)) - 0.02 / hz
+
+
+def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
+    """A filter at ω_b is met by its roots and by the growth of |S| above ω_b."""
+    structure = Structure()
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        kappa = rng.normal(4.0, 0.8, len(structure.names))
+        K = state_space(structure, kappa)
+        expected = roots(structure, kappa)[0]
+        found = np.sort(np.abs(zeros(K, 50.0)))
+        np.testing.assert_allclose(found, np.sort(np.abs(expected)), rtol=1e-5)
+    G, K = pair(0, None)
+    w = 20.0 * HZ
+    A = np.array([[0.0, 1.0], [-(w**2), -2.0 * 0.05 * w]])
+    C = np.array([[0.0, 2.0 * (0.02 - 0.05) * w]])  # (s² + 0.04 ws + w²)/(s² + 0.1 ws + w²)
+    narrow = StateSpace(A, np.array([[0.0], [1.0]]), C, np.eye(1))
+    series = StateSpace(
+        np.block([[K.A, K.B @ narrow.C], [np.zeros((2, len(K.A))), narrow.A]]),
+        np.vstack([K.B @ narrow.D, narrow.B]), np.hstack([K.C, K.D @ narrow.C]), K.D @ narrow.D,
+    )  # fmt: skip
+    before = loop_figures([G], K, None, w)
+    after = loop_figures([G], series, None, w)
+    added = [root[1:] for root in after.light_roots][len(before.light_roots) :]
+    new = [root for root in after.light_roots if abs(root[0] / w - 1.0) < 1e-6]
+    assert len(added) == len(new) == 2
+    named = {(word, round(damping, 6)) for _, damping, word in new}
+    assert named == {("pole", 0.05), ("zero", 0.02)}
+    assert len(loop_warnings(after, w)) == len(loop_warnings(before, w)) + 2
+
+
+def test_tustin_keeps_the_response_at_the_warped_frequency() -> None:
+    _, K = pair(2, None)
+    T = 1e-4
+    k = tustin(K, T)
+    omega = np.geomspace(1.0, 0.9 * np.pi / T, 40)
+    z = np.exp(1j * omega * T)
+    at = 2j / T * np.tan(0.5 * omega * T)
+
+    def response(system: StateSpace, s: np.ndarray) -> np.ndarray:
+        shape = s[:, None, None] * np.eye(len(system.A)) - system.A
+        return (system.C @ np.linalg.solve(shape, system.B + 0j) + system.D)[:, 0, 0]
+
+    np.testing.assert_allclose(response(k, z), response(K, at), rtol=1e-6)
