@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.analysis.loop import Loop, tustin, zeros
-from ccd_casadi.analysis.loop_figures import loop_figures, loop_warnings, step_figures
+from ccd_casadi.analysis.loop_figures import (
+    LoopFigures,
+    gain_margin,
+    loop_figures,
+    loop_warnings,
+    measured_entry,
+    step_figures,
+)
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import roots, state_space
 from ccd_casadi.plants.scaling import StateSpace
@@ -31,6 +38,10 @@ def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
     return bool(Loop(G, K, sampling).poles().real.max() < 0.0)
 
 
+def warnings_of(found: LoopFigures, bandwidth: float) -> list[str]:
+    return loop_warnings(found.growth, found.light_roots, bandwidth)
+
+
 @pytest.mark.parametrize("sampling", [None, FAST, LATE])
 @pytest.mark.parametrize("seed", range(3))
 def test_stability_is_lost_at_the_margins(seed: int, sampling: Sampling | None) -> None:
@@ -38,14 +49,13 @@ def test_stability_is_lost_at_the_margins(seed: int, sampling: Sampling | None) 
     G, K = pair(seed, sampling)
     found = loop_figures([G], K, sampling, 20.0 * HZ)
     assert is_stable(G, K, sampling)
-    ends = [is_stable(G, turned(K, f), sampling) for f in (found.gain, 1.0 / found.gain)]
-    beyond = [1.001 * found.gain, 0.999 / found.gain]
-    inside = [0.999 * found.gain, 1.001 / found.gain]
-    assert not all(is_stable(G, turned(K, f), sampling) for f in beyond), ends
+    gain = gain_margin(found.margins)
+    beyond, inside = (1.001 * gain, 0.999 / gain), (0.999 * gain, 1.001 / gain)
+    assert not all(is_stable(G, turned(K, f), sampling) for f in beyond)
     assert all(is_stable(G, turned(K, f), sampling) for f in inside)
     if sampling is not None:
         late = [
-            Sampling(sampling.rate_hz, sampling.delay_us + 1e6 * f * found.delay)
+            Sampling(sampling.rate_hz, sampling.delay_us + 1e6 * f * found.margins.delay)
             for f in (0.999, 1.001)
         ]
         assert [is_stable(G, K, other) for other in late] == [True, False]
@@ -114,7 +124,7 @@ def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
     assert len(added) == len(new) == 2
     named = {(word, round(damping, 6)) for _, damping, word in new}
     assert named == {("pole", 0.05), ("zero", 0.02)}
-    assert len(loop_warnings(after, w)) == len(loop_warnings(before, w)) + 2
+    assert len(warnings_of(after, w)) == len(warnings_of(before, w)) + 2
 
 
 def test_tustin_keeps_the_response_at_the_warped_frequency() -> None:
@@ -130,3 +140,14 @@ def test_tustin_keeps_the_response_at_the_warped_frequency() -> None:
         return (system.C @ np.linalg.solve(shape, system.B + 0j) + system.D)[:, 0, 0]
 
     np.testing.assert_allclose(response(k, z), response(K, at), rtol=1e-6)
+
+
+def test_margins_on_dense_lines_are_those_of_the_model() -> None:
+    G, K = pair(0, None)
+    made, w = Loop(G, K), 20.0 * HZ
+    omega = np.geomspace(1.0, 3000.0, 20_000)
+    lines = measured_entry(omega, made.open_at_input(0, omega), K, w, 1.5)
+    exact = loop_figures([G], K, None, w).margins
+    assert lines["phase_margin_deg"] == pytest.approx(exact.phase_deg, abs=0.05)
+    assert lines["gain_margin"] == pytest.approx(gain_margin(exact), rel=1e-3)
+    assert lines["delay_margin_us"] == pytest.approx(1e6 * exact.delay, rel=1e-3)

@@ -5,7 +5,7 @@ are given; steps are of the model and of the plants where the margins are least.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -39,17 +39,13 @@ class StepFigures:
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """Crossover of the model in rad/s; the least margins of all plants: phase in degrees, `gain` as
-    a factor either way, delay in s; the worst step.
+    """The least margins of all plants, with the crossover of the model; the worst step.
 
     `growth`: the largest factor by which σ_max(S) grows within a tenth of an octave above ω_b.
     `light_roots`: (frequency in rad/s, damping, "zero" or "pole") of K's near ω_b.
     """
 
-    crossover: float
-    phase_deg: float
-    gain: float
-    delay: float
+    margins: ClassicalMargins
     step: StepFigures
     growth: float
     light_roots: tuple[tuple[float, float, str], ...]
@@ -64,16 +60,13 @@ def loop_figures(
     """Of a stable loop on every plant, the model first; SI, ω_b in rad/s."""
     loops = [Loop(plant, controller, sampling) for plant in plants]
     margins = [_least_margins(loop) for loop in loops]
-    gain = [min(m.gain_up, 1.0 / m.gain_down if m.gain_down else np.inf) for m in margins]
+    gain = [gain_margin(m) for m in margins]
     worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
     steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
     above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
     sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
     return LoopFigures(
-        crossover=margins[0].crossover,
-        phase_deg=min(m.phase_deg for m in margins),
-        gain=min(gain),
-        delay=min(m.delay for m in margins),
+        margins=replace(_least(margins), crossover=margins[0].crossover),
         step=StepFigures(
             max(s.overshoot for s in steps),
             max(s.settling for s in steps),
@@ -86,10 +79,13 @@ def loop_figures(
 
 def _least_margins(loop: Loop) -> ClassicalMargins:
     omega = loop.grid()
-    each = [
-        classical_margins(partial(loop.open_at_input, i), omega)
-        for i in range(loop.plant.B.shape[1])
-    ]
+    count = loop.plant.B.shape[1]
+    return _least(
+        [classical_margins(partial(loop.open_at_input, i), omega) for i in range(count)]
+    )
+
+
+def _least(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
     return ClassicalMargins(
         max(m.gain_down for m in each),
         min(m.gain_up for m in each),
@@ -151,21 +147,58 @@ def force_step(
     return np.asarray(steps.period * counts, float), np.array(y)
 
 
-def loop_warnings(found: LoopFigures, bandwidth: float) -> list[str]:
+def loop_warnings(
+    growth: float, roots: Sequence[tuple[float, float, str]], bandwidth: float
+) -> list[str]:
     """By name, what an engineer would not build: ω_b that is held by something narrow."""
     hz = bandwidth / HZ
     words = []
-    if found.growth > SHARP:
+    if growth > SHARP:
         words.append(
-            f"|S| grows by a factor of {found.growth:.3g} within a tenth of an octave above "
+            f"|S| grows by a factor of {growth:.3g} within a tenth of an octave above "
             f"{hz:.4g} Hz: the bandwidth is held by something narrow"
         )
     words += [
         f"the controller has a {word} at {w / HZ:.4g} Hz with damping {d:.3g}, within 20 % of the "
         f"bandwidth"
-        for w, d, word in found.light_roots
+        for w, d, word in roots
     ]
     return words
+
+
+def measured_entry(
+    omega: Array, L: np.ndarray, controller: StateSpace, bandwidth: float, sensitivity_peak: float
+) -> dict[str, Any]:
+    """The same of one loop known on lines ω (k,) in rad/s: between them ln|L| and its phase are
+    straight over ln ω. There are no steps."""
+    x, size, phase = np.log(omega), np.log(np.abs(L)), np.unwrap(np.angle(L))
+
+    def response(w: Array) -> np.ndarray:
+        at = np.log(w)
+        return np.asarray(np.exp(np.interp(at, x, size) + 1j * np.interp(at, x, phase)))
+
+    margins = classical_margins(response, omega)
+    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
+    S = np.abs(1.0 / (1.0 + response(above)))
+    roots = light_roots(controller, bandwidth)
+    return _entry(margins, sensitivity_peak) | {
+        "loop_warnings": loop_warnings(float((S / S[0]).max()), roots, bandwidth)
+    }
+
+
+def _entry(margins: ClassicalMargins, sensitivity_peak: float) -> dict[str, Any]:
+    return {
+        "crossover_hz": margins.crossover / HZ,
+        "phase_margin_deg": margins.phase_deg,
+        "gain_margin": gain_margin(margins),
+        "delay_margin_us": 1e6 * margins.delay,
+        "modulus_margin": 1.0 / sensitivity_peak,
+    }
+
+
+def gain_margin(margins: ClassicalMargins) -> float:
+    """The least factor, up or down, at which stability is lost."""
+    return min(margins.gain_up, 1.0 / margins.gain_down if margins.gain_down else np.inf)
 
 
 def loop_entry(
@@ -177,16 +210,11 @@ def loop_entry(
 ) -> dict[str, Any]:
     """The figures under the keys of `result.json`; the modulus margin is 1/‖S‖∞."""
     found = loop_figures(plants, controller, sampling, bandwidth)
-    return {
-        "crossover_hz": found.crossover / HZ,
-        "phase_margin_deg": found.phase_deg,
-        "gain_margin": found.gain,
-        "delay_margin_us": 1e6 * found.delay,
-        "modulus_margin": 1.0 / sensitivity_peak,
+    return _entry(found.margins, sensitivity_peak) | {
         "step_overshoot": found.step.overshoot,
         "settling_ms": 1e3 * found.step.settling,
         "force_step_max": found.step.by_force,
-        "loop_warnings": loop_warnings(found, bandwidth),
+        "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth),
     }
 
 

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.inner_answer import InnerAnswer
 from ccd_casadi.codesign.result import controller_dict
+from ccd_casadi.fixed_structure.measured import controller_response
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.support.units import HZ
@@ -36,6 +38,7 @@ def measured_answer(
         "sensitivity_low": f.S_low,
         "compliance_max": f.GS,
         "KS_max": f.KS,
+        **_loop_entry(case, made),
         "certificate": {
             "stable": f.stable,
             "sure": f.sure,
@@ -50,3 +53,12 @@ def measured_answer(
     }  # fmt: skip
     controller = controller_dict(made.controller) | {"sections": parts | loop}
     return InnerAnswer("verified" if made.usable else "not_verified", figures, controller), made
+
+
+def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
+    """Margins on the lines; nothing of an unstable loop."""
+    if made.controller is None or made.figures is None or not made.figures.stable:
+        return {}
+    hz = case.response.hz
+    L = case.response.G * controller_response(made.controller, hz, case.period)
+    return measured_entry(HZ * hz, L, made.controller, made.bandwidth, made.figures.S_peak)

@@ -104,6 +104,7 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
             f"S_low = {inner.S_low:g}",
         ),
         *_compliance(problem, r),
+        *loop_facts(r),
         (
             "Certificate",
             "passed" if certificate["passed"] else "FAILED",
@@ -115,6 +116,32 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
         *_optimality(r),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]
+
+
+def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
+    """Margins and steps, and what is narrow at the bandwidth; nothing of a run of before."""
+    if "phase_margin_deg" not in r:
+        return []
+
+    def shown(key: str, unit: str, scale: float = 1.0) -> str:
+        return "unlimited" if r[key] is None else f"{number(scale * r[key], 3)}{unit}"
+
+    gain = f"gain × {shown('gain_margin', '')} or ÷ as much"
+    rest = f"delay {shown('delay_margin_us', ' µs')}, modulus {shown('modulus_margin', '')}"
+    found = [
+        ("Margins", f"phase {shown('phase_margin_deg', '°')}",
+         f"{gain}, {rest}; the least of the plants that the controller is made for"),
+        ("Crossover |L| = 1", shown("crossover_hz", " Hz"), "of the model"),
+    ]  # fmt: skip
+    if "step_overshoot" in r:
+        settled = "does not settle" if r["settling_ms"] is None else (
+            f"within 2 % after {number(r['settling_ms'], 3)} ms"
+        )  # fmt: skip
+        found += [
+            ("Step of the reference", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
+            ("Step of force, 1 N", shown("force_step_max", " µm", 1e6), "largest displacement"),
+        ]
+    return found + [("Warning", "narrow", words) for words in r.get("loop_warnings", ())]
 
 
 def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:

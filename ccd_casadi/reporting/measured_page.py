@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.measured import clearances, controller_response
 from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.reporting.facts import Fact
+from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden, shown_rows
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
@@ -117,6 +117,7 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
         ("|S| at ω_low", number(answer["sensitivity_low"]),
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
         ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),
+        *loop_facts(answer),
         ("Largest |KS|", f"{number(answer['KS_max'], 4)} N/m", ""),
     ]  # fmt: skip
     names = {"S_max": "S_max", "S_low": "S_low", "KS": "weighted KS", "T": "weighted T",

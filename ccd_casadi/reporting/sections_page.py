@@ -7,7 +7,14 @@ from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
-from ccd_casadi.reporting.facts import Fact, binding, cost_words, theta_table, theta_words
+from ccd_casadi.reporting.facts import (
+    Fact,
+    binding,
+    cost_words,
+    loop_facts,
+    theta_table,
+    theta_words,
+)
 from ccd_casadi.reporting.glance import glance_of_sections
 from ccd_casadi.reporting.page import (
     Section,
@@ -188,6 +195,7 @@ def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
          f"S_low = {inner.S_low:g}"),
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
+        *loop_facts(r),
         ("Largest |KS|", f"{number(r['KS_max'], 4)} N/m", ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
