@@ -14,7 +14,7 @@ from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import assess, constraints, evaluate, to_theta
+from ccd_casadi.fixed_structure.figures import assess, constraints, curve_levels, to_theta
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import closed_on_zero
@@ -125,10 +125,11 @@ def test_peaks_are_the_suprema_of_dense_grids(
     assert found is not None
     edge = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
     v = np.geomspace(problem.base[0], problem.base[-1], 60001)
+    curves = (*problem.curves, Curve.CROSSING)
+    dense = curve_levels(problem, kappa, tau, curves, np.tile(v, (2, 1)))
     for i in range(2):
-        dense = evaluate(problem, kappa, tau, np.full(len(v), i), v, order=0)
-        for curve in (*problem.curves, Curve.CROSSING):
-            kinds, values = [curve], dense.levels[curve] + problem.margin
+        for curve in curves:
+            kinds, values = [curve], dense[curve][i] + problem.margin
             if curve is Curve.CROSSING or problem.ends_at_crossing(curve):
                 values, kinds = values[v <= edge], [curve, Curve.LEVEL, Curve.CROSSING]
             own = (found.plant == i) & np.isin(found.curve, kinds)

@@ -12,7 +12,7 @@ from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi,
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.figures import evaluate
+from ccd_casadi.fixed_structure.figures import curve_levels
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.modal_sum import modal_sum
@@ -106,13 +106,15 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
     plants = box.plants([(0, point) for point in corner[1:].T])
     problem = problem_for(plants, structure, BOUNDS, sampling)
     own = problem.plants
-    loops = evaluate(problem, in_problem_units(problem, kappa), np.log(bandwidth / own.omega_0),
-                     np.arange(len(plants)), own.variable(corner[0] / own.omega_0))  # fmt: skip
+    curves = (Curve.S_MAX, Curve.SHAPE, Curve.KS, Curve.T, Curve.GS)
+    v = own.variable(corner[0] / own.omega_0)[:, None]
+    tau = float(np.log(bandwidth / own.omega_0))
+    levels = curve_levels(problem, in_problem_units(problem, kappa), tau, curves, v)
     rising = (middle - half)[0] < family.corner
     assert rising.sum() > 10
-    for curve in (Curve.S_MAX, Curve.SHAPE, Curve.KS, Curve.T, Curve.GS):
+    for curve in curves:
         highest = found.highest[found.names.index(curve.name)]
-        value = np.exp(loops.levels[curve]).reshape(count, 4).max(axis=1)
+        value = np.exp(levels[curve]).reshape(count, 4).max(axis=1)
         if curve is Curve.SHAPE:  # beyond it S_max says more
             highest, value = highest[rising], value[rising]
         assert (value <= highest * (1.0 + 1e-9)).all()

@@ -11,7 +11,7 @@ from functools import singledispatch
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import OF_S, evaluate
+from ccd_casadi.fixed_structure.figures import IS_OF_S, loop_rows, to_parameters
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem, Problem
 from ccd_casadi.fixed_structure.structure import second_slopes
 from ccd_casadi.support.arrays import Array
@@ -27,21 +27,18 @@ def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) 
     out = np.zeros((m, n + 1, n + 1))
     if not m:
         return out
-    at = evaluate(problem, kappa, tau, rows.plant, rows.v)
-    T = 1.0 - at.S
-    of_s = np.isin(rows.curve, OF_S)
+    _, slope, S, g = loop_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v)
+    T = 1.0 - S
+    of_s = IS_OF_S[rows.curve]
     second = second_slopes(problem.structure, kappa, 1j * rows.v)
-    g = at.to_kappa
-    weighted = np.where(of_s, -T, at.S)[:, None, None] * second
-    out[:, :n, :n] = (weighted - (at.S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
+    weighted = np.where(of_s, -T, S)[:, None, None] * second
+    out[:, :n, :n] = (weighted - (S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
     slopes, gradients = [], []
     for sign in (1.0, -1.0):
         moved = rows.v * np.exp(sign * STEP)
-        near = evaluate(problem, kappa, tau, rows.plant, moved)
-        slopes.append(_chosen(near.slopes, rows.curve))
-        factor = np.where(of_s, near.S - 1.0, near.S)
-        gradients.append((factor[:, None] * near.to_kappa).real)
-    slope = _chosen(at.slopes, rows.curve)
+        _, near, *parts = loop_rows(problem, kappa, tau, rows.curve, rows.plant, moved)
+        slopes.append(near)
+        gradients.append(to_parameters(rows.curve, *parts))
     c_xx = (slopes[0] - slopes[1]) / (2.0 * STEP)
     c_xk = (gradients[0] - gradients[1]) / (2.0 * STEP)
     end = rows.curve == Curve.CROSSING
@@ -65,9 +62,3 @@ def lagrangian_hessian(
         np.einsum("m,mij->ij", mu[chosen], hessians(problem, kappa, tau, rows.only(chosen)))
     )
 
-
-def _chosen(parts: dict[Curve, Array], curve: np.ndarray) -> Array:
-    out = np.empty(len(curve))
-    for code in np.unique(curve):
-        out[curve == code] = parts[Curve(code)][curve == code]
-    return out

@@ -146,4 +146,4 @@ def _chosen(point: Point, radius: float) -> Constraints:
     assert rows is not None
     slack = rows.value + radius * (np.abs(rows.to_kappa).sum(1) + np.abs(rows.to_tau))
     chosen = np.flatnonzero(slack > 0.0)
-    return rows.only(chosen[np.argsort(-slack[chosen], kind="stable")[: ROWS[-1]]])
+    return rows.only(chosen[np.argsort(-slack[chosen], kind="stable")[: ROWS]])

@@ -7,7 +7,7 @@ the derivative to κ is that of the curve,
     ∂ln|S| = ∂ln|KS| = -Re(S K ∂G),    ∂ln|T| = Re(S ∂G/G)                 (the plant, so θ)
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import singledispatch
 
 import numpy as np
@@ -20,34 +20,16 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     Problem,
     chain_of,
-    log_weights,
-    shaped_at,
 )
-from ccd_casadi.fixed_structure.peak_search import closed_on_zero, frequency_grid
-from ccd_casadi.fixed_structure.structure import (
-    response,
-    response_and_slope,
-    response_and_slopes,
-    roots,
-)
+from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, frequency_grid
+from ccd_casadi.fixed_structure.structure import response, roots
+from ccd_casadi.kernels import sections
+from ccd_casadi.kernels.sections import HALF_POWER as HALF_POWER
 from ccd_casadi.support.arrays import Array
 
 RELEVANT = -1.0  # ln of the share of its bound under which a peak is none of ours
-HALF_POWER = 0.5 * np.log(2.0)
 OF_S = (Curve.S_MAX, Curve.LEVEL, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
-
-
-@dataclass(frozen=True)
-class Loops:
-    """S, K, G, T of some plants at some v, and the slopes of ln|·| to ln v."""
-
-    v: Array
-    which: np.ndarray
-    S: np.ndarray
-    K: np.ndarray
-    to_kappa: np.ndarray
-    levels: dict[Curve, Array]
-    slopes: dict[Curve, Array]
+IS_OF_S = np.isin(list(Curve), OF_S)  # by code
 
 
 @singledispatch
@@ -72,12 +54,10 @@ def assess(
         return Assessment(False, poles, None, None)
     v, regular = frequency_grid(problem, roots(problem.structure, kappa), poles)
     P, k = v.shape
-    which = np.broadcast_to(np.arange(P)[:, None], v.shape)
-    loops = evaluate(problem, kappa, tau, which, v, order=0)
+    levels = curve_levels(problem, kappa, tau, problem.curves, v)
     found, near = [], []
     crossing = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
-    for curve in problem.curves:
-        value = loops.levels[curve]
+    for curve, value in levels.items():
         short = problem.ends_at_crossing(curve)
         if short:
             value = np.where(v <= crossing, value, -np.inf)
@@ -114,89 +94,39 @@ def constraints(
     problem: Problem, kappa: Array, tau: float, curve: np.ndarray, which: np.ndarray, v: Array
 ) -> Constraints:
     """Values and derivatives of these curves of these plants at these v."""
-    loops = evaluate(problem, kappa, tau, which, v)
-    value, to_tau = np.empty(len(v)), np.zeros(len(v))
-    for code in np.unique(curve):
-        chosen = curve == code
-        value[chosen] = loops.levels[Curve(code)][chosen] + problem.margin
-    T = 1.0 - loops.S
-    of_s = np.isin(curve, OF_S)
-    factor = np.where(of_s, -T, loops.S)
-    to_kappa = (factor[:, None] * loops.to_kappa).real
-    to_tau[curve == Curve.SHAPE] = 1.0
+    value, slope, S, g = loop_rows(problem, kappa, tau, curve, which, v)
+    to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
     end = curve == Curve.CROSSING
-    to_tau[end] = (loops.slopes[Curve.CROSSING] / chain_of(problem, v))[end]
-    return Constraints(curve, which, v, value, to_kappa, to_tau)
+    to_tau[end] = (slope / chain_of(problem, v))[end]
+    to_kappa = to_parameters(curve, S, g)
+    return Constraints(curve, which, v, value + problem.margin, to_kappa, to_tau)
 
 
-def evaluate(
-    problem: Problem, kappa: Array, tau: float, which: np.ndarray, v: Array, *, order: int = 2
-) -> Loops:
-    """All curves of the plants `which` at v (any one shape), relative to their bounds.
+def loop_rows(
+    problem: Problem, kappa: Array, tau: float, curve: np.ndarray, which: np.ndarray, v: Array
+) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+    """Values, slopes to ln v, S, and g = ∂ln K/∂κ (M, n) of these rows."""
+    found: tuple[Array, Array, np.ndarray, np.ndarray] = sections.rows(
+        curve, problem.factors, np.exp(kappa), *problem.modes, np.ascontiguousarray(which), v,
+        problem.limits(tau),
+    )  # fmt: skip
+    return found
 
-    `order` 0: levels only, 1: slopes to ln v only, 2: both, and ∂ln K/∂κ.
-    """
-    plants, bounds = problem.plants, problem.bounds
-    s = 1j * v
-    to_kappa = np.zeros((*v.shape, 0))
-    K_slope: np.ndarray = np.zeros(())
-    if order == 0:
-        K = response(problem.structure, kappa, s)
-    elif order == 1:
-        K, K_slope = response_and_slope(problem.structure, kappa, s)
-    else:
-        K, to_kappa, K_slope = response_and_slopes(problem.structure, kappa, s)
-    if order == 0:
-        G, dG = plants.values(which, v), np.zeros(())
-    else:
-        G, dG = plants.responses(which, v)
-    L = G * K
-    S = 1.0 / (1.0 + L)
-    omega = plants.frequency(v)
-    weighted, compliant = Curve.KS in problem.curves, bounds.compliance_max is not None
-    levels: dict[Curve, Array] = {}
-    gradients: dict[Curve, Array] = {}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shaped = shaped_at(problem, omega)
-        if weighted:
-            assert bounds.weights is not None
-            W, dW = log_weights(bounds.weights, omega * plants.omega_0)
-        if compliant and order == 0:
-            free, free_slope = plants.values(which, v, free=True), np.zeros(())
-        elif compliant:
-            free, free_slope = plants.free_responses(which, v)
-        if order != 1:
-            ln_S = np.log(np.abs(S))
-            levels = {
-                Curve.S_MAX: ln_S - np.log(bounds.S_max),
-                Curve.S_LOW: ln_S - np.log(bounds.S_low),
-                Curve.CROSSING: ln_S + HALF_POWER,
-                Curve.LEVEL: ln_S + HALF_POWER,
-            }
-            if bounds.shape is not None:
-                under = np.log(bounds.shape * shaped) - tau
-                levels[Curve.SHAPE] = ln_S + HALF_POWER - under
-            if bounds.weighted_level is not None:
-                ln_level = np.log(bounds.weighted_level)
-                ln_K, ln_L = np.log(np.abs(K)), np.log(np.abs(L))
-                levels[Curve.KS] = ln_K + ln_S + W[0] + np.log(plants.force) - ln_level
-                levels[Curve.T] = ln_L + ln_S + W[1] - ln_level
-            if bounds.compliance_max is not None:
-                ceiling = np.log(bounds.compliance_max * plants.force)
-                levels[Curve.GS] = np.log(np.abs(free)) + ln_S - ceiling
-        if order:
-            chain = chain_of(problem, v)
-            slope = -(S * (K * dG + L * K_slope)).real
-            gradients = dict.fromkeys(
-                (Curve.S_MAX, Curve.S_LOW, Curve.CROSSING, Curve.LEVEL), slope
-            )
-            gradients[Curve.SHAPE] = slope - (shaped == omega) * chain
-            if weighted:
-                gradients[Curve.KS] = K_slope.real + slope + dW[0] * chain
-                gradients[Curve.T] = (K_slope + dG / G).real + slope + dW[1] * chain
-            if compliant:
-                gradients[Curve.GS] = (free_slope / free).real + slope
-    return Loops(v, which, S, K, to_kappa, levels, gradients)
+
+def to_parameters(curve: np.ndarray, S: np.ndarray, g: np.ndarray) -> Array:
+    """∂c/∂κ (M, n) at fixed frequencies."""
+    factor = np.where(IS_OF_S[curve], S - 1.0, S)
+    return np.asarray((factor[:, None] * g).real)
+
+
+def curve_levels(
+    problem: Problem, kappa: Array, tau: float, curves: Sequence[Curve], v: Array
+) -> dict[Curve, Array]:
+    """The curves of all plants at v (P, k), relative to their bounds; without the margin."""
+    codes = np.array(curves, np.int64)
+    values = sections.levels(codes, problem.factors, np.exp(kappa), *problem.modes, v,
+                             problem.limits(tau))  # fmt: skip
+    return dict(zip(curves, values, strict=True))
 
 
 @singledispatch
@@ -206,13 +136,14 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
     plants = problem.plants
     count = plants.plants[0].dA.shape[0]
     out = np.zeros((len(found.v), count))
-    loops = evaluate(problem, kappa, 0.0, found.plant, found.v)
-    G, _ = plants.responses(found.plant, found.v)
-    free, _ = plants.free_responses(found.plant, found.v)
+    G = plants.values(found.plant, found.v)
+    K_all = response(problem.structure, kappa, 1j * found.v)
+    S_all = 1.0 / (1.0 + G * K_all)
+    free = plants.values(found.plant, found.v, free=True)
     for i in np.unique(found.plant):
         at = np.flatnonzero(found.plant == i)
         dG = plants.to_theta(int(i), found.v[at])
-        S, K = loops.S[at][:, None], loops.K[at][:, None]
+        S, K = S_all[at][:, None], K_all[at][:, None]
         loss = -(S * K * dG).real
         of_t = (found.curve[at] == Curve.T)[:, None]
         out[at] = loss + np.where(of_t, (dG / G[at][:, None]).real, 0.0)
@@ -233,12 +164,9 @@ def _closed(
     low: Array,
     high: Array,
 ) -> tuple[Array, np.ndarray]:
-    def slope(x: Array, of: np.ndarray) -> Array:
-        loops = evaluate(problem, kappa, tau, which[of], np.exp(x), order=1)
-        out = np.empty(len(x))
-        for code in np.unique(curve[of]):
-            chosen = curve[of] == code
-            out[chosen] = loops.slopes[Curve(code)][chosen]
-        return out
-
-    return closed_on_zero(slope, start, low, high)
+    tolerances = (FLAT, NARROW, float(CLOSINGS))
+    found: tuple[Array, np.ndarray] = sections.close(
+        curve, problem.factors, np.exp(kappa), *problem.modes, which, start, low, high,
+        problem.limits(tau), tolerances,
+    )  # fmt: skip
+    return found

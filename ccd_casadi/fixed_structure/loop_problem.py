@@ -10,7 +10,6 @@ A constraint is c(κ, τ) <= 0 with τ = ln ω_b.
 """
 
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
@@ -21,24 +20,12 @@ from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.structure import (
     Structure,
 )
+from ccd_casadi.kernels.sections import Curve, Limit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
 PER_DECADE = 24
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
-
-
-class Curve(IntEnum):
-    """What is bounded."""
-
-    S_MAX = 0
-    SHAPE = 1
-    S_LOW = 2
-    KS = 3
-    T = 4
-    GS = 5
-    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
-    LEVEL = 7  # |S| <= 1/√2 below ω_b
 
 
 @dataclass(frozen=True)
@@ -103,9 +90,40 @@ class LoopProblem:
 
 @dataclass(frozen=True)
 class Problem(LoopProblem):
-    """That of SISO plants."""
+    """That of SISO plants, with what its kernels take (`kernels.sections`)."""
 
     structure: Structure
+
+    @cached_property
+    def factors(self) -> np.ndarray:
+        """Those of the structure."""
+        return self.structure.factors
+
+    @cached_property
+    def modes(self) -> tuple[tuple[np.ndarray, ...], float, float]:
+        """The plants' modes, T (0: continuous) and whole periods of delay."""
+        P = self.plants
+        if P.period is None:
+            return (P.poles, P.residues, P.poles, P.poles, P.poles), 0.0, 0.0
+        d, late, early, grown = P.held
+        return (P.poles, P.residues, late, early, grown), P.period, float(d[0])
+
+    def limits(self, tau: float) -> Array:
+        """What the curves are held against at ω_b = e^τ; infinite where nothing bounds one."""
+        b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
+        found = np.zeros(Limit.COUNT)
+        found[Limit.S_MAX], found[Limit.S_LOW] = np.log(b.S_max), np.log(b.S_low)
+        found[Limit.SHAPE] = np.inf if b.shape is None else np.log(b.shape) - tau
+        found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
+        if b.weights is not None and b.weighted_level is not None:
+            w, level = b.weights, np.log(b.weighted_level)
+            found[Limit.KS] = level - np.log(w.c_K / w.M_K * force)
+            found[Limit.T] = level + np.log(w.A_u)
+            roots = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
+            found[Limit.KS_ZERO : Limit.COUNT] = np.array(roots) / w0
+        if b.compliance_max is not None:
+            found[Limit.GS] = np.log(b.compliance_max * force)
+        return found
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.descent import Point, descend
+from ccd_casadi.fixed_structure.figures import HALF_POWER, IS_OF_S
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
     MeasuredFigures,
@@ -37,10 +38,8 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
-HALF_POWER = 0.5 * np.log(2.0)
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 RELEVANT = -1.0  # ln of a figure over its bound below which a line is none of ours
-OF_S = (Curve.S_MAX, Curve.SHAPE, Curve.S_LOW, Curve.CROSSING, Curve.GS)
 RACED = 4  # starts that climb
 SHORT = 0.05  # of ω over a crossover that a start aims at: its bandwidth at first
 
@@ -218,7 +217,7 @@ class _OnLines:
         K, g, _ = response_and_slopes(self.structure, point.kappa, s)
         S = 1.0 / (1.0 + self.G[rows.plant] * K)
         T = 1.0 - S
-        weight = mu * np.where(np.isin(rows.curve, OF_S), -T, S)
+        weight = mu * np.where(IS_OF_S[rows.curve], -T, S)
         second = second_slopes(self.structure, point.kappa, s)
         out[:n, :n] = np.einsum("m,mij->ij", weight, second).real
         out[:n, :n] -= np.einsum("m,mi,mj->ij", mu * S * T, g, g).real

@@ -5,8 +5,7 @@
 p = (d, δ), with all local peaks and the grid values near their bounds as rows. H is the Hessian of
 the Lagrangian with the multipliers of the linear programme (H = 0), made convex. A step counts only
 where every closed loop stays stable, and where τ - ρ max(0, max c) rises: the exact penalty
-function of the largest violation. (Fletcher & Sainz de la Maza 1989.) The programmes are solved by
-CasADi's DAQP, or by its interior-point method where that one fails.
+function of the largest violation. (Fletcher & Sainz de la Maza 1989.)
 """
 
 from dataclasses import dataclass
@@ -211,6 +210,6 @@ def _rows(found: Assessment, radius: float) -> tuple[Constraints, np.ndarray]:
     reach = radius * (np.abs(joint.to_kappa).sum(1) + np.abs(joint.to_tau))
     slack = joint.value + reach
     chosen = np.flatnonzero(slack > 0.0)
-    if len(chosen) > ROWS[-1]:
-        chosen = chosen[np.argsort(-slack[chosen])[: ROWS[-1]]]
+    if len(chosen) > ROWS:
+        chosen = chosen[np.argsort(-slack[chosen])[: ROWS]]
     return joint.only(chosen), chosen < len(found.peaks.v)

@@ -71,6 +71,18 @@ def compile_part(part: str) -> None:
         gamma.gamma_lower_bound(G, w, grid, np.ones(41))
         squared_weights(w, grid)
         sensitivity.axis_frequencies(A, B, C, none, 1.0)
+        _compile_sections()
+
+
+def _compile_sections() -> None:
+    from ccd_casadi.kernels import sections
+
+    pole = np.array([[-1.0 + 1.0j]])
+    loop = (np.zeros((1, 3), np.int64), np.ones(2), (pole, pole, pole, pole, pole), 0.0, 0.0)
+    one, first, limits = np.ones(1), np.zeros(1, np.int64), np.ones(int(sections.Limit.COUNT))
+    sections.rows(first, *loop, first, one, limits)
+    sections.levels(first, *loop, np.ones((1, 1)), limits)
+    sections.close(first, *loop, first, one, one, one, limits, (1e-9, 1e-6, 40.0))
 
 
 def ensure_compiled() -> None:

@@ -10,9 +10,9 @@ from ccd_casadi.analysis.loop_figures import force_step
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.composite import CompositeProblem, largest_gains
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import evaluate
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
@@ -74,10 +74,10 @@ def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDes
         return Loops(omega / HZ, S, KS * P.force, T, np.zeros((0, len(v))))
     assert isinstance(inside, Problem)
     which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
-    tau = float(np.log(made.bandwidth / P.omega_0))
-    found = evaluate(inside, kappa, tau, which, grid, order=0)
-    L = 1.0 / found.S - 1.0
-    return Loops(omega / HZ, found.S, found.K * P.force * found.S, 1.0 - found.S, L)
+    K = response(inside.structure, kappa, 1j * v)
+    L = P.values(which, grid) * K
+    S = 1.0 / (1.0 + L)
+    return Loops(omega / HZ, S, K * P.force * S, 1.0 - S, L)
 
 
 def compared_html(
