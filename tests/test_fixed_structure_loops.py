@@ -14,7 +14,13 @@ from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
 from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import assess, constraints, curve_levels, to_theta
+from ccd_casadi.fixed_structure.figures import (
+    assess,
+    constraints,
+    curve_levels,
+    loop_rows,
+    to_theta,
+)
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import closed_on_zero
@@ -280,3 +286,15 @@ def test_a_peak_is_closed_in_on_however_flat_one_side_of_it_is(power: int, mirro
                                  np.exp([max(0.0, mirror)]))  # fmt: skip
     assert closed.all()
     assert mirror * np.log(top) == pytest.approx(least ** (1.0 / power), abs=1e-6)
+
+
+def test_a_plant_that_answers_nothing_raises_nothing() -> None:
+    """G = 0 at a frequency: curves of it are -inf, and no division is an error."""
+    problem, kappa = loop(0, Structure())
+    silence = replace(problem.plants, residues=0.0 * problem.plants.residues)
+    silent = replace(problem, plants=silence)
+    v = np.geomspace(0.01, 1.0, 5)
+    found = curve_levels(silent, kappa, 0.0, silent.curves, np.tile(v, (1, 1)))
+    assert (found[Curve.T] == -np.inf).all()
+    rows = np.full(5, int(Curve.T))
+    assert not np.isfinite(loop_rows(silent, kappa, 0.0, rows, np.zeros(5, int), v)[1]).any()

@@ -78,7 +78,8 @@ def _compile_sections() -> None:
     from ccd_casadi.kernels import sections
 
     pole = np.array([[-1.0 + 1.0j]])
-    loop = (np.zeros((1, 3), np.int64), np.ones(2), (pole, pole, pole, pole, pole), 0.0, 0.0)
+    modes = (pole, 0.1 * pole, pole, pole, pole)
+    loop = (np.zeros((1, 3), np.int64), np.ones(2), modes, 0.0, 0.0)
     one, first, limits = np.ones(1), np.zeros(1, np.int64), np.ones(int(sections.Limit.COUNT))
     sections.rows(first, *loop, first, one, limits)
     sections.levels(first, *loop, np.ones((1, 1)), limits)

@@ -145,6 +145,14 @@ def _expm1(x):
 
 
 @compiled
+def _over(a, b):
+    """a/b, not finite where b is 0 (Numba's own division raises there)."""
+    size = b.real * b.real + b.imag * b.imag
+    c = a * b.conjugate()
+    return complex(c.real / size, c.imag / size)
+
+
+@compiled
 def _offset(curve, ω, chain, limits):
     """What is added to the logarithm of a curve, and its slope to ln v."""
     if curve == S_MAX:
@@ -181,7 +189,7 @@ def _curve(curve, factors, values, modes, T, d, i, v, limits, g):
     """Value and slope to ln v of one curve; S; fills g."""
     K, K_slope = controller(factors, values, complex(0.0, v), g)
     G, dG, free, dfree = plant(modes, T, d, i, v)
-    S = 1.0 / (1.0 + G * K)
+    S = _over(1.0 + 0.0j, 1.0 + G * K)
     ω, chain = _warped(T, v)
     offset, offset_slope = _offset(curve, ω, chain, limits)
     value = np.log(abs(S)) + offset
@@ -191,10 +199,10 @@ def _curve(curve, factors, values, modes, T, d, i, v, limits, g):
         slope += K_slope.real
     elif curve == T_:
         value += np.log(abs(G * K))
-        slope += (K_slope + dG / G).real
+        slope += (K_slope + _over(dG, G)).real
     elif curve == GS:
         value += np.log(abs(free))
-        slope += (dfree / free).real
+        slope += _over(dfree, free).real
     return value, slope, S
 
 
@@ -220,7 +228,7 @@ def levels(curves, factors, values, modes, T, d, v, limits):
         for k in range(count):
             K = gain(factors, values, complex(0.0, v[i, k]))
             G, _, free, _ = plant(modes, T, d, i, v[i, k])
-            S = np.log(abs(1.0 / (1.0 + G * K)))
+            S = -np.log(abs(1.0 + G * K))
             ω, chain = _warped(T, v[i, k])
             for c in range(curves.size):
                 value = S + _offset(curves[c], ω, chain, limits)[0]
