@@ -64,7 +64,7 @@ def test_the_table_of_the_docs(
     else:
         problem, made = prepared(problem_of(parse_case(case(tilt, plants), CASE)))
     assert made.certified
-    found = design_dict(problem, made)
+    found = design_dict(problem, problem.start, made)
     own = found["channel_bounds"][0]
     figures = found["bandwidth_hz"], own["sensitivity_peak"], own["bandwidth_hz"]
     shown = f"{figures[0]:.2f} Hz", f"{figures[1]:.3f}", f"{figures[2]:.1f} Hz"

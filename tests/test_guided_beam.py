@@ -14,6 +14,7 @@ from ccd_casadi.codesign.sections_direct import polish_sections
 from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_truth import TrueBandwidth
+from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, prepared, sections_value
 from ccd_casadi.plants.plant import constraint_values
@@ -63,7 +64,8 @@ def test_a_double_pole_does_not_spoil_the_judge() -> None:
 def anchored() -> CoDesignProblem:
     problem = problem_of(load_case(CASE))
     assert problem.sections is not None
-    few = replace(problem.sections, starts=4)
+    # where |S| may leap at ω_b the optimum lies on a kink
+    few = replace(problem.sections, starts=4, shape_ends=ShapeEnd.CROSSING)
     found, made = prepared(replace(problem, sections=few))
     assert made.certified
     return found

@@ -74,11 +74,11 @@ class Bounds:
     S_low: float
     omega_low: float
     shape: float | None = None
-    shape_ends: ShapeEnd = ShapeEnd.S_MAX
     weighted_level: float | None = None
     weights: Weights | None = None
     compliance_max: float | None = None
     channels: tuple[ChannelBounds, ...] = ()
+    shape_ends: ShapeEnd = ShapeEnd.S_MAX
 
     def __post_init__(self) -> None:
         if not self.S_max > 1.0:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
@@ -18,6 +19,11 @@ from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 
 FITS = 6
+# Two biquads at a resonance: (root, over its frequency, damping), first a lag, then a lead.
+SKEWED = (
+    (("zeros", 0.93, 0.07), ("poles", 0.8, 0.1)),
+    (("zeros", 0.95, 0.07), ("poles", 1.1, 0.2)),
+)
 
 
 def resonances(problem: Problem) -> Array:
@@ -33,16 +39,20 @@ def resonances(problem: Problem) -> Array:
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
-    Notches come narrow and wide, and shifted to either side; of several biquads the last one is a
-    filter at the crossover too.
+    Notches come narrow and wide, and shifted to either side. Of several biquads two are skewed
+    notches at the first resonance too, which turn its circle away from -1; where the shape ends at
+    ω_b the last one is a filter at the crossover instead.
     """
     tops, count = resonances(problem), problem.structure.biquads
     shapes = [(0.5, 1.0, 0.0), (1.0, 1.0, 0.0), (0.5, 0.8, 0.0), (0.5, 1.25, 0.0)]
-    if count > 1:
+    narrow = problem.bounds.shape is None or problem.bounds.shape_ends is ShapeEnd.CROSSING
+    if count > 1 and narrow:
         shapes += [(1.0, 1.0, 0.7), (1.0, 1.0, 1.0)]
+    elif count > 1 and len(tops):
+        shapes.append((0.5, 1.0, 0.0))  # the notches beyond the skewed ones
     found = []
     for crossover in crossovers:
-        for width, below, filtered in shapes:
+        for turn, (width, below, filtered) in enumerate(shapes):
             values = _around(problem, float(crossover), np.random.default_rng(0), 0.0)
             for i in range(count):
                 notch = tops[i % len(tops)] if len(tops) else 4.0 * crossover
@@ -50,6 +60,11 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
                 values[f"biquad {i + 1} zeros damping"] = 0.1
                 values[f"biquad {i + 1} poles"] = notch * below
                 values[f"biquad {i + 1} poles damping"] = width
+            if turn == 4 and not filtered:
+                for i, roots in enumerate(SKEWED, 1):
+                    for root, ratio, damping in roots:
+                        values[f"biquad {i} {root}"] = ratio * tops[0]
+                        values[f"biquad {i} {root} damping"] = damping
             if filtered:  # the last one lifts |L| just below the crossover, where S rises
                 values[f"biquad {count} zeros"] = 1.02 * filtered * crossover
                 values[f"biquad {count} poles"] = filtered * crossover
