@@ -34,6 +34,7 @@ from ccd_casadi.plants.plant import constraint_values, hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
@@ -90,7 +91,7 @@ def look_over_box(
     """
     problem = sampler.problem
     quantities = TrueQuantities(problem, sampler.record)
-    if processes and _may_jump(sampler, x):
+    if processes and _may_jump(problem, x, quantities.at(x)):
         processes = ()
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
@@ -208,12 +209,12 @@ def _spread(
     return known, passed_over
 
 
-def _may_jump(sampler: Sampler, x: Array) -> bool:
+def _may_jump(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Whether a local maximum of S at x is near -3 dB: there ω_b jumps, and surrogates do not."""
-    problem = sampler.problem
     peaks = local_peaks_with_gradients(
         scaled_plant(problem, tuple(x[:-2])),
-        problem.weights.at(float(np.exp(x[-2])), float(np.exp(x[-1]))),
+        problem.weights.at(design.figures.omega_S, design.figures.omega_T),
+        design,
         gamma_backoff=problem.inner.gamma_backoff,
         least=float(np.exp(HALF_POWER - NEAR_SHELF)),
     )

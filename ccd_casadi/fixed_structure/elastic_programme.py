@@ -6,23 +6,16 @@ It always has a solution: σ is by how much the linear model leaves its bounds p
 Fletcher 1987, section 12.4).
 """
 
-from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
+from ccd_casadi.optim.quadratic import solve_quadratic
 from ccd_casadi.support.arrays import Array
 
 ROWS = (64, 128, 256, 400)  # sizes of programmes, so that few solvers are made
 FLAT = 1e-4  # least curvature, which leaves a linear programme one
-KEPT = 1e-7  # by how much a programme's answer may miss its own rows
 LARGEST = 1e4  # of σ
-# The dual active-set method is fast, the interior-point method misses nothing.
-OPTIONS: dict[str, dict[str, Any]] = {
-    "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}},
-    "ipqp": {"print_iter": False, "print_header": False, "print_info": False},
-}
 
 
 class Answer(NamedTuple):
@@ -46,18 +39,6 @@ def solve_elastic(
     upper[:m] = -value
     H = np.zeros((n + 1, n + 1))
     H[:n, :n], H[n, n] = hessian, FLAT
-    for name in ("daqp", "ipqp"):
-        solver = _solver(name, n + 1, size)
-        found = solver(h=H, g=np.append(cost, penalty), a=A, lba=-np.inf, uba=upper,
-                       lbx=np.append(low, 0.0), ubx=np.append(high, LARGEST))  # fmt: skip
-        x = np.array(found["x"]).ravel()
-        if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
-            mu = np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
-            return Answer(x[:n], mu, -float(found["cost"]))
-    return None
-
-
-@lru_cache(maxsize=64)
-def _solver(name: str, n: int, rows: int) -> ca.Function:
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-    return ca.conic("programme", name, shapes, {"error_on_fail": False, **OPTIONS[name]})
+    bounds = np.append(low, 0.0), np.append(high, LARGEST)
+    found = solve_quadratic(H, np.append(cost, penalty), A, upper, *bounds)
+    return None if found is None else Answer(found.x[:n], found.multipliers[:m], -found.value)
