@@ -28,9 +28,10 @@ from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -154,7 +155,7 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
         for end in (lower[i], upper[i])
         if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
     ]
-    allowed = [x for x in found if (constraint_values(plant_of(problem), x) <= 0.0).all()]
+    allowed = [x for x in found if not unmet(problem, x)]
     return np.array(allowed).reshape(-1, len(theta))
 
 
@@ -188,9 +189,8 @@ def _spread(
     known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
     passed_over = 0
     if len(known) < points:
-        plant = plant_of(sampler.problem)
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
-        more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
+        more = [theta for theta in spread if not unmet(sampler.problem, theta)]
         solve: list[Array] = list(more)
         if more and len(processes) > 1 and _trustworthy(processes, seed):
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
@@ -289,7 +289,7 @@ def _starts(
 
 
 def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
-    return bool((constraint_values(plant_of(problem), sample.theta) <= 1e-9).all())
+    return not unmet(problem, sample.theta)
 
 
 def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:

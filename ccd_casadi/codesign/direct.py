@@ -20,9 +20,10 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.peak_constraints import other_peaks
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -169,8 +170,7 @@ def _terms(problem: CoDesignProblem, x: Array, design: Sensitivities) -> tuple[f
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
-    lam = constraint_values(plant_of(problem), x[: len(problem.names)])
-    return problem.inner.feasible(design.figures) and bool((lam <= 1e-9).all())
+    return problem.inner.feasible(design.figures) and not unmet(problem, x[: len(problem.names)])
 
 
 def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:

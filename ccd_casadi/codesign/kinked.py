@@ -16,6 +16,7 @@ import numpy as np
 from ccd_casadi.codesign.kkt import lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, SAME_PEAK, other_peaks
+from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.quadratic import solve_quadratic
@@ -139,8 +140,9 @@ def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) 
     if not design.figures.certified or design.made is None:
         return None
     gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
-    g = g.copy()
-    g[: len(problem.inner.bounds)] += INSIDE
+    first, sizes = len(problem.inner.bounds), constraint_sizes(problem)
+    g = np.append(g[:first] + INSIDE, g[first:] / sizes)
+    jacobian = np.vstack([jacobian[:first], jacobian[first:] / sizes[:, None]])
     peaks = other_peaks(problem, x, design, BAND)
     tags = [(name, 0.0, 0) for name in names]
     place = float(np.log(design.figures.sensitivity_peak_frequency))

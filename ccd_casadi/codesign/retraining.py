@@ -32,9 +32,9 @@ from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.codesign.sections_run import conclude_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
+from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
-from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
@@ -232,9 +232,7 @@ def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.
     levels = problem.inner.levels
     y = ca.MX.sym("y", 1 if nested else 1 + len(levels))
     f, lam = plant.hardware(x[:count])
-    middle = np.array([problem.lower, problem.start, problem.upper])
-    sizes = np.array([np.abs(constraint_values(plant, theta)) for theta in middle])
-    g = lam / ca.DM(np.maximum(sizes.max(axis=0), 1e-300)) if lam.numel() else ca.MX(0, 1)
+    g = lam / ca.DM(constraint_sizes(problem)) if lam.numel() else ca.MX(0, 1)
     if not nested:
         g = ca.vertcat(y[1:] - levels, g)
     J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import (
@@ -147,17 +148,16 @@ class Sampler:
         self.store.put([sample], self.hash)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
 
-    def _spend(self, key: str, count: int, theta: tuple[float, ...], bandwidth: float) -> None:
+    def _spend(self, key: str, count: int, theta: tuple[float, ...], value: float) -> None:
         """Count a unit once, and keep what it was worth: NaN where it is not feasible."""
         if key in self._spent:
             return
         self._spent[key] = count
         objective = np.nan
-        plant = plant_of(self.problem)
-        if np.isfinite(bandwidth) and (constraint_values(plant, theta) <= 1e-9).all():
-            cost = hardware_cost(plant, theta)
-            objective = self.problem.w1 * cost + self.problem.w2 * bandwidth
-        self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(objective)))
+        if np.isfinite(value) and not unmet(self.problem, theta):
+            cost = hardware_cost(plant_of(self.problem), theta)
+            objective = self.problem.w1 * cost + self.problem.w2 * value
+        self.trace.append(TraceEntry(self.syntheses, theta, float(value), float(objective)))
 
     def _meets(self, sample: Sample) -> bool:
         return sample.certified and self.problem.inner.excess(sample) <= 0.0
