@@ -1,6 +1,8 @@
 """Local peaks of S as constraints: each stands among the rows once, and none costs a synthesis."""
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,13 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign import peak_constraints
+from ccd_casadi.codesign.box_look import look_over_box
 from ccd_casadi.codesign.direct import objective
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
-from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.codesign.verify import verify
+from ccd_casadi.inner_problem import true_function
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.synthesis import derivatives, peaks
 from ccd_casadi.synthesis.peaks import LocalPeak, local_peaks_with_gradients
 
@@ -88,3 +96,23 @@ def test_a_descent_synthesises_every_design_once(
     J = [objective(case, x, quantities.at(x)) for x in (start, end)]
     assert J[1] < J[0]
     assert len(calls) == len(quantities.designs)
+
+
+def test_a_verification_synthesises_every_design_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Polish, verification and the look over the box ask the same truth."""
+    asked: list[tuple] = []
+    real = true_function.true_design
+
+    def counted(problem: CoDesignProblem, *where: Any) -> object:
+        asked.append(where)
+        return real(problem, *where)
+
+    monkeypatch.setattr(true_function, "true_design", counted)
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        sampler = Sampler(problem(), store, Workers(1))
+        verified = verify(sampler, at((62.0, 64.0, 500.0, 45.0)))
+        look_over_box(sampler, verified.x, verified.objective, 4, 0)
+    assert verified.feasible
+    assert len(set(asked)) == len(asked)

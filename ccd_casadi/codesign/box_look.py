@@ -30,7 +30,6 @@ from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -91,7 +90,7 @@ def look_over_box(
     `processes`: surrogates of ω_b, ln‖S‖∞ and ln|S(jω_low)| over x, where there are any.
     """
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     if processes and _may_jump(problem, x, quantities.at(x)):
         processes = ()
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
@@ -162,7 +161,7 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
 def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     lower, upper = box(problem)
     ends = []
     for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
@@ -294,4 +293,4 @@ def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
 
 def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.bandwidth
+    return problem.w1 * cost + problem.w2 * sample.value

@@ -54,7 +54,7 @@ class Direct:
 def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
     """IPOPT on the true problem from the case's start and a Sobol set of starts."""
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     program = lifted_program(problem, quantities, exact_hessian=False)
     lower, upper = lifted_bounds(problem)
     middle = 0.5 * (lower + upper)
@@ -85,9 +85,8 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     A descent past kinks, IPOPT where that leaves a residual, then Newton's steps. Returns the
     start itself where none of them finds better that is certified and feasible.
     """
-    quantities = TrueQuantities(sampler.problem, sampler.record)
-    x, design, solution = _descended(sampler.problem, quantities, x)
-    return *_settled(sampler.problem, quantities, x, design), solution
+    x, design, solution = _descended(sampler.problem, sampler.truth, x)
+    return *_settled(sampler.problem, sampler.truth, x, design), solution
 
 
 def _descended(

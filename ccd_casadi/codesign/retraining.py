@@ -96,7 +96,7 @@ class CoDesignTruth:
         problem = sampler.problem
         self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
         self.write_page = write_page
-        self.formulation = "nested" if formulation == "nested" else "lifted"
+        self.formulation = formulation
         self.structured = problem.sections is not None
         self.nested = self.structured or formulation == "nested"  # x = θ
         self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
@@ -104,7 +104,8 @@ class CoDesignTruth:
         self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
         self.tolerance = case.outer.tolerance if tolerance is None else tolerance
         self.objective, self.constraints = _functions(problem, self.nested)
-        self.describe = {"formulation": self.formulation, "outputs": list(self.outputs)}
+        form = "nested" if formulation == "nested" else "lifted"  # direct has no surrogates
+        self.describe = {"formulation": form, "outputs": list(self.outputs)}
 
     @property
     def spent(self) -> int:
@@ -205,7 +206,7 @@ class CoDesignTruth:
     def _bandwidths(self, samples: list[BandwidthSample]) -> Observations:
         d = len(self.lower)
         X = np.array([s.theta for s in samples]).reshape(-1, d)
-        Y = np.array([[s.bandwidth] for s in samples]).reshape(-1, 1)
+        Y = np.array([[s.value] for s in samples]).reshape(-1, 1)
         if self.formulation == "nested":
             return Observations(X, Y)
         dY = np.array([s.gradient for s in samples]).reshape(-1, 1, d)

@@ -70,7 +70,7 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     """Polish x on the true problem, ask the global inner problem there, certify what results."""
     problem = sampler.problem
     count = len(problem.names)
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
@@ -113,7 +113,7 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         design=final,
         objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
         hardware_cost=cost,
-        active=_active(problem, x, final.figures),
+        active=_active(problem, quantities, x, final.figures),
         kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
         inner_gap=float(gap),
         feasible=acceptable(problem, x, design),
@@ -164,8 +164,10 @@ def _snapped(problem: CoDesignProblem, x: Array) -> Array:
     return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)
 
 
-def _active(problem: CoDesignProblem, x: Array, figures: DesignFigures) -> tuple[str, ...]:
-    program = lifted_program(problem, TrueQuantities(problem), exact_hessian=False)
+def _active(
+    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, figures: DesignFigures
+) -> tuple[str, ...]:
+    program = lifted_program(problem, quantities, exact_hessian=False)
     bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
     extra = touched(problem, x[: len(problem.names)])
     return (*bounds, *active_constraints(problem.inner, figures), *extra)
