@@ -202,7 +202,7 @@ def _step(here: _Point, H: Array, radius: float, rho: float, bend: float) -> _St
     A = np.hstack([here.jacobian, -np.eye(m)])
     low = np.append(np.maximum(-1.0, -here.z / radius), np.zeros(m))
     high = np.append(np.minimum(1.0, (1.0 - here.z) / radius), np.full(m, np.inf))
-    found = solve_quadratic(hessian, linear, A, -g / radius, low, high)
+    found = solve_quadratic(hessian, linear, A, -g / radius, low, high, singular=True)
     if found is None:
         return None
     d = radius * np.clip(found.x[:n], low[:n], high[:n])

@@ -16,6 +16,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}},
     "ipqp": {"print_iter": False, "print_header": False, "print_info": False},
 }
+# Where H may be nearly singular: an LDL factorisation then warns on the terminal.
+SINGULAR = {"linear_solver": "qr"}
 
 
 class Answer(NamedTuple):
@@ -27,15 +29,16 @@ class Answer(NamedTuple):
 
 
 def solve_quadratic(
-    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array
+    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array, *, singular: bool = False
 ) -> Answer | None:
     """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper; bounds may be infinite.
 
-    None where neither solver keeps the rows of A (m, n), which tells nothing of x.
+    None where neither solver keeps the rows of A (m, n), which tells nothing of x. `singular`: H
+    may be nearly so.
     """
     rows, n = A.shape
     for name in OPTIONS:
-        solver = _solver(name, n, rows)
+        solver = _solver(name, n, rows, singular and name == "ipqp")
         found = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
         x = np.array(found["x"]).ravel()
         missed = max((low - x).max(), (x - high).max())
@@ -47,6 +50,7 @@ def solve_quadratic(
 
 
 @lru_cache(maxsize=256)
-def _solver(name: str, n: int, rows: int) -> ca.Function:
+def _solver(name: str, n: int, rows: int, singular: bool) -> ca.Function:
     shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-    return ca.conic("programme", name, shapes, {"error_on_fail": False, **OPTIONS[name]})
+    options = {"error_on_fail": False, **OPTIONS[name], **(SINGULAR if singular else {})}
+    return ca.conic("programme", name, shapes, options)
