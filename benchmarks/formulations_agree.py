@@ -6,11 +6,17 @@ lines of the verdict that did not pass, how many problems agree within 0.1 %, an
 that is worse by more is called verified. `--grid N` compares those of the first N problems of two
 parameters with true inner problems on a grid over θ. What the file of `--out` holds already is not
 computed again.
+
+With `--kinds` the chains are in turn of every kind of mixed sensitivity (with the reference alone,
+with disturbances, on a robust set, with a bound on the compliance), `--formulations lifted direct`
+leaves nested out. Printed last is the share of designs that are not verified, by the line of the
+verdict that failed.
 """
 
 import argparse
 import json
 from collections import Counter
+from dataclasses import replace
 from itertools import count, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,10 +28,30 @@ from chain_plants import chain_problem
 
 import ccd_casadi as ccd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_inner
+from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.plants.plant import hardware_cost
 
 AGREE = 1e-3  # relative
 SIDE = 15  # points a side of the grid over θ
+KINDS = ("reference", "disturbance", "robust", "compliance")
+
+
+def of_kind(problem: CoDesignProblem, kind: str, seed: int) -> CoDesignProblem:
+    """The problem with disturbances in its synthesis, a set of plants, or ‖GS‖∞ bounded."""
+    rng = np.random.default_rng([seed, 3])
+    if kind == "disturbance":
+        force = problem.weights.M_K * float(np.exp(rng.uniform(np.log(1.0), np.log(30.0))))
+        return replace(problem, weights=replace(problem.weights, disturbance=force))
+    if kind == "robust":
+        shift = float(rng.uniform(0.002, 0.02))
+        return replace(problem, robust=RobustSet(shift, 3, (), float(rng.choice([0.0, shift]))))
+    if kind == "compliance":
+        asked = replace(problem, inner=replace(problem.inner, compliance_max=1e300))
+        best = true_inner(asked, problem.start).optimum
+        if best is not None:
+            most = float(best.figures.compliance * rng.uniform(0.5, 1.2))
+            return replace(problem, inner=replace(problem.inner, compliance_max=most))
+    return problem
 
 
 def formulations(parameters: int) -> tuple[Any, ...]:
@@ -37,12 +63,14 @@ def formulations(parameters: int) -> tuple[Any, ...]:
     return nested, ccd.Lifted(), ccd.Direct()
 
 
-def solved(seed: int, store: Path) -> dict[str, Any]:
+def solved(seed: int, store: Path, kind: str, names: list[str]) -> dict[str, Any]:
     """One problem by all formulations; what they all look at is computed once, in `store`."""
-    problem = chain_problem(seed)
+    problem = of_kind(chain_problem(seed), kind, seed)
     found: dict[str, Any] = {}
     for formulation in formulations(len(problem.names)):
         name = type(formulation).__name__.lower()
+        if name not in names:
+            continue
         began = process_time()
         result = ccd.solve(problem, formulation, seed=0, store=store).result
         found[name] = {"status": result["status"], "cpu_seconds": process_time() - began}
@@ -58,7 +86,7 @@ def solved(seed: int, store: Path) -> dict[str, Any]:
             "lines": lines,
             "reason": result["reason"],
         }
-    return {"seed": seed, "parameters": len(problem.names), "formulations": found}
+    return {"seed": seed, "kind": kind, "parameters": len(problem.names), "formulations": found}
 
 
 def on_grid(problem: CoDesignProblem) -> dict[str, Any]:
@@ -84,6 +112,24 @@ def worse_than_grid(row: dict[str, Any]) -> list[str]:
     found = {n: item.get("objective", np.inf) for n, item in row["formulations"].items()}
     level = best + AGREE * abs(best)
     return [name for name, J in found.items() if level < J]
+
+
+def not_verified(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of the designs that were found, the share that is not verified; by kind and failed line."""
+    designs = [
+        (row.get("kind", KINDS[0]), name, item)
+        for row in rows
+        for name, item in row["formulations"].items()
+        if "lines" in item
+    ]
+    failed: Counter[str] = Counter()
+    for kind, name, item in designs:
+        for line, state in item["lines"].items():
+            if state == "failed":
+                failed[f"{kind} {name}: {line}"] += 1
+    count = sum(item["status"] != "verified" for _, _, item in designs)
+    share = count / max(len(designs), 1)
+    return {"designs": len(designs), "not_verified": count, "share": share, "by_line": failed}
 
 
 def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -119,6 +165,7 @@ def judged(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "worse_or_missing": lost,
         "worse_and_called_verified": false_verified,
         "lines": dict(lines),
+        "not_verified": not_verified(rows),
         "grids": sum("grid" in row for row in rows),
         "worse_than_grid": [(row["seed"], name) for row in rows for name in worse_than_grid(row)],
         "cpu_seconds": sum(i["cpu_seconds"] for row in rows for i in row["formulations"].values()),
@@ -130,7 +177,8 @@ def printed(row: dict[str, Any]) -> None:
     for name, item in row["formulations"].items():
         bad = [f"{k}:{v}" for k, v in item.get("lines", {}).items() if v in ("failed",)]
         print(
-            f"{row['seed']:4d} {row['parameters']} {name:7s} {item['status']:12s} "
+            f"{row['seed']:4d} {row.get('kind', KINDS[0])[:7]:7s} {row['parameters']} {name:7s} "
+            f"{item['status']:12s} "
             f"J {item.get('objective', np.nan):14.6f} "
             f"before {item.get('before_look') or np.nan:14.6f} "
             f"kkt {item.get('kkt', np.nan):.0e} {item.get('syntheses', 0):5d} "
@@ -152,6 +200,9 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--grid", type=int, default=0)
+    parser.add_argument("--kinds", action="store_true")
+    names = ("nested", "lifted", "direct")
+    parser.add_argument("--formulations", nargs="+", choices=names, default=names)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rows: dict[int, dict[str, Any]] = {}
@@ -163,7 +214,9 @@ def main() -> None:
     for seed in range(options.first, last):
         if seed not in rows:
             with TemporaryDirectory() as folder:
-                rows[seed] = solved(seed, Path(folder) / "samples.sqlite")
+                kind = KINDS[seed % len(KINDS) if options.kinds else 0]
+                store = Path(folder) / "samples.sqlite"
+                rows[seed] = solved(seed, store, kind, options.formulations)
         if seed in planar and "grid" not in rows[seed]:
             rows[seed]["grid"] = on_grid(chain_problem(seed))
         printed(rows[seed])

@@ -189,7 +189,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
-    from ccd_casadi.codesign.formulations import formulation_of
+    from ccd_casadi.codesign.formulations import formulation_of, slow_words, usual_name
     from ccd_casadi.codesign.run import co_design
     from ccd_casadi.codesign.run_files import resolved, write_run
     from ccd_casadi.codesign.stored import named_surrogate
@@ -202,8 +202,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     problem = problem_of(case)
     plant_of(problem)  # a wrong plant is told before anything is written
     folder = run_folder(options.case, options.out)
+    name = options.formulation or usual_name(case, len(problem.names))
+    formulation = formulation_of(case, name)
     if not options.quiet:
         show_findings(case, problem)
+        slow = slow_words(formulation, len(problem.names))
+        if slow:
+            print(f"warning: {slow}", file=sys.stderr)
     with ExitStack() as stack:
         helper = None
         if not options.no_report and options.workers > 1 and not options.quiet:
@@ -213,14 +218,13 @@ def command(options: argparse.Namespace) -> ExitCode:
             helper = stack.enter_context(Ahead(ready))
         given = None
         if options.surrogate is not None:
-            given = named_surrogate(folder, options.surrogate, options.formulation, problem)
+            given = named_surrogate(folder, options.surrogate, name, problem)
         store = folder / "samples.sqlite"
         with (
             pool(options.scheduler, options.workers, PATIENCE) as workers,
             SampleStore(store) as samples,
         ):
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-            formulation = formulation_of(case, options.formulation)
             solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
             write_run(folder, case, solution)
         code = _CODES[solution.result["status"]]
@@ -241,7 +245,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.solve", "Co-design a stage and its controller; see the README.")
     arguments.add_argument(
-        "--formulation", choices=FORMULATIONS, default="nested", help="default: nested"
+        "--formulation",
+        choices=FORMULATIONS,
+        help="default: nested; direct where that is slow, as with many parameters",
     )
     arguments.add_argument(
         "--resume",

@@ -19,7 +19,10 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign import sections_run
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
@@ -28,6 +31,7 @@ from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.compare import main as compare
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.sampling.sampler import Sampler
@@ -306,3 +310,21 @@ def test_what_needs_ranges_says_so(tmp_path: Path, capsys: pytest.CaptureFixture
         sampler = Sampler(problem_of(case), store, pool)
         with pytest.raises(UserError, match="--surrogate"):
             co_design(sampler, Lifted(), 0, Surrogates((), np.empty((0, 2)), ()))
+
+
+def test_what_sections_spend_is_counted_over_all_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They were solved on a sampler of their own, and a catalogue said "syntheses": 0."""
+
+    def formulated(sampler: Sampler, *_: object) -> FormulationResult:
+        sampler._spend("a design", 5, (60.0, 60.0), 12.0)
+        return FormulationResult(None, None, (), (), None, False, "nothing is feasible")
+
+    monkeypatch.setattr(sections_run, "_formulated", formulated)
+    monkeypatch.setattr(sections_run, "seeded_and_prepared", lambda _, own, *__: (own, ""))
+    own = problem(sections=SectionsProblem())
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        sampler = Sampler(own, store, Workers(1))
+        found = sections_run.run_sections(sampler.of(own), Direct(), 0)
+        assert found.syntheses == sampler.syntheses == 6  # five designs and a race

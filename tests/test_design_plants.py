@@ -54,12 +54,12 @@ def test_a_range_is_reached_from_the_plant_alone(tmp_path) -> None:  # type: ign
     x = np.array([*THETA, np.log(f.omega_S), np.log(f.omega_T)])
     with SampleStore(tmp_path / "s.sqlite") as store, Workers(1, 60.0) as pool:
         sampler = Sampler(case, store, pool)
-        assert not acceptable(case, x, sampler.design(x))
+        assert not acceptable(case, x, sampler.truth.at(x))
         reached = widen(sampler, x)
         assert 0.0 < reached.share <= 1.0
         held = replace(case, robust=OPEN.scaled(reached.share) if case.robust else None)
         held = replace(held, robust=replace(held.robust, design_shift=-0.02 * reached.share))
-        assert acceptable(held, reached.x, Sampler(held, store, pool).design(reached.x))
+        assert acceptable(held, reached.x, Sampler(held, store, pool).truth.at(reached.x))
 
 
 @pytest.mark.parametrize("share", [2e-1, 1e-3, 1e-6, 1e-9, 1e-12])

@@ -1,5 +1,6 @@
 """`python -m surrogates.retrain`: exit codes, bad input, and a copy to work on."""
 
+import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -13,9 +14,12 @@ from camel import Camel, entries
 
 import surrogates.retrain as retrain_module
 import surrogates.truth as truth_module
+from ccd_casadi.codesign.retraining import open_run
 from surrogates.interface import Array
 from surrogates.retrain import main
 from surrogates.truth import Observations, TruthError, TruthInterrupted
+
+ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture
@@ -180,3 +184,16 @@ def test_a_scheduler_that_is_none_is_told_in_one_line(
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert told.startswith("--scheduler nowhere: is no address; give what `dask scheduler`")
+
+
+@pytest.mark.parametrize("formulation", ["nested", "lifted", "direct"])
+def test_a_run_keeps_the_name_of_its_formulation(tmp_path: Path, formulation: str) -> None:
+    """A `direct` run was called `lifted` once it had been trained again."""
+    (tmp_path / "case.toml").write_text((ROOT / "runs" / "two_mass.toml").read_text())
+    named = {"truth": "ccd_casadi", "formulation": formulation}
+    (tmp_path / "truth.json").write_text(json.dumps(named))
+    options: dict[str, Any] = {"tolerance": None, "workers": 1, "seed": 0, "quiet": True}
+    with open_run(tmp_path, **options, write_page=lambda *_: None) as truth:
+        truth.finish(truth.lower, (), None)
+    assert json.loads((tmp_path / "result.json").read_text())["formulation"] == formulation
+    assert json.loads((tmp_path / "truth.json").read_text()) == named

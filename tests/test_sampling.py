@@ -179,7 +179,7 @@ def test_theta_is_all_but_the_last_two_however_many_there_are(
 def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, violated: bool
 ) -> None:
-    monkeypatch.setattr(module, "constraint_values", lambda *_: np.array([-1.0, float(violated)]))
+    monkeypatch.setattr(module, "unmet", lambda *_: ("least mass",) * violated)
     monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=-3.0), store, Workers(1))
@@ -193,6 +193,26 @@ def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     else:
         assert sampler.trace[0].objective == 170.0
     assert math.isnan(sampler.trace[1].objective)
+
+
+def test_a_trace_tells_bandwidths_where_j_counts_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had the error, in m, for the bandwidth."""
+
+    def unit(task: Any) -> Any:
+        _, _, key, theta = task
+        payload: dict[str, Any] = {"bandwidth": 300.0, "error": 2e-9, "gradient": [0.0, 0.0]}
+        payload |= {"active": [], "shortfall": "", "violation": 0.0, "syntheses": 1, "kappa": [1.0]}
+        return [], (key, theta, payload)
+
+    monkeypatch.setattr(module, "inner_unit", unit)
+    monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
+    with SampleStore(tmp_path / "s.sqlite") as store:
+        sampler = Sampler(problem(w1=2.0, w2=1e9), store, Workers(1))
+        sampler.bandwidths(THETAS[:1])
+    assert sampler.trace[0].bandwidth == 300.0
+    assert sampler.trace[0].objective == pytest.approx(202.0)
 
 
 def test_an_easier_problems_designs_are_counted_and_not_traced(tmp_path: Path) -> None:

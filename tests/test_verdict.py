@@ -204,7 +204,7 @@ def test_the_largest_local_peak_is_the_norm_and_has_its_gradient(robust: RobustS
     theta, point = (60.0, 62.0), (300.0 * HZ, 60.0 * HZ)
     design = true_design(case, theta, *point)
     peaks = local_peaks_with_gradients(
-        scaled_plant(case, theta), case.weights.at(*point), gamma_backoff=1.02, least=1.0
+        scaled_plant(case, theta), case.weights.at(*point), design, gamma_backoff=1.02, least=1.0
     )
     assert design.figures.certified
     assert peaks[0].ln_gain == pytest.approx(design.values[1], abs=1e-9)
@@ -215,8 +215,9 @@ def test_the_largest_local_peak_is_the_norm_and_has_its_gradient(robust: RobustS
     second = peaks[1]
     ends = []
     for sign in (1.0, -1.0):
+        there = (60.0 + sign * step, 62.0)
         moved = local_peaks_with_gradients(
-            scaled_plant(case, (60.0 + sign * step, 62.0)), case.weights.at(*point),
+            scaled_plant(case, there), case.weights.at(*point), true_design(case, there, *point),
             gamma_backoff=1.02, least=0.9,
         )  # fmt: skip
         same = [p for p in moved if p.member == second.member]

@@ -90,7 +90,7 @@ class ControllerSection:
         0.0,
         says="of sections: least damping ratio of their zeros and poles",
     )
-    starts: int = key(count(1), 24, says="of sections: how many places the search starts from")
+    starts: int = key(count(1), 12, says="of sections: how many places the search starts from")
     channel: tuple[tuple[str, ChannelSection], ...] = key(
         table, (), says="tables [controller.channel.NAME] of plants with several outputs"
     )

@@ -28,12 +28,13 @@ from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
 from surrogates import GaussianProcess, design, quality_of
 
@@ -89,8 +90,8 @@ def look_over_box(
     `processes`: surrogates of ω_b, ln‖S‖∞ and ln|S(jω_low)| over x, where there are any.
     """
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
-    if processes and _may_jump(sampler, x):
+    quantities = sampler.truth
+    if processes and _may_jump(problem, x, quantities.at(x)):
         processes = ()
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
@@ -153,14 +154,14 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
         for end in (lower[i], upper[i])
         if abs(end - theta[i]) > SAME * (upper[i] - lower[i])
     ]
-    allowed = [x for x in found if (constraint_values(plant_of(problem), x) <= 0.0).all()]
+    allowed = [x for x in found if not unmet(problem, x)]
     return np.array(allowed).reshape(-1, len(theta))
 
 
 def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     lower, upper = box(problem)
     ends = []
     for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
@@ -187,9 +188,8 @@ def _spread(
     known = [sample for sample, keep in zip(solved, apart, strict=True) if keep]
     passed_over = 0
     if len(known) < points:
-        plant = plant_of(sampler.problem)
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
-        more = [theta for theta in spread if (constraint_values(plant, theta) <= 0.0).all()]
+        more = [theta for theta in spread if not unmet(sampler.problem, theta)]
         solve: list[Array] = list(more)
         if more and len(processes) > 1 and _trustworthy(processes, seed):
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
@@ -208,12 +208,12 @@ def _spread(
     return known, passed_over
 
 
-def _may_jump(sampler: Sampler, x: Array) -> bool:
+def _may_jump(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Whether a local maximum of S at x is near -3 dB: there ω_b jumps, and surrogates do not."""
-    problem = sampler.problem
     peaks = local_peaks_with_gradients(
         scaled_plant(problem, tuple(x[:-2])),
-        problem.weights.at(float(np.exp(x[-2])), float(np.exp(x[-1]))),
+        problem.weights.at(design.figures.omega_S, design.figures.omega_T),
+        design,
         gamma_backoff=problem.inner.gamma_backoff,
         least=float(np.exp(HALF_POWER - NEAR_SHELF)),
     )
@@ -288,9 +288,9 @@ def _starts(
 
 
 def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
-    return bool((constraint_values(plant_of(problem), sample.theta) <= 1e-9).all())
+    return not unmet(problem, sample.theta)
 
 
 def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.bandwidth
+    return problem.w1 * cost + problem.w2 * sample.value

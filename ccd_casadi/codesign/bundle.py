@@ -11,13 +11,11 @@ learns from their combination Σ μ_i g_i, which is what is smooth of ∇J along
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
-from ccd_casadi.codesign.quasi_newton import damped_bfgs
+from ccd_casadi.optim.quadratic import solve_quadratic
+from ccd_casadi.optim.quasi_newton import damped_bfgs
 from ccd_casadi.support.arrays import Array
 
 FIRST, LARGEST, LEAST = 1e-2, 0.2, 1e-10  # of the box: radii
@@ -27,11 +25,6 @@ BENT = 0.5  # of the largest slope, per share of the box: by what a piece is low
 RESTORED = 5  # Newton's steps back to λ <= 0
 INSIDE = 1e-10  # of λ
 CURVED = (1e-4, 1e-8)  # of d and t, in the programme's own units: its answer is then one point
-KEPT = 1e-7  # by how much an answer may miss its rows
-OPTIONS: dict[str, dict[str, Any]] = {  # dual active sets are fast, the interior point is robust
-    "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}},
-    "ipqp": {"print_iter": False, "print_header": False, "print_info": False},
-}
 
 Constraints = Callable[[Array], tuple[Array, Array]]
 
@@ -72,8 +65,12 @@ def descend(
     H = np.zeros((start.z.size, start.z.size))
     step = _step(best, pieces, constraints, radius, H)
     for _ in range(steps):
-        if step is None or step.promised <= settled * abs(best.value) or radius < LEAST:
+        if radius < LEAST or (step is not None and step.promised <= settled * abs(best.value)):
             break
+        if step is None:  # that tells nothing of an optimum: a programme of its own, nearer by
+            H, radius = np.zeros_like(H), 0.5 * radius
+            step = _step(best, pieces, constraints, radius, H)
+            continue
         z = _restored(np.clip(best.z + step.change, 0.0, 1.0), constraints)
         there = None if z is None else at(z)
         gained = -np.inf if there is None else best.value - there.value
@@ -123,18 +120,13 @@ def _step(
     high = np.append(np.minimum(1.0, (1.0 - best.z) / radius), 10.0 * n)
     hessian = np.diag(np.append(np.full(n, CURVED[0]), CURVED[1]))
     hessian[:n, :n] += radius / size * H
-    for name in OPTIONS:
-        solver = _solver(name, n + 1, rows)
-        found = solver(
-            h=hessian, g=np.eye(n + 1)[n], a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high
-        )
-        x = np.array(found["x"]).ravel()
-        if solver.stats()["success"] and (A @ x - upper).max() <= KEPT:
-            mu = np.maximum(np.array(found["lam_a"]).ravel()[:m], 0.0)
-            d = radius * np.clip(x[:n], low[:n], high[:n])
-            promised = -size * radius * float(x[n]) - 0.5 * float(d @ H @ d)
-            return _Step(d, promised, mu @ slopes / max(float(mu.sum()), 1e-300))
-    return None
+    found = solve_quadratic(hessian, np.eye(n + 1)[n], A, upper, low, high)
+    if found is None:
+        return None
+    mu = found.multipliers[:m]
+    d = radius * np.clip(found.x[:n], low[:n], high[:n])
+    promised = -size * radius * float(found.x[n]) - 0.5 * float(d @ H @ d)
+    return _Step(d, promised, mu @ slopes / max(float(mu.sum()), 1e-300))
 
 
 def _restored(z: Array, constraints: Constraints) -> Array | None:
@@ -147,9 +139,3 @@ def _restored(z: Array, constraints: Constraints) -> Array | None:
         shift = np.linalg.lstsq(jacobian[broken], g[broken] + INSIDE, rcond=None)[0]
         z = np.clip(z - shift, 0.0, 1.0)
     return None
-
-
-@lru_cache(maxsize=128)
-def _solver(name: str, n: int, rows: int) -> ca.Function:
-    shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-    return ca.conic("bundle", name, shapes, {"error_on_fail": False, **OPTIONS[name]})

@@ -230,7 +230,7 @@ def _sequential(
         design: Sensitivities | SectionsDesign
         if problem.sections is None:
             x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-            design = sampler.design(x)
+            design = sampler.truth.at(x)
         else:
             design = sections_value(problem, sample.theta).design
     figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)

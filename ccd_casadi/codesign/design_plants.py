@@ -60,7 +60,7 @@ def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, flo
     reached = widen(sampler, x)
     if reached.share < 1.0:
         return None, reached.share
-    made = sampler.design(reached.x)
+    made = sampler.truth.at(reached.x)
     words = "reached by continuation from narrower ranges"
     return FormulationResult(reached.x, made, (), (), None, True, words), 1.0
 

@@ -20,9 +20,10 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.peak_constraints import other_peaks
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -53,7 +54,7 @@ class Direct:
 def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> FormulationResult:
     """IPOPT on the true problem from the case's start and a Sobol set of starts."""
     problem = sampler.problem
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     program = lifted_program(problem, quantities, exact_hessian=False)
     lower, upper = lifted_bounds(problem)
     middle = 0.5 * (lower + upper)
@@ -84,9 +85,8 @@ def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolut
     A descent past kinks, IPOPT where that leaves a residual, then Newton's steps. Returns the
     start itself where none of them finds better that is certified and feasible.
     """
-    quantities = TrueQuantities(sampler.problem, sampler.record)
-    x, design, solution = _descended(sampler.problem, quantities, x)
-    return *_settled(sampler.problem, quantities, x, design), solution
+    x, design, solution = _descended(sampler.problem, sampler.truth, x)
+    return *_settled(sampler.problem, sampler.truth, x, design), solution
 
 
 def _descended(
@@ -169,8 +169,7 @@ def _terms(problem: CoDesignProblem, x: Array, design: Sensitivities) -> tuple[f
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
     """Certified, within S_max and S_low as given (no slack), and λ(θ) <= 0 to rounding."""
-    lam = constraint_values(plant_of(problem), x[: len(problem.names)])
-    return problem.inner.feasible(design.figures) and bool((lam <= 1e-9).all())
+    return problem.inner.feasible(design.figures) and not unmet(problem, x[: len(problem.names)])
 
 
 def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:

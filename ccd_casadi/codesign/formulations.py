@@ -6,6 +6,8 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 
 Formulation = Nested | Lifted | Direct
+MANY = 12  # parameters up to which surrogates are worth their fit: docs/method.md has the figures
+SAMPLES = 1000  # inner problems of a plan over θ, some minutes
 
 
 def formulation_of(case: Case, name: str) -> Formulation:
@@ -17,3 +19,22 @@ def formulation_of(case: Case, name: str) -> Formulation:
     if name == "lifted":
         return Lifted(sampling.lifted_points, *rounds, outer.box_points)
     return Direct(outer.direct_starts, outer.tolerance, outer.box_points)
+
+
+def usual_name(case: Case, parameters: int) -> str:
+    """The formulation where the user names none: nested, or direct where nested has no end."""
+    return "direct" if slow_words(formulation_of(case, "nested"), parameters) else "nested"
+
+
+def slow_words(formulation: Formulation, parameters: int) -> str:
+    """Why a formulation is slow with so many parameters, in one line; empty where it is not."""
+    why = ""
+    if isinstance(formulation, Direct):
+        return why
+    if isinstance(formulation, Nested) and formulation.plan == "grid":
+        count = formulation.points**parameters
+        why = f"its grid is {count:.3g} inner problems" if count > SAMPLES else ""
+    if not why and parameters > MANY:
+        why = f"its surrogates are for {MANY} at most"
+    name = type(formulation).__name__.lower()
+    return f"{name} is slow with {parameters} parameters: {why}; direct is not" if why else ""

@@ -11,15 +11,16 @@ design is certified; H is the damped BFGS matrix of the Lagrangian (Nocedal and 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.kkt import lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
-from ccd_casadi.codesign.quasi_newton import damped_bfgs
+from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, SAME_PEAK, other_peaks
+from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.quadratic import solve_quadratic
+from ccd_casadi.optim.quasi_newton import damped_bfgs
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -32,7 +33,6 @@ SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from whe
 FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
 ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
 BASIN = 1e-2  # of the box: this close to an end that is known, and no lower, is its basin
-SAME_PEAK = 0.03  # ln ω within which peaks of two designs are one
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,20 @@ class _Point:
     def by_shelf(self) -> bool:
         """Whether ω_b may jump near by."""
         return any(kind == "shelf" for kind, _, _ in self.tags)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """d, the multipliers of g, and by how much the model of the merit falls."""
+
+    change: Array
+    multipliers: Array
+    model: float
+
+    @property
+    def size(self) -> float:
+        """The largest share of the box."""
+        return float(np.abs(self.change).max())
 
 
 def descend(
@@ -85,17 +99,24 @@ def descend(
     for _ in range(steps):
         if any(_in_basin(here, (known - lower) / width, J) for known, J in ended):
             break
-        d, mu, model = _step(here, H, radius, rho, bend)
-        while model <= settled * abs(here.J) and here.by_shelf and radius > LEAST:
+        least = settled * abs(here.J)
+        step = _step(here, H, radius, rho, bend)
+        while step is not None and step.model <= least and here.by_shelf and radius > LEAST:
             radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
-            d, mu, model = _step(here, H, radius, rho, bend)
-        if model <= settled * abs(here.J) and LEAST < ZOOM * np.abs(d).max() < radius:
+            step = _step(here, H, radius, rho, bend)
+        if step is not None and step.model <= least and LEAST < ZOOM * step.size < radius:
             # The quadratic program is solved to a share of the radius, and the merit counts what
             # it leaves of a violation: next to an optimum that is more than is left to gain.
-            radius = ZOOM * float(np.abs(d).max())
-            d, mu, model = _step(here, H, radius, rho, bend)
+            radius = ZOOM * step.size
+            step = _step(here, H, radius, rho, bend)
+        if radius < LEAST:
+            break
+        if step is None:  # that tells nothing of an optimum: a programme of its own, nearer by
+            H, radius = scale * np.eye(size), 0.35 * radius
+            continue
+        d, mu, model = step.change, step.multipliers, step.model
         rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
-        if radius < LEAST or model <= settled * abs(here.J):
+        if model <= least:
             break
         there = at(here.z + d)
         gained = -np.inf if there is None else _merit(here, rho) - _merit(there, rho)
@@ -103,8 +124,8 @@ def descend(
             H = _updated(H, here, there, mu)
             bend = _bend(here, there, bend)
         if there is None or gained < 0.1 * model:
-            radius = min(radius, float(np.abs(d).max())) * 0.35
-        elif gained > 0.7 * model and np.abs(d).max() > 0.9 * radius:
+            radius = min(radius, step.size) * 0.35
+        elif gained > 0.7 * model and step.size > 0.9 * radius:
             radius = min(2.0 * radius, LARGEST)
         if there is not None and gained > 1e-4 * model:
             here = there
@@ -116,14 +137,16 @@ def _in_basin(here: _Point, z: Array, J: float) -> bool:
 
 
 def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) -> _Point | None:
-    if not design.figures.certified:
+    if not design.figures.certified or design.made is None:
         return None
     gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
-    g = g.copy()
-    g[: len(problem.inner.bounds)] += INSIDE
+    first, sizes = len(problem.inner.bounds), constraint_sizes(problem)
+    g = np.append(g[:first] + INSIDE, g[first:] / sizes)
+    jacobian = np.vstack([jacobian[:first], jacobian[first:] / sizes[:, None]])
     peaks = other_peaks(problem, x, design, BAND)
     tags = [(name, 0.0, 0) for name in names]
-    tags[0] = ("peak", float(np.log(design.figures.sensitivity_peak_frequency)), -1)
+    place = float(np.log(design.figures.sensitivity_peak_frequency))
+    tags[0] = ("peak", place, design.made.worst)
     if peaks:
         g = np.append(g, [peak.value + INSIDE for peak in peaks])
         jacobian = np.vstack([jacobian, *(peak.row for peak in peaks)])
@@ -164,12 +187,9 @@ def _bend(here: _Point, there: _Point, bend: float) -> float:
     return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
 
 
-def _step(
-    here: _Point, H: Array, radius: float, rho: float, bend: float
-) -> tuple[Array, Array, float]:
-    """d, the multipliers of g, and by how much the model of the merit falls."""
+def _step(here: _Point, H: Array, radius: float, rho: float, bend: float) -> _Step | None:
+    """None where the programme is not solved."""
     n, m = here.z.size, here.g.size
-    solver = _solver(n, m)
     unit = max(float(np.abs(here.gradient).max()), 1e-300)
     # Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong.
     shelf = np.array([kind == "shelf" for kind, _, _ in here.tags])
@@ -182,25 +202,16 @@ def _step(
     A = np.hstack([here.jacobian, -np.eye(m)])
     low = np.append(np.maximum(-1.0, -here.z / radius), np.zeros(m))
     high = np.append(np.minimum(1.0, (1.0 - here.z) / radius), np.full(m, np.inf))
-    try:
-        answer = solver(h=hessian, g=linear, a=A, lba=-np.inf, uba=-g / radius, lbx=low, ubx=high)
-    except RuntimeError:  # the quadratic program was not solved
-        return np.zeros(n), np.zeros(m), 0.0
-    d = radius * np.clip(np.array(answer["x"]).ravel()[:n], low[:n], high[:n])
-    mu = unit * np.maximum(np.array(answer["lam_a"]).ravel(), 0.0)
+    found = solve_quadratic(hessian, linear, A, -g / radius, low, high, singular=True)
+    if found is None:
+        return None
+    d = radius * np.clip(found.x[:n], low[:n], high[:n])
+    mu = unit * found.multipliers
     weight = max(rho, 2.0 * float(mu.max(initial=0.0)))
     before = weight * float(np.maximum(here.g, 0.0).sum())
     after = weight * float(np.maximum(here.g + here.jacobian @ d, 0.0).sum())
     model = before - after - float(here.gradient @ d + 0.5 * d @ H @ d)
-    return d, mu, model
-
-
-def _solver(n: int, m: int) -> ca.Function:
-    dense = {
-        "h": ca.Sparsity.dense(n + m, n + m),
-        "a": ca.Sparsity.dense(m, n + m),
-    }
-    return ca.conic("step", "daqp", dense, {"error_on_fail": True})
+    return _Step(d, mu, model)
 
 
 def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
@@ -217,9 +228,9 @@ def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
 
 
 def _same(tag: tuple[str, float, int], there: _Point) -> int | None:
-    """The row of the same constraint there; of a peak, the nearest in frequency."""
-    kind, place, _ = tag
-    rows = [i for i, other in enumerate(there.tags) if other[0] == kind]
+    """The row of the same constraint there; of a peak, the nearest of its plant in frequency."""
+    kind, place, member = tag
+    rows = [i for i, (name, _, of) in enumerate(there.tags) if (name, of) == (kind, member)]
     if not rows:
         return None
     nearest = min(rows, key=lambda i: abs(there.tags[i][1] - place))

@@ -15,20 +15,20 @@ within `ACTIVE` is a constraint of its own.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import nnls
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import PeakConstraint, other_peaks
+from ccd_casadi.inner_problem.constraints import ACTIVE, constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.plants.plant import constraint_values, hardware_slopes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 # The polish stops where steps no longer change J by more than rounding; a constraint closer
-# than this (in logarithm, or share of the box) is one that it runs along.
-ACTIVE = 1e-6
+# than ACTIVE (in logarithm, or share of the box or its size) is one that it runs along.
 STEP = 1e-4  # of the box: differences of true gradients
 SMOOTH = 1e-6  # residual up to which nothing speaks of a kink
 
@@ -115,13 +115,16 @@ def active_set(
     lower, upper = lifted_bounds(problem)
     width = upper - lower
     gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
+    first, own = len(problem.inner.bounds), constraint_sizes(problem)
     if others:
         g = np.append(g, [peak.value for peak in others])
         jacobian = np.vstack([jacobian, *(peak.row for peak in others)])
         names = (*names, *(peak.name for peak in others))
     rows, labels, slack = [], [], []
-    for value, row, name in zip(g, jacobian, names, strict=True):
-        if value >= -ACTIVE:
+    sizes = np.ones(len(g))
+    sizes[first : first + len(own)] = own
+    for value, size, row, name in zip(g, sizes, jacobian, names, strict=True):
+        if value >= -ACTIVE * size:
             rows.append(row)
             labels.append(name)
             slack.append(value)
@@ -133,7 +136,7 @@ def active_set(
                 rows.append(sign * np.eye(x.size)[i])
                 labels.append(f"{name} {end}")
                 slack.append(value)
-    violation = max(0.0, float(low.max()), float(high.max()), float(np.max(g, initial=0.0)))
+    violation = max(0.0, float(low.max()), float(high.max()), float(np.max(g / sizes, initial=0.0)))
     matrix = np.array(rows).reshape(-1, x.size)
     return ActiveSet(gradient, matrix, np.array(slack), tuple(labels), count, violation)
 
@@ -176,18 +179,13 @@ def lagrangian_parts(
     lower, upper = lifted_bounds(problem)
     width = upper - lower
     theta = x[:count]
-    symbol = ca.MX.sym("theta", count)
-    f, lam = plant.hardware(symbol)
-    slopes = ca.Function("slopes", [symbol], [ca.jacobian(f, symbol), ca.jacobian(lam, symbol)])
-    df, dlam = (np.array(value) for value in slopes(theta))
+    df, dlam = hardware_slopes(plant, theta)
     total = np.hstack([design.to_theta, design.to_break_frequencies])
     gradient = problem.w2 * total[0]
-    gradient[:count] += problem.w1 * df.ravel()
-    lam_values = np.array(plant.hardware(theta)[1]).ravel()
-    g = np.concatenate([design.values[1:-1] - problem.inner.levels, lam_values])
-    jacobian = np.vstack(
-        [total[1:-1], np.hstack([dlam.reshape(-1, count), np.zeros((len(lam_values), 2))])]
-    )
+    gradient[:count] += problem.w1 * df
+    lam = constraint_values(plant, theta)
+    g = np.concatenate([design.values[1:-1] - problem.inner.levels, lam])
+    jacobian = np.vstack([total[1:-1], np.hstack([dlam, np.zeros((len(lam), 2))])])
     names = (*problem.inner.bounds, *plant.constraint_names)
     return gradient * width, g, jacobian * width, names
 

@@ -19,8 +19,9 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.inner_problem.constraints import constraint_shares
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
@@ -177,9 +178,9 @@ def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
 
 
 def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
-    """Largest violation of λ and, in ln, of a bound."""
+    """Largest violation of λ, in shares of its size, and, in ln, of a bound."""
     levels = problem.inner.levels - MARGIN
-    lam = constraint_values(plant_of(problem), sample.x[: len(problem.names)])
+    lam = constraint_shares(problem, sample.x[: len(problem.names)])
     return float(np.concatenate([sample.values[1:-1] - levels, lam]).max())
 
 

@@ -18,8 +18,9 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -155,8 +156,7 @@ def fit_bandwidth(
 
 def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
     """The points with λ(θ) <= 0; all of them where none has."""
-    plant = plant_of(problem)
-    keep = [bool((constraint_values(plant, theta) <= 0.0).all()) for theta in thetas]
+    keep = [not unmet(problem, theta) for theta in thetas]
     return thetas[keep] if any(keep) else thetas
 
 
@@ -166,9 +166,8 @@ def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
 
 
 def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> BandwidthSample:
-    plant = plant_of(problem)
     feasible = [sample for sample in samples if sample.feasible]
-    inside = [s for s in feasible if (constraint_values(plant, s.theta) <= 1e-9).all()]
+    inside = [s for s in feasible if not unmet(problem, s.theta)]
     return min(inside or feasible, key=lambda sample: _objective(problem, sample))
 
 

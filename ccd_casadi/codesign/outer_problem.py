@@ -13,9 +13,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
-from ccd_casadi.plants.plant import Plant, constraint_values
+from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from surrogates import design
 from surrogates.ipopt import end_points
@@ -41,7 +42,10 @@ class NonlinearProgram:
 
 @dataclass(frozen=True)
 class LocalOptimum:
-    """One end point of IPOPT: x, objective, multipliers of g and of the bounds, its verdict."""
+    """One end point of IPOPT: x, objective, multipliers of g and of the bounds, its verdict.
+
+    g has λ in shares of its size, see `inner_problem.constraints`.
+    """
 
     x: Array
     objective: float
@@ -69,7 +73,7 @@ def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> Nonlinea
     """The outer problem over θ with a surrogate bandwidth(θ) in rad/s."""
     plant = plant_of(problem)
     theta = ca.MX.sym("theta", len(problem.names))
-    f, lam = _hardware(plant, theta)
+    f, lam = _hardware(problem, theta)
     return NonlinearProgram(
         x=theta,
         f=problem.w1 * f + problem.w2 * bandwidth(theta),
@@ -95,7 +99,7 @@ def lifted_program(
     x = ca.MX.sym("x", count + 2)
     theta = x[:count]
     q = quantities(x)
-    f, lam = _hardware(plant, theta)
+    f, lam = _hardware(problem, theta)
     inner = problem.inner
     levels = inner.levels - margin
     lower, upper = lifted_bounds(problem)
@@ -219,36 +223,36 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         return ""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     points = np.vstack([np.array(problem.start), design("sobol", lower, upper, starts, seed)])
-    values = np.array([constraint_values(plant, point) for point in points])
-    if (values <= 0.0).all(axis=1).any():
+    if not all(unmet(problem, point) for point in points):
         return ""
     theta, slack = ca.MX.sym("theta", len(lower)), ca.MX.sym("slack")
-    lam = _hardware(plant, theta)[1]
-    size = float(np.abs(values).max())
+    shares = np.array([constraint_shares(problem, point).max() for point in points])
+    most = 2.0 * float(np.abs(shares).max())
     program = NonlinearProgram(
         x=ca.vertcat(theta, slack),
         f=slack,
-        g=lam / size - slack,
-        lower=np.append(lower, -2.0),
-        upper=np.append(upper, 2.0),
+        g=_hardware(problem, theta)[1] - slack,
+        lower=np.append(lower, -most),
+        upper=np.append(upper, most),
         variables=(*problem.names, "slack"),
         constraints=plant.constraint_names,
         exact_hessian=plant.exact_hessian,
     )
     try:
-        best = solve_program(program, np.column_stack([points, np.ones(len(points))])).best.x[:-1]
+        best = solve_program(program, np.column_stack([points, shares])).best.x[:-1]
     except OuterFailure:
-        best = points[np.argmin(values.max(axis=1))]
-    found = constraint_values(plant, best)
-    worst = int(np.argmax(found))
-    if found[worst] <= 1e-9 * size:
+        best = points[np.argmin(shares)]
+    if not unmet(problem, best):
         return ""
+    worst = int(np.argmax(constraint_shares(problem, best)))
+    least = constraint_values(plant, best)[worst]
     return (
         f"no theta was found that meets the constraint {plant.constraint_names[worst]}: its least "
-        f"value found in the bounds is {found[worst]:.4g}, and it is met where it is 0 or less"
+        f"value found in the bounds is {least:.4g}, and it is met where it is 0 or less"
     )
 
 
-def _hardware(plant: Plant, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
-    f, lam = plant.hardware(theta)
-    return f, lam
+def _hardware(problem: CoDesignProblem, theta: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """f, and λ in shares of its size."""
+    f, lam = plant_of(problem).hardware(theta)
+    return f, lam / ca.DM(constraint_sizes(problem)) if lam.numel() else lam

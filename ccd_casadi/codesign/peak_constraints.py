@@ -13,9 +13,10 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
+from ccd_casadi.synthesis.peaks import LocalPeak, local_peaks_with_gradients
 
 HALF_POWER = -0.5 * np.log(2.0)
+SAME_PEAK = 0.03  # ln ω within which peaks of one plant are one
 OTHER_PEAK = "S_max at "  # begins the name of a local peak besides the largest
 
 
@@ -45,16 +46,18 @@ def other_peaks(
     peaks = local_peaks_with_gradients(
         scaled_plant(problem, tuple(x[:-2])),
         problem.weights.at(figures.omega_S, figures.omega_T),
+        design,
         gamma_backoff=problem.inner.gamma_backoff,
         least=float(np.exp(min(HALF_POWER, np.log(problem.inner.S_max)) - band)),
     )
-    S_max, largest, found = np.log(problem.inner.S_max), False, []
+    S_max, found = np.log(problem.inner.S_max), []
+    norm = _of_norm(peaks, design)
     for peak in peaks:
+        if peak is norm:
+            continue  # the row S_max itself
         on = f" on plant {peak.member} of the set" if peak.member else ""
         place = f"{peak.omega / HZ:.4g} Hz{on}"
-        if not largest and abs(peak.ln_gain - design.values[1]) <= 1e-7:
-            largest = True  # the row S_max itself
-        elif peak.ln_gain >= S_max - band:
+        if peak.ln_gain >= S_max - band:
             level, name = S_max, OTHER_PEAK + place
             row = peak.gradient * width
             found.append(PeakConstraint(name, peak.ln_gain - level, row, peak.omega, peak.member))
@@ -66,3 +69,14 @@ def other_peaks(
             row, value = peak.gradient * width, peak.ln_gain - HALF_POWER
             found.append(PeakConstraint(f"-3 dB at {place}", value, row, peak.omega, 0))
     return tuple(found)
+
+
+def _of_norm(peaks: tuple[LocalPeak, ...], design: Sensitivities) -> LocalPeak | None:
+    """The peak that ‖S‖∞ is read at: by its plant and frequency, as others may be as high."""
+    if design.made is None:
+        return None
+    place = np.log(design.figures.sensitivity_peak_frequency)
+    own = [peak for peak in peaks if peak.member == design.made.worst]
+    nearest = min(own, key=lambda peak: abs(np.log(peak.omega) - place), default=None)
+    far = nearest is None or abs(np.log(nearest.omega) - place) > SAME_PEAK
+    return None if far else nearest

@@ -32,9 +32,9 @@ from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.codesign.sections_run import conclude_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
+from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
-from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
@@ -96,7 +96,7 @@ class CoDesignTruth:
         problem = sampler.problem
         self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
         self.write_page = write_page
-        self.formulation = "nested" if formulation == "nested" else "lifted"
+        self.formulation = formulation
         self.structured = problem.sections is not None
         self.nested = self.structured or formulation == "nested"  # x = θ
         self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
@@ -104,7 +104,8 @@ class CoDesignTruth:
         self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
         self.tolerance = case.outer.tolerance if tolerance is None else tolerance
         self.objective, self.constraints = _functions(problem, self.nested)
-        self.describe = {"formulation": self.formulation, "outputs": list(self.outputs)}
+        form = "nested" if formulation == "nested" else "lifted"  # direct has no surrogates
+        self.describe = {"formulation": form, "outputs": list(self.outputs)}
 
     @property
     def spent(self) -> int:
@@ -205,7 +206,7 @@ class CoDesignTruth:
     def _bandwidths(self, samples: list[BandwidthSample]) -> Observations:
         d = len(self.lower)
         X = np.array([s.theta for s in samples]).reshape(-1, d)
-        Y = np.array([[s.bandwidth] for s in samples]).reshape(-1, 1)
+        Y = np.array([[s.value] for s in samples]).reshape(-1, 1)
         if self.formulation == "nested":
             return Observations(X, Y)
         dY = np.array([s.gradient for s in samples]).reshape(-1, 1, d)
@@ -232,9 +233,7 @@ def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.
     levels = problem.inner.levels
     y = ca.MX.sym("y", 1 if nested else 1 + len(levels))
     f, lam = plant.hardware(x[:count])
-    middle = np.array([problem.lower, problem.start, problem.upper])
-    sizes = np.array([np.abs(constraint_values(plant, theta)) for theta in middle])
-    g = lam / ca.DM(np.maximum(sizes.max(axis=0), 1e-300)) if lam.numel() else ca.MX(0, 1)
+    g = lam / ca.DM(constraint_sizes(problem)) if lam.numel() else ca.MX(0, 1)
     if not nested:
         g = ca.vertcat(y[1:] - levels, g)
     J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])

@@ -10,9 +10,9 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
-from ccd_casadi.codesign.direct import solve_direct
+from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.formulations import MANY, Formulation
 from ccd_casadi.codesign.full_order import full_order_beside
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
@@ -46,9 +46,10 @@ def solve(
 
         min w1 f(θ) + w2 ω_b*(θ),  θ_min <= θ <= θ_max,  λ(θ) <= 0      (paper, equation (9))
 
-    `formulation` is `Nested(...)`, `Lifted(...)` (default) or `Direct(...)`; samples are kept in
-    the file `store`, which a later call resumes from, or nowhere. More than one of `workers` needs
-    the caller's script behind `if __name__ == "__main__":`, as any use of processes does.
+    `formulation` is `Nested(...)`, `Lifted(...)` or `Direct(...)`: by default lifted, direct with
+    more than 12 parameters. Samples are kept in the file `store`, which a later call resumes from,
+    or nowhere. More than one of `workers` needs the caller's script behind
+    `if __name__ == "__main__":`, as any use of processes does.
 
     Raises UserError where the plant or the store cannot be used; an infeasible problem is a
     Solution with `verified` None.
@@ -66,7 +67,8 @@ def solve(
         SampleStore(store or Path(folder) / "samples.sqlite") as samples,
     ):
         sampler = Sampler(problem, samples, pool, quiet=quiet)
-        return co_design(sampler, formulation or Lifted(), seed)
+        usual = Lifted() if len(problem.names) <= MANY else Direct()
+        return co_design(sampler, formulation or usual, seed)
 
 
 def co_design(

@@ -51,7 +51,7 @@ def conclude_with_look(
         ends = [verify(sampler, end) for end in perturbed(sampler, verified.x, seed)]
         verified = _best([verified, *ends], formulation.tolerance)
         if isinstance(formulation, Direct):  # has no surrogate that could have promised another
-            outcome = replace(outcome, x=verified.x, design=sampler.design(verified.x))
+            outcome = replace(outcome, x=verified.x, design=sampler.truth.at(verified.x))
     return conclude(sampler, name, outcome, formulation.tolerance, seed, began, verified, look)
 
 
@@ -60,7 +60,7 @@ def _resumed(
 ) -> FormulationResult:
     """Go on from a better design (or the same one, wrongly predicted): the surrogates learn it."""
     if isinstance(formulation, Direct):
-        return replace(outcome, x=x, design=sampler.design(x), agreed=True)
+        return replace(outcome, x=x, design=sampler.truth.at(x), agreed=True)
     if isinstance(formulation, Nested):
         thetas = np.unique(np.array([*sampler.solved, tuple(x[:-2])]), axis=0)
         found = solve_nested(sampler, formulation, seed=seed, given=Surrogates((), thetas, ()))

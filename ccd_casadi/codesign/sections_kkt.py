@@ -23,6 +23,7 @@ from scipy.optimize import nnls
 from ccd_casadi.codesign.kkt import ACTIVE, STEP, Kink, KktCertificate
 from ccd_casadi.codesign.sections_truth import TrueBandwidth, hardware_at, objective_gradient
 from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -52,9 +53,9 @@ def sections_kkt(
     own = hardware_at(problem, theta)
     gradient = objective_gradient(problem, sample)
     rows, labels, slack = [], [], []
-    for value, row, name in zip(
-        own.constraints, own.slopes, plant_of(problem).constraint_names, strict=True
-    ):
+    names = plant_of(problem).constraint_names
+    size_of = dict(zip(names, constraint_sizes(problem), strict=True))
+    for value, row, name in zip(own.constraints, own.slopes, names, strict=True):
         if value >= -ACTIVE:
             rows.append(row)
             labels.append(name)
@@ -95,7 +96,10 @@ def sections_kkt(
         stationarity=residual,
         primal=float(primal),
         complementarity=float(np.abs(nu * np.array(slack)).max(initial=0.0)) / size,
-        multipliers={name: float(value) for name, value in zip(labels, nu, strict=True)},
+        multipliers={
+            name: float(value) / size_of.get(name, 1.0)
+            for name, value in zip(labels, nu, strict=True)
+        },
         active=tuple(labels),
         second_order=second,
         objective_gradient=tuple(map(float, gradient)),

@@ -18,10 +18,10 @@ from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.inner_problem.constraints import touched, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -202,10 +202,9 @@ def sections_result(
     error = abs(verified.predicted / verified.value - 1.0)
     of_error = sections_of_problem(problem).of_error
     plant = plant_of(problem)
-    lam = constraint_values(plant, verified.theta)
     checks = {
         "certificate": made.certified,
-        "constraints": bool((lam <= 1e-9).all()),
+        "constraints": not unmet(problem, verified.theta),
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.race_gap <= tolerance),
         "robust": verified.wide.passed and not verified.proof.refuted,
@@ -222,7 +221,7 @@ def sections_result(
     if sections.weighted_level is None:
         notes.append("KS and T are not bounded: the case gives no controller.weighted_level")
     bounds = [name for name in verified.kkt.active if name not in plant.constraint_names]
-    met = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
+    met = touched(problem, verified.theta)
     result = {
         **design_dict(verified.problem, verified.theta, made),
         "status": "not_verified" if failed else "verified",

@@ -76,34 +76,32 @@ class SectionsRun:
 def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> SectionsRun:
     """Sections' co-design on the sampler's store and workers."""
     quiet = sampler.quiet
-    spent = 0
     problem, first = seeded_and_prepared(
         sampler.store, sampler.problem, seed, quiet, sampler.workers
     )
-    spent += 1
+    sampler.also("race")
     rounds = 0
     while True:
         rounds += 1
-        asked = Sampler(problem, sampler.store, sampler.workers, quiet=quiet)
+        asked = sampler.of(problem, traced=False)  # a smaller set of plants is an easier problem
         outcome = _formulated(asked, formulation, seed)
         if outcome.x is None:
             words = first if first and not sections_of_problem(problem).anchors else ""
             if asked.nearest is not None:
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
-            return SectionsRun(outcome, None, spent + asked.syntheses)
+            return SectionsRun(outcome, None, sampler.syntheses)
         sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
-        spent += 1
+        asked.also("race at the end")
         if not (end.better or end.members) or rounds == AGAIN:
             break
-        spent += asked.syntheses
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
         problem = joined(problem, kappa, end.members)
     if not isinstance(formulation, Direct):
         outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
     sampler.trace.extend(asked.trace)
-    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent + asked.syntheses)
+    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), sampler.syntheses)
 
 
 def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:

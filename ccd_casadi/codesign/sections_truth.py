@@ -9,11 +9,11 @@ Every evaluation is a design that the judge confirms, with its envelope gradient
 
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
+from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -47,8 +47,7 @@ class TrueBandwidth(VectorCallback):
 
 def objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
     """J in its own unit; infinite where θ is infeasible."""
-    lam = constraint_values(plant_of(problem), sample.theta)
-    if not sample.feasible or (lam > 1e-9).any():
+    if not sample.feasible or unmet(problem, sample.theta):
         return np.inf
     cost = hardware_cost(plant_of(problem), sample.theta)
     return problem.w1 * cost + problem.w2 * sample.value
@@ -56,7 +55,7 @@ def objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
 
 @dataclass(frozen=True)
 class Hardware:
-    """w1 ∇f (n,), λ (m,) and ∇λ (m, n) at θ, per share of the box."""
+    """w1 ∇f (n,), λ (m,) in shares of its size and ∇λ (m, n) at θ, per share of the box."""
 
     cost_gradient: Array
     constraints: Array
@@ -66,14 +65,11 @@ class Hardware:
 def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
     """What θ costs and may not, to first order."""
     lower, upper = box(problem)
-    symbol = ca.MX.sym("theta", len(lower))
-    f, lam = plant_of(problem).hardware(symbol)
-    wanted = [ca.jacobian(f, symbol), lam, ca.jacobian(lam, symbol)]
-    df, values, dlam = map(np.array, ca.Function("hardware", [symbol], wanted)(theta))
     width = upper - lower
-    return Hardware(
-        problem.w1 * df.ravel() * width, values.ravel(), dlam.reshape(-1, len(lower)) * width
-    )
+    df, dlam = hardware_slopes(plant_of(problem), theta)
+    sizes = constraint_sizes(problem)
+    shares = constraint_shares(problem, theta)
+    return Hardware(problem.w1 * df * width, shares, dlam * width / sizes[:, None])
 
 
 def objective_gradient(problem: CoDesignProblem, sample: BandwidthSample) -> Array:

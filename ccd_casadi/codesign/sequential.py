@@ -11,9 +11,10 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
+from ccd_casadi.inner_problem.constraints import constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -103,7 +104,7 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
     program = NonlinearProgram(
         x=theta,
         f=cost / (abs(hardware_cost(plant, start)) or 1.0),
-        g=ca.vertcat(-callback(theta), lam),
+        g=ca.vertcat(-callback(theta), lam / ca.DM(constraint_sizes(problem))),
         lower=lower,
         upper=upper,
         variables=problem.names,
@@ -115,7 +116,6 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
     except OuterFailure:
         point = np.array(start)
     omega = callback.at(point)[0]
-    allowed = bool((constraint_values(plant, point) <= 1e-9).all())
-    met = bool(omega >= resonance * (1.0 - 1e-6)) and allowed
+    met = bool(omega >= resonance * (1.0 - 1e-6)) and not unmet(problem, point)
     value = hardware_cost(plant, point)
     return HardwareDesign(tuple(float(v) for v in point), value, omega, met)

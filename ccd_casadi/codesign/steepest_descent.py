@@ -95,10 +95,11 @@ class Descent:
 
 @dataclass(frozen=True)
 class _Answer:
-    """ω_b (rad/s) of the best design at a θ, dω_b/dθ, and its (ω_S, ω_T), NaN where it has none."""
+    """The best design at a θ: ω_b (rad/s), what J counts, that one's slope, (ω_S, ω_T) or NaN."""
 
     design: Sensitivities | SectionsDesign
     bandwidth: float
+    value: float
     slope: Array
     frequencies: tuple[float, float] = (np.nan, np.nan)
 
@@ -153,7 +154,7 @@ def steepest_descent(
             found = asked(trial, answer.frequencies)
             if (
                 found is not None
-                and _objective(problem, trial, found.bandwidth) < history[-1].objective
+                and _objective(problem, trial, found.value) < history[-1].objective
             ):
                 accepted = trial, found
                 break
@@ -172,7 +173,8 @@ def _structured(problem: CoDesignProblem) -> _Ask:
         value = sections_value(problem, theta.tolist())
         if not value.feasible:
             return None, value.syntheses
-        return _Answer(value.design, value.bandwidth, np.array(value.gradient)), value.syntheses
+        slope = np.array(value.gradient)
+        return _Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
 
     return ask
 
@@ -187,7 +189,8 @@ def _swept(problem: CoDesignProblem, gradient: Gradient) -> _Ask:
         figures = design.figures
         slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
         frequencies = (figures.omega_S, figures.omega_T)
-        return _Answer(design, figures.bandwidth, np.asarray(slope, float), frequencies), spent
+        omega = figures.bandwidth
+        return _Answer(design, omega, omega, np.asarray(slope, float), frequencies), spent
 
     return ask
 
@@ -231,8 +234,8 @@ def _cost_gradient(problem: CoDesignProblem) -> Callable[[Array], Array]:
     return lambda theta: np.array(function(theta)).ravel()
 
 
-def _objective(problem: CoDesignProblem, theta: Array, bandwidth: float) -> float:
-    return problem.w1 * hardware_cost(plant_of(problem), theta) + problem.w2 * bandwidth
+def _objective(problem: CoDesignProblem, theta: Array, value: float) -> float:
+    return problem.w1 * hardware_cost(plant_of(problem), theta) + problem.w2 * value
 
 
 def _iterate(
@@ -248,7 +251,7 @@ def _iterate(
         omega_S=answer.frequencies[0],
         omega_T=answer.frequencies[1],
         bandwidth=answer.bandwidth,
-        objective=_objective(problem, theta, answer.bandwidth),
+        objective=_objective(problem, theta, answer.value),
         gradient=tuple(float(v) for v in gradient),
         step=step,
         syntheses=spent,

@@ -9,11 +9,12 @@ from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
 from ccd_casadi.codesign.survival import Survival, survival
+from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
-from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
@@ -69,7 +70,7 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     """Polish x on the true problem, ask the global inner problem there, certify what results."""
     problem = sampler.problem
     count = len(problem.names)
-    quantities = TrueQuantities(problem, sampler.record)
+    quantities = sampler.truth
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
@@ -112,7 +113,7 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         design=final,
         objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
         hardware_cost=cost,
-        active=_active(problem, x, final.figures),
+        active=_active(problem, quantities, x, final.figures),
         kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
         inner_gap=float(gap),
         feasible=acceptable(problem, x, design),
@@ -163,10 +164,10 @@ def _snapped(problem: CoDesignProblem, x: Array) -> Array:
     return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)
 
 
-def _active(problem: CoDesignProblem, x: Array, figures: DesignFigures) -> tuple[str, ...]:
-    program = lifted_program(problem, TrueQuantities(problem), exact_hessian=False)
+def _active(
+    problem: CoDesignProblem, quantities: TrueQuantities, x: Array, figures: DesignFigures
+) -> tuple[str, ...]:
+    program = lifted_program(problem, quantities, exact_hessian=False)
     bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
-    plant = plant_of(problem)
-    lam = constraint_values(plant, x[: len(problem.names)])
-    extra = [n for n, v in zip(plant.constraint_names, lam, strict=True) if v >= -1e-6]
+    extra = touched(problem, x[: len(problem.names)])
     return (*bounds, *active_constraints(problem.inner, figures), *extra)

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -17,7 +18,7 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_by
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
-from ccd_casadi.plants.plant import Mechanics, constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -198,10 +199,7 @@ def judged(
 
 def hardware_at(problem: CoDesignProblem, theta: Sequence[float]) -> tuple[float, list[str]]:
     """f(θ), and the names of the constraints on θ that are not met."""
-    plant = plant_of(problem)
-    values = constraint_values(plant, theta)
-    broken = [n for n, v in zip(plant.constraint_names, values, strict=True) if v > 1e-9]
-    return hardware_cost(plant, theta), broken
+    return hardware_cost(plant_of(problem), theta), list(unmet(problem, tuple(theta)))
 
 
 def _excess(problem: CoDesignProblem, row: DesignFigures) -> float:

@@ -47,7 +47,7 @@ def synthesise(
     bounds: Bounds,
     *,
     sampling: Sampling | None = None,
-    starts: int = 24,
+    starts: int = 12,
     seed: int = 0,
     initial: Sequence[Array | StateSpace] = (),
     only_initial: bool = False,

@@ -25,7 +25,7 @@ def synthesise_sections(
     *,
     sampling: Sampling | None = None,
     M_K: float | None = None,
-    starts: int = 24,
+    starts: int = 12,
     seed: int = 0,
     initial: Sequence[Any] = (),
     progress: Progress | None = None,

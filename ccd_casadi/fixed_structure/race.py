@@ -20,7 +20,7 @@ from ccd_casadi.support.process_pool import Pool, Workers
 FIRST = float(np.log(0.1))  # τ at the start, ω_b over ω₀
 ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
 HALVINGS = 3  # rounds after which the better half goes on
-LAST = 3  # that are never halved away
+LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
 MERGED = 1e-3  # in κ and τ: searches as close as that are one

@@ -222,7 +222,7 @@ def synthesise_robustly(
     bounds: Bounds,
     *,
     sampling: Sampling | None = None,
-    starts: int = 24,
+    starts: int = 12,
     seed: int = 0,
     initial: Sequence[Array | StateSpace] = (),
     rounds: int = 8,

@@ -62,6 +62,11 @@ class SectionsValue:
     envelope: Envelope | None = None
 
     @property
+    def value(self) -> float:
+        """What J counts: the error where the problem minimises that, else ω_b*."""
+        return self.bandwidth if np.isnan(self.error) else self.error
+
+    @property
     def feasible(self) -> bool:
         """Whether the judge confirms a design at θ."""
         return self.design.certified

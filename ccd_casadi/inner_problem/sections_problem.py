@@ -77,7 +77,7 @@ class SectionsProblem:
     compliance_max: float | None = None
     sampling: Sampling | None = None
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
-    starts: int = 24
+    starts: int = 12
     seed: int = 0
     frequencies: tuple[float, float] | None = None
     anchors: tuple[tuple[float, ...], ...] = ()

@@ -8,7 +8,7 @@ options; it returns a mapping with `mass`, `stiffness`, `input`, `output`, one o
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import casadi as ca
@@ -73,6 +73,13 @@ class Plant:
     nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
+
+    @cached_property
+    def slopes(self) -> ca.Function:
+        """θ to the Jacobians of f (1, n) and λ (m, n)."""
+        theta = ca.MX.sym("theta", len(self.names))
+        f, lam = self.hardware(theta)
+        return ca.Function("slopes", [theta], [ca.jacobian(f, theta), ca.jacobian(lam, theta)])
 
 
 def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str, Any]) -> Plant:
@@ -210,6 +217,12 @@ def hardware_cost(plant: Plant, theta: Sequence[float] | Array) -> float:
 def constraint_values(plant: Plant, theta: Sequence[float] | Array) -> Array:
     """λ(θ), one value a name of `plant.constraint_names`; met where <= 0."""
     return np.array(plant.hardware(np.asarray(theta, float))[1]).ravel()
+
+
+def hardware_slopes(plant: Plant, theta: Sequence[float] | Array) -> tuple[Array, Array]:
+    """∇f (n,) and ∇λ (m, n) at θ."""
+    df, dlam = (np.array(value) for value in plant.slopes(np.asarray(theta, float)))
+    return df.ravel(), dlam.reshape(-1, len(plant.names))
 
 
 def theta_words(plant: Plant, theta: Sequence[float]) -> str:

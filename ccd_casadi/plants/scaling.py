@@ -80,6 +80,11 @@ class ScaledPlant:
     channels: tuple[ScaledChannel, ...] = ()
     family: PlantFamily | None = None
 
+    @property
+    def members(self) -> "tuple[ScaledPlant, ...]":
+        """The plants that a design on it is judged on: itself, and those of its family."""
+        return (self, *(() if self.family is None else self.family.perturbed))
+
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""
         w0 = self.omega_0

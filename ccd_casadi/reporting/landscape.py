@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.maps import Landscape
 from ccd_casadi.reporting.page import Table, number
@@ -56,7 +56,7 @@ def landscape_data(
     forbidden = None
     plant = plant_of(problem)
     if plant.constraint_names:
-        bad = [bool((constraint_values(plant, theta) > 0.0).any()) for theta in thetas]
+        bad = [bool(unmet(problem, theta)) for theta in thetas]
         forbidden = np.array(bad).reshape(count, count)
     region = None
     if radius < 1.0 and centre is not None:

@@ -1,15 +1,19 @@
 """Offline sampling of the truth on all cores, through the store: nothing is computed twice.
 
 The rows and the result of a unit of work (`units`) are written in one transaction, so a kill loses
-only units in flight.
+only units in flight. Not so for `truth`, which a polish asks one design after the other: these are
+made once a run, as what is asked of them besides, controller and local peaks of S, is in no row.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_design
-from ccd_casadi.plants.plant import constraint_values, hardware_cost
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import (
@@ -104,7 +108,7 @@ class Sampler:
                 self.nearest is None or sample.violation < self.nearest.violation
             ):
                 self.nearest = sample
-            self._spend(key, sample.syntheses, theta, sample.value)
+            self._spend(key, sample.syntheses, theta, sample.bandwidth, sample.value)
         return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:
@@ -132,12 +136,10 @@ class Sampler:
         inner = self.problem.inner
         return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
 
-    def design(self, x: Array) -> Sensitivities:
-        """One true design at x, recorded."""
-        point = np.asarray(x, float)
-        made = true_design(self.problem, tuple(point[:-2]), *frequencies(self.problem, point))
-        self.record(point, made)
-        return made
+    @cached_property
+    def truth(self) -> TrueQuantities:
+        """The true quantities at any x, for IPOPT and what polishes: made in this process."""
+        return TrueQuantities(self.problem, self.record)
 
     def record(self, x: Array, design: Sensitivities) -> None:
         """Keep a design made outside the pool (IPOPT on the true function)."""
@@ -147,16 +149,29 @@ class Sampler:
         self.store.put([sample], self.hash)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
 
-    def _spend(self, key: str, count: int, theta: tuple[float, ...], bandwidth: float) -> None:
-        """Count a unit once, and keep what it was worth: NaN where it is not feasible."""
+    def also(self, name: str) -> None:
+        """Count one more of what is no design at an asked θ, such as a race; each name once."""
+        self._spent[f"{self.hash} {name}"] = 1
+
+    def _spend(
+        self,
+        key: str,
+        count: int,
+        theta: tuple[float, ...],
+        bandwidth: float,
+        value: float | None = None,
+    ) -> None:
+        """Count a unit once, and keep what it was worth: NaN where it is not feasible.
+
+        `value` is what J counts, where that is not the bandwidth.
+        """
         if key in self._spent:
             return
         self._spent[key] = count
-        objective = np.nan
-        plant = plant_of(self.problem)
-        if np.isfinite(bandwidth) and (constraint_values(plant, theta) <= 1e-9).all():
-            cost = hardware_cost(plant, theta)
-            objective = self.problem.w1 * cost + self.problem.w2 * bandwidth
+        objective, value = np.nan, bandwidth if value is None else value
+        if np.isfinite(value) and not unmet(self.problem, theta):
+            cost = hardware_cost(plant_of(self.problem), theta)
+            objective = self.problem.w1 * cost + self.problem.w2 * value
         self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(objective)))
 
     def _meets(self, sample: Sample) -> bool:

@@ -54,5 +54,4 @@ def compliance_of(plant: ScaledPlant, controller: StateSpace) -> Compliance:
 
 def compliance_over_family(plant: ScaledPlant, controller: StateSpace) -> Compliance:
     """The largest of the plant itself and, where it has a family, of every plant of that."""
-    members = (plant, *(() if plant.family is None else plant.family.perturbed))
-    return max((compliance_of(each, controller) for each in members), key=lambda c: c.gain)
+    return max((compliance_of(each, controller) for each in plant.members), key=lambda c: c.gain)

@@ -4,7 +4,7 @@ The controller, γ_opt and the Riccati solution move with the plant; the paper's
 with K held fixed (its equations (10) to (13)), comes along for the baseline.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,6 +27,20 @@ _WEIGHTS = ("M_S", "A_S", "omega_S", "c_K", "omega_K", "A_l", "A_u", "omega_T")
 
 
 @dataclass(frozen=True)
+class Made:
+    """What was made, in scaled units: for what else is read off the same design.
+
+    `row` of its figures, (A_K, B_K, C_K), dγ_opt to θ and weights; `worst` is the place in its
+    family of the plant that has ‖S‖∞, 0 the plant itself.
+    """
+
+    row: Array
+    controller: tuple[Array, Array, Array]
+    to_gamma: Array
+    worst: int = 0
+
+
+@dataclass(frozen=True)
 class Sensitivities(Shown):
     """Figures of one design with their gradients.
 
@@ -44,6 +58,7 @@ class Sensitivities(Shown):
     to_weights: dict[str, Array]
     fixed_controller: Array
     simple: tuple[bool, ...]
+    made: Made | None = field(default=None, repr=False, compare=False)
 
     @property
     def to_break_frequencies(self) -> Array:
@@ -74,13 +89,15 @@ def sensitivities(
     count = plant.dA.shape[0]
     names = _WEIGHTS + (("disturbance",) if weights.delta else ())
     scaled = np.append(w, weights.delta)
-    figures = None
+    figures = made = None
     try:
         row, *controller, gradient, fixed, gaps = design_with_gradients(
             *arguments, omega_low / w0, guess, *slopes, made_on.channels, weights.delta
         )
+        made = Made(row, (controller[0], controller[1], controller[2]), gradient[3].copy())
         if plant.family is not None or compliance:
-            figures, worst = over_family(plant, weights, row, tuple(controller), omega_low)
+            figures, worst = over_family(plant, weights, row, made.controller, omega_low)
+            made = replace(made, worst=[at is worst for at in plant.members].index(True))
             places = [
                 (plant, figures.bandwidth, False),
                 (worst, figures.sensitivity_peak_frequency, False),
@@ -119,4 +136,5 @@ def sensitivities(
         to_weights={name: gradient[:, count + i] * scaled[i] for i, name in enumerate(names)},
         fixed_controller=fixed * w0,
         simple=tuple(bool(gap > MULTIPLE_GAP) for gap in gaps),
+        made=made,
     )

@@ -11,15 +11,11 @@ from scipy.optimize import minimize_scalar
 
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.kernels.gradients import (
-    DesignPlant,
-    Loop,
-    design_with_gradients,
-    peak_gradients,
-)
+from ccd_casadi.kernels.gradients import DesignPlant, Loop, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
 
 # Around each closed-loop pole in multiples of its width, and over the decades about ω₀: what no
@@ -46,50 +42,36 @@ class LocalPeak:
 def local_peaks_with_gradients(
     plant: ScaledPlant,
     weights: Weights,
+    design: Sensitivities,
     *,
     gamma_backoff: float,
     least: float,
 ) -> tuple[LocalPeak, ...]:
     """All local peaks of at least `least`, largest first; none where the design has no derivatives.
 
-    Synthesises once more at (θ, weights): the same design as `sensitivities` has there.
+    `design`: what `sensitivities` made of the same plant and weights; nothing is made anew.
     """
+    made = design.made
+    if made is None or made.row[Figure.CODE] != Code.CERTIFIED or made.row[Figure.BALANCED]:
+        return ()
     w0, w = plant.omega_0, weights.scaled(plant.omega_0)
     made_on = plant if plant.family is None else plant.family.design
-    base = (made_on.A, made_on.B, made_on.C, w)
-    slopes = (made_on.dA, made_on.dB, made_on.dC)
-    try:
-        row, Ak, Bk, Ck, gradient, _, _ = design_with_gradients(
-            *base,
-            made_on.grid,
-            made_on.gain,
-            gamma_backoff,
-            1e-3,
-            0.0,
-            *slopes,
-            made_on.channels,
-            weights.delta,
-        )
-    except np.linalg.LinAlgError:
-        return ()
-    if row[Figure.CODE] != Code.CERTIFIED or row[Figure.BALANCED]:
-        return ()
-    members = (plant, *(() if plant.family is None else plant.family.perturbed))
     found = [
         (omega, i, gain)
-        for i, member in enumerate(members)
-        for omega, gain in _peaks(member, (Ak, Bk, Ck), least)
+        for i, member in enumerate(plant.members)
+        for omega, gain in _peaks(member, made.controller, least)
     ]
     if not found:
         return ()
     loops = [
         Loop(at.A, at.B, at.C, at.dA, at.dB, at.dC, omega)
-        for omega, at in ((omega, members[i]) for omega, i, _ in found)
+        for omega, at in ((omega, plant.members[i]) for omega, i, _ in found)
     ]
     count = plant.dA.shape[0]
-    design_plant = DesignPlant(*base[:3], *slopes, w, gamma_backoff, weights.delta)
+    slopes = (made_on.dA, made_on.dB, made_on.dC)
+    made_at = DesignPlant(made_on.A, made_on.B, made_on.C, *slopes, w, gamma_backoff, weights.delta)
     try:
-        rows = peak_gradients(design_plant, row, gradient[3], loops)
+        rows = peak_gradients(made_at, made.row, made.to_gamma, loops)
     except np.linalg.LinAlgError:
         return ()
     out = []

@@ -1,0 +1,107 @@
+"""Quadratic programmes: an answer is the optimum, and no answer is never taken for one."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers import HZ, few, problem
+from hypothesis import given
+from hypothesis import strategies as st
+from test_kinks import pieces
+
+from ccd_casadi.codesign import bundle
+from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim import quadratic
+from ccd_casadi.optim.quadratic import INSIDE, KEPT, solve_quadratic
+from ccd_casadi.support.arrays import Array
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def elastic(rng: np.random.Generator) -> tuple[Array, ...]:
+    """A trust-region step with elastic rows, whose H is nearly singular: see `codesign.kinked`.
+
+    The dual active-set method alone calls a success what misses the rows of every second one.
+    """
+    n, m, radius = int(rng.integers(2, 30)), int(rng.integers(1, 12)), 10.0 ** rng.uniform(-6, -0.5)
+    root = rng.normal(size=(n, n))
+    H = np.zeros((n + m, n + m))
+    H[:n, :n] = radius * 10.0 ** rng.uniform(-2, 3) * (root @ root.T / n + 1e-9 * np.eye(n))
+    H[n:, n:] = 1e-6 * np.eye(m)
+    c = np.append(rng.normal(size=n) / 3.0, np.full(m, 10.0 * (1.0 + 10.0 ** rng.uniform(0, 3))))
+    A = np.hstack([rng.normal(size=(m, n)), -np.eye(m)])
+    upper = -rng.normal(size=m) * 10.0 ** rng.uniform(-9, -1) / radius
+    z = rng.uniform(size=n) * (rng.uniform(size=n) > 0.3)
+    low = np.append(np.maximum(-1.0, -z / radius), np.zeros(m))
+    high = np.append(np.minimum(1.0, (1.0 - z) / radius), np.full(m, np.inf))
+    return H, c, A, upper, low, high
+
+
+@few(max_examples=60)
+@given(seed=SEEDS)
+def test_an_answer_keeps_its_rows_and_is_optimal(seed: int) -> None:
+    """Its value is the dual's: no feasible point has a lower one (weak duality)."""
+    H, c, A, upper, low, high = elastic(np.random.default_rng(seed))
+    found = solve_quadratic(H, c, A, upper, low, high, singular=True)
+    assert found is not None
+    x, mu = found.x, found.multipliers
+    assert (A @ x - upper).max() <= KEPT
+    assert max((low - x).max(), (x - high).max()) <= INSIDE
+    slope = H @ x + c + A.T @ mu  # what the bounds carry
+    ends = np.where(slope > 0.0, low, np.where(np.isfinite(high), high, x))
+    dual = -0.5 * x @ H @ x - mu @ upper + slope @ ends
+    primal = c @ x + 0.5 * x @ H @ x
+    assert primal - dual <= 1e-5 * (np.abs(c) @ np.abs(x) + np.abs(mu) @ np.abs(upper) + 1.0)
+
+
+class Refused:
+    """A solver of CasADi's whose answer is no success."""
+
+    def __call__(self, **programme: object) -> dict:
+        return {"x": ca.DM(programme["g"]) * 0.0, "lam_a": ca.DM(0), "cost": ca.DM(0)}
+
+    def stats(self) -> dict:
+        return {"success": False}
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch):
+    """Let the next programmes fail, by either solver."""
+
+    def let(count: int) -> None:
+        left = [count]
+        dual, interior = quadratic.daqp.solve, quadratic._interior
+
+        def solve(*programme: object, **options: object) -> tuple:
+            x, value, flag, info = dual(*programme, **options)
+            return x, value, -1 if left[0] else flag, info
+
+        def other(*shape: object) -> object:
+            refused = left[0] > 0
+            left[0] -= refused
+            return Refused() if refused else interior(*shape)
+
+        monkeypatch.setattr(quadratic.daqp, "solve", solve)
+        monkeypatch.setattr(quadratic, "_interior", other)
+
+    return let
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_failed_programme_is_no_optimum_on_kinks(failing, count: int) -> None:
+    case = problem()
+    quantities = TrueQuantities(case)
+    start = np.array([60.0, 66.0, *np.log([500.0 * HZ, 45.0 * HZ])])
+    failing(count)
+    end = descend(case, quantities, start, steps=40)
+    assert kkt_certificate(case, end, quantities.at(end)).stationarity <= SMOOTH
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_failed_programme_is_no_optimum_in_a_bundle(failing, count: int) -> None:
+    p = pieces(np.random.default_rng(0), 3, 3, bound=False, bent=0.3)
+    z = np.full(3, 0.35)
+    failing(count)
+    best = bundle.descend(p.at, p.at(z), [], p.constraints, steps=80, settled=1e-12)
+    assert np.abs(best.z - p.minimiser).max() <= 1e-4
