@@ -12,7 +12,7 @@ from ccd_casadi.codesign.mixed_verdict import verdict_of
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
-from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
+from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.json_files import clean
@@ -122,7 +122,7 @@ def result_dict(
             }
             for check in verified.references
         },
-        **_robust(verified.robust),
+        **_robust(verified),
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         "syntheses": syntheses,
@@ -196,18 +196,20 @@ def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
     }
 
 
-def _robust(check: RobustCheck | None) -> dict[str, Any]:
-    """What a robust design does on its nominal plant and on a dense set; nothing for others."""
+def _robust(verified: VerifiedDesign) -> dict[str, Any]:
+    """What a robust design does on its nominal plant and all along its set; nothing for others."""
+    check = verified.robust
     if check is None:
         return {}
     return {
         "robust": {
-            "nominal_sensitivity_peak": check.nominal.sensitivity_peak,
-            "stable": check.worst.certificate.stable,
-            "worst_sensitivity_peak": check.worst.sensitivity_peak,
+            "nominal_sensitivity_peak": check.nominal,
+            "stable": math.isfinite(check.peak),
+            "worst_sensitivity_peak": check.peak,
             "worst_shift": check.at.shift,
             "worst_damping": check.at.damping,
             "plants": check.plants,
+            **({} if verified.damping is None else verified.damping.entry),
         }
     }
 

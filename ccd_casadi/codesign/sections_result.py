@@ -142,6 +142,7 @@ def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str,
             for option, point in sections_of_problem(verified.problem).members
         ],
         "words": wide.words,
+        **({} if verified.damping is None else verified.damping.entry),
     }
 
 
@@ -187,7 +188,7 @@ def sections_result(
         "constraints": bool((lam <= 1e-9).all()),
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.race_gap <= tolerance),
-        "robust": verified.wide.passed and not verified.proof.refuted,
+        "robust": verified.kept,
     }
     verdict = sections_verdict(
         verified, constraints=checks["constraints"], error=error, tolerance=tolerance,

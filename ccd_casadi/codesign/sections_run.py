@@ -14,11 +14,13 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.robust_check import OtherDamping, other_damping, reach_of, survived
 from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
 from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.survival import Survival, loops_of
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.optimality import Envelope
@@ -62,6 +64,15 @@ class VerifiedSections:
     predicted: float
     value: float
     rounds: int
+    survival: Survival | None
+    damping: OtherDamping | None
+
+    @property
+    def kept(self) -> bool:
+        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
+        found, ends = self.survival, reach_of(self.problem)
+        along = found is None or found.within(*ends)
+        return self.wide.passed and not self.proof.refuted and along
 
 
 @dataclass(frozen=True)
@@ -186,6 +197,7 @@ def _verified(
     problem, best, made = asked.problem, end.best, end.design
     assert made.controller is not None
     worst = end.worst
+    loops = loops_of(problem, best.theta, made.controller)
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
     return VerifiedSections(
         problem=problem,
@@ -203,6 +215,8 @@ def _verified(
         predicted=_predicted(outcome, best),
         value=best.value,
         rounds=rounds,
+        survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
+        damping=other_damping(problem, loops),
     )
 
 
