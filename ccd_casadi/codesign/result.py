@@ -1,6 +1,7 @@
 """The run folder's JSON files: result.json and controller.json."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -15,6 +16,7 @@ from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
 from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -59,7 +61,7 @@ def result_dict(
     verified: VerifiedDesign,
     *,
     tolerance: float,
-    syntheses: int,
+    spent: Mapping[str, int],
     seconds: float,
     seed: int,
     quality: tuple[Quality, ...] = (),
@@ -125,7 +127,7 @@ def result_dict(
         **_robust(verified),
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        "syntheses": syntheses,
+        **spent_entry(spent, look is not None and look.moved),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),
@@ -146,14 +148,14 @@ def _compliance(verified: VerifiedDesign) -> dict[str, Any]:
 
 
 def infeasible_dict(
-    formulation: str, reason: str, *, syntheses: int, seconds: float, seed: int
+    formulation: str, reason: str, *, spent: Mapping[str, int], seconds: float, seed: int
 ) -> dict[str, Any]:
     """result.json where no certified design meets the constraints."""
     return {
         "status": "infeasible",
         "reason": reason,
         "formulation": formulation,
-        "syntheses": syntheses,
+        **spent_entry(spent),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),

@@ -1,5 +1,6 @@
 """result.json and controller.json of a co-design with a controller of fixed structure."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -20,6 +21,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.plants.plant import constraint_values
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -172,7 +174,7 @@ def sections_result(
     verified: VerifiedSections,
     *,
     tolerance: float,
-    syntheses: int,
+    spent: Mapping[str, int],
     seconds: float,
     seed: int,
     quality: tuple[Quality, ...] = (),
@@ -234,7 +236,7 @@ def sections_result(
         "proof": proof_dict(verified.proof),
         "notes": notes,
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        "syntheses": syntheses,
+        **spent_entry(spent),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),

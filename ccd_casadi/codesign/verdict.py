@@ -304,7 +304,8 @@ def reason(verdict: Verdict) -> str:
 
 def _range(low: float, high: float) -> str:
     beyond = [">" if abs(end) >= 0.999 * REACH else "" for end in (low, high)]
-    return f"{beyond[0]}{100 * low:+.2g} to {beyond[1]}{100 * high:+.2g} %"
+    shown = [float(round(100.0 * end, 3)) for end in (low, high)]  # less is none
+    return f"{beyond[0]}{shown[0]:+.2g} to {beyond[1]}{shown[1]:+.2g} %"
 
 
 def _count(number: int, noun: str) -> str:

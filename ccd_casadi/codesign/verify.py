@@ -58,13 +58,19 @@ class VerifiedDesign:
 
 def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     """Polish x on the true problem, ask the global inner problem there, certify what results."""
+    with sampler.spent.on("checks"):
+        return _verified(sampler, x)
+
+
+def _verified(sampler: Sampler, x: Array) -> VerifiedDesign:
     problem = sampler.problem
     count = len(problem.names)
     quantities = TrueQuantities(problem, sampler.record)
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
-        with Progress(1, "polishing on the truth", quiet=sampler.quiet) as progress:
+        polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
+        with polishing as progress, sampler.spent.on("polish"):
             x, design, _ = polish(sampler, x)
             progress.advance()
         at_bounds = _snapped(problem, x)

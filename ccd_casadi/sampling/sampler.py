@@ -19,6 +19,7 @@ from ccd_casadi.sampling.samples import (
     quantity_sample,
     sample_of,
 )
+from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import design_unit, frequencies, inner_unit
 from ccd_casadi.support.arrays import Array
@@ -56,7 +57,7 @@ class Sampler:
         self.hash = problem_hash(problem.identity())
         self.inner_hash = problem_hash({"problem": self.hash, "inner": problem.inner_identity()})
         store.put_problem(self.hash, problem.identity())
-        self._spent: dict[str, int] = {}
+        self.spent = Spent()
         self.trace: list[TraceEntry] = []
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
         self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # inner problems asked for
@@ -67,7 +68,7 @@ class Sampler:
         An easier problem's designs are worth nothing to this one: they are not traced.
         """
         other = Sampler(problem, self.store, self.workers, quiet=self.quiet)
-        other._spent = self._spent
+        other.spent = self.spent
         if traced:
             other.trace = self.trace
         return other
@@ -75,7 +76,7 @@ class Sampler:
     @property
     def syntheses(self) -> int:
         """Distinct true syntheses asked for so far."""
-        return sum(self._spent.values())
+        return self.spent.total
 
     def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
         """ω_b* at every row of `thetas`, in their order."""
@@ -149,9 +150,8 @@ class Sampler:
 
     def _spend(self, key: str, count: int, theta: tuple[float, ...], bandwidth: float) -> None:
         """Count a unit once, and keep what it was worth: NaN where it is not feasible."""
-        if key in self._spent:
+        if not self.spent.once(key, count):
             return
-        self._spent[key] = count
         objective = np.nan
         plant = plant_of(self.problem)
         if np.isfinite(bandwidth) and (constraint_values(plant, theta) <= 1e-9).all():
