@@ -31,7 +31,7 @@ class Controller:
         self.continuous, self.sampling = continuous, sampling
         self.state = continuous if sampling is None else tustin(continuous, sampling.period)
         self._poles, V = np.linalg.eig(self.state.A)
-        self._sound = bool(np.linalg.cond(V) < 1e8)
+        self._sound = bool(not V.size or np.linalg.cond(V) < 1e8)
         if self._sound:
             right = np.linalg.solve(V, self.state.B + 0j)
             self._left, self._right = self.state.C @ V, right
