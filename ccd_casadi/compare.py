@@ -15,15 +15,17 @@ def table(comparison: "Comparison") -> str:
     """The methods in a few columns for the terminal."""
     from ccd_casadi.reporting.verdict import short
 
-    lines = [f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'s':>8}  status"]
+    head = f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'box look':>10}"
+    lines = [f"{head}{'s':>8}  status"]
     for method in comparison.methods:
         f = method.figures
         if f.get("objective") is None:
-            lines.append(f"{method.name:24}{'':49}  {f['status']}: {f.get('reason', '')}")
+            lines.append(f"{method.name:24}{'':59}  {f['status']}: {f.get('reason', '')}")
             continue
         lines.append(
             f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
-            f"{f['hardware_cost']:10.4g}{f['syntheses']:11d}{f['seconds']:8.1f}  {f['status']}"
+            f"{f['hardware_cost']:10.4g}{f['syntheses_to_optimum']:11d}"
+            f"{f['syntheses'] - f['syntheses_to_optimum']:10d}{f['seconds']:8.1f}  {f['status']}"
             + (f" ({short(f)})" if short(f) else "")
         )
     return "\n".join(lines)

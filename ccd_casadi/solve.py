@@ -29,6 +29,7 @@ def summary(solution: "Solution") -> str:
     from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.reporting.verdict import terminal_lines
+    from ccd_casadi.sampling.spent import cost_words
 
     result = solution.result
     if result["status"] == "infeasible":
@@ -55,7 +56,7 @@ def summary(solution: "Solution") -> str:
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
         f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
-        f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
+        f"cost          {cost_words(result)}",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
@@ -98,6 +99,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
     from ccd_casadi.codesign.budget_result import budget_lines
     from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words
     from ccd_casadi.reporting.verdict import terminal_lines
+    from ccd_casadi.sampling.spent import cost_words
     from ccd_casadi.support.units import counted
 
     residual = result["kkt"]["stationarity"]
@@ -127,7 +129,7 @@ def sections_summary(result: Mapping[str, Any]) -> str:
         f"theta{'' if result['kkt'].get('kink') is None else ' and controller, at a kink of J'}, "
         f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
         + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
-        f"cost          {result['syntheses']} syntheses, {result['seconds']:.1f} s",
+        f"cost          {cost_words(result)}",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)

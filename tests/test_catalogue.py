@@ -35,6 +35,7 @@ from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Workers
@@ -139,7 +140,7 @@ class Found:
 class OneSampler(SimpleNamespace):
     """What the search asks of a Sampler."""
 
-    syntheses = 0
+    spent = Spent()
 
     def of(self, other: CoDesignProblem) -> "OneSampler":
         return OneSampler(problem=other)

@@ -93,6 +93,13 @@ def test_three_formulations_agree_and_a_resumed_run_is_the_same(
         assert result["status"] == "verified", result["reason"]
         assert result["omega_S_hz"] is None
         assert result["kkt"]["stationarity"] < 1e-4
+        survives = result["verdict"]["survives"]
+        assert survives["state"] == "warned", "[robust] names no plant"
+        assert "stable for resonances" in survives["words"]
+        assert survives["stable_shift"][0] <= survives["S_max_shift"][0] <= 0.0
+        assert survives["stable_damping"][0] < 1.0 < survives["stable_damping"][1]
+        assert survives["unstable_controller_poles_hz"] == []
+        assert result["verdict"]["deployable"]["delay_margin"] > 0.0
         assert result["objective"] == pytest.approx(nested.result["objective"], rel=1e-3)
     before = store.stat().st_mtime_ns
     again = solve(case, Nested(plan="sobol", points=4), store=store)

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from case_documents import SECTIONS_TABLES
+from contradictions import contradictions
 from helpers import problem
 
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.full_order import stacked_norm
 from ccd_casadi.codesign.sections_insight import sections_responses
@@ -71,6 +74,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "quick.toml").write_text(QUICK)
     assert solve_main([str(place / "quick.toml"), "--out", str(place / "run"), *COMMON]) == 0
     return place
+
+
+def test_its_verdict_agrees_with_itself(folder: Path) -> None:
+    problem = problem_of(load_case(folder / "run" / "case.toml"))
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert contradictions(result, problem) == []
+    assert {"races", "samples", "rounds"} <= set(result["spent"])
 
 
 def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:

@@ -23,7 +23,7 @@ from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.survival import REACH, Survival, survival
+from ccd_casadi.codesign.survival import REACH, Survival, loops_of, survival_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -149,7 +149,8 @@ def corner_design() -> tuple[Survival, float]:
         omega_low=problem().inner.omega_low,
     )
     bandwidth = made.figures.bandwidth
-    return survival(problem(), CORNER, made.controller, bandwidth), bandwidth
+    loops = loops_of(problem(), CORNER, made.controller)
+    return survival_of(problem(), loops, bandwidth), bandwidth
 
 
 def test_the_range_found_is_where_stability_is_lost() -> None:

@@ -22,6 +22,7 @@ from ccd_casadi.codesign.design_plants import order
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.spent import spent_entry, was_moved
 
 Lists = dict[str, tuple[float, ...]]
 AT = 1e-6  # of a range: this close to a value of its list an optimum is on it
@@ -99,7 +100,7 @@ def best_of_lists(sampler: Sampler, solve: Callable[[Sampler], Solution]) -> Sol
     assert best is not None
     result = best.result | {
         "seconds": perf_counter() - began,
-        "syntheses": sampler.syntheses,
+        **spent_entry(sampler.spent.by_purpose, was_moved(best.result)),
         "listed": _listed(problem, best, nodes, cut),
     }
     words = _words(problem, result)

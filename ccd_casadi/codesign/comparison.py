@@ -25,6 +25,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.process_pool import Pool
@@ -192,10 +193,12 @@ def _best_descent(
         "history": [asdict(iterate) for iterate in best.iterates],
     }
     if best.design is None:
-        figures = {"status": "infeasible", "reason": best.stop.value, "syntheses": best.syntheses}
+        figures = {"status": "infeasible", "reason": best.stop.value}
+        figures |= spent_entry({"descent": best.syntheses})
         return Method(name, clean(figures | extra), (), (), descent=best)
     theta = best.iterates[-1].theta
-    figures = _figures(problem, theta, best.design, best.syntheses, best.seconds) | extra
+    spent = {"descent": best.syntheses}
+    figures = _figures(problem, theta, best.design, spent, best.seconds) | extra
     trace = tuple(
         TraceEntry(item.syntheses, item.theta, item.bandwidth, item.objective)
         for item in best.iterates
@@ -223,9 +226,9 @@ def _sequential(
         sampler = Sampler(problem, store, workers)
         sample = sampler.bandwidths(np.array(hardware.theta))[0]
         trace = tuple(sampler.trace)
-        spent = sampler.syntheses
+        spent = sampler.spent.by_purpose
         if not sample.feasible:
-            figures = {"status": "infeasible", "reason": sample.shortfall, "syntheses": spent}
+            figures = {"status": "infeasible", "reason": sample.shortfall, **spent_entry(spent)}
             return Method(name, figures, (hardware.theta,), trace)
         design: Sensitivities | SectionsDesign
         if problem.sections is None:
@@ -243,7 +246,7 @@ def _figures(
     problem: CoDesignProblem,
     theta: tuple[float, ...],
     design: Sensitivities | SectionsDesign,
-    syntheses: int,
+    spent: dict[str, int],
     seconds: float,
 ) -> dict[str, Any]:
     """The contract's keys for a design that no formulation made."""
@@ -266,7 +269,7 @@ def _figures(
         "first_resonance_hz": _resonance(problem, theta),
         "surrogate_bandwidth_hz": None,
         "verification_error": None,
-        "syntheses": syntheses,
+        **spent_entry(spent),
         "seconds": seconds,
         "versions": versions(),
     }

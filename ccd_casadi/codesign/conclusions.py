@@ -18,11 +18,12 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     ranked = sorted(solved, key=lambda name: solved[name]["objective"])
     best = solved[ranked[0]]["objective"]
     near = [n for n in ranked if solved[n]["objective"] <= best + EQUAL * abs(best)]
-    cheapest = min(near, key=lambda name: solved[name]["syntheses"])
+    cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
     answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
     sentences = [
         f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
-        f"{cheapest} with {solved[cheapest]['syntheses']} true syntheses."
+        f"{cheapest} with {solved[cheapest]['syntheses_to_optimum']} true syntheses to the optimum"
+        f"{_beside(solved[cheapest])}."
     ]
     for name in ("steepest_descent", "steepest_descent_total"):
         if name in solved:
@@ -37,12 +38,18 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     return answer | {"sentences": sentences}
 
 
+def _beside(figures: dict[str, Any]) -> str:
+    """The look over the box that every formulation ends with, and no descent."""
+    beside = figures["syntheses"] - figures["syntheses_to_optimum"]
+    return f", and {beside} that looked over the box for a better one" if beside else ""
+
+
 def _descent(
     problem: CoDesignProblem, run: dict[str, Any], best: dict[str, Any], name: str
 ) -> tuple[dict[str, Any], list[str]]:
     """How far a descent ends from the best, and which of gradient, sweep or step stopped it."""
     gap = run["objective"] - best["objective"]
-    ratio = run["syntheses"] / best["syntheses"]
+    ratio = run["syntheses"] / best["syntheses_to_optimum"]
     theta = tuple(run["theta"].values())
     swept_loss = 0.0  # sections are not swept
     if problem.sections is None:

@@ -20,6 +20,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, pl
 from ccd_casadi.inner_problem.sweep import LABELS, missed_by
 from ccd_casadi.plants.plant import theta_words
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.spent import spent_entry, was_moved
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -94,7 +95,7 @@ def best_over_design_plants(
     best = min(range(len(found)), key=lambda i: (*order(found[i]), violation[i]))
     result = found[best].result | {
         "seconds": perf_counter() - began,
-        "syntheses": sampler.syntheses,
+        **spent_entry(sampler.spent.by_purpose, was_moved(found[best].result)),
     }
     if problem.robust is not None:
         names = [_at(choice) for choice in choices]

@@ -106,7 +106,8 @@ def solve_lifted(
             )
         x = solution.best.x
         predicted = np.array([float(process.predict(x[None, :])[0]) for process in processes])
-        sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
+        with sampler.spent.on("rounds"):
+            sample = sampler.quantities(x, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, incumbent, sample, predicted)
         iterates.append(iterate)
         settled = incumbent is not None and abs(

@@ -11,7 +11,7 @@ from ccd_casadi.codesign.verdict import (
     predicted,
     survives,
 )
-from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
+from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ
 from surrogates import Quality
@@ -62,7 +62,8 @@ def verdict_of(
             verified.survival,
             S_max=problem.inner.S_max,
             robust=None if robust is None else robust.passed,
-            robust_words=_robust_words(robust),
+            robust_words="" if robust is None else robust.words,
+            other_damping="" if verified.damping is None else verified.damping.words,
             closer=tuple(
                 CloserModel(
                     check.name,
@@ -74,15 +75,3 @@ def verdict_of(
         ),
         deployable=deployable(verified.survival),
     )
-
-
-def _robust_words(check: RobustCheck | None) -> str:
-    if check is None:
-        return ""
-    at = f"at {100 * check.at.shift:+.2g} %, damping x {check.at.damping:.3g}"
-    if not check.worst.certificate.stable:
-        return f"unstable within its own robust set, {at}"
-    peak = f"peak of S {check.worst.sensitivity_peak:.4g} {at}"
-    if check.passed:
-        return f"its own robust set is kept ({check.plants} plants, worst {peak})"
-    return f"its own robust set is not kept: {peak}"

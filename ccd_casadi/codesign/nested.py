@@ -96,7 +96,8 @@ def solve_nested(
             continue
         theta = solution.best.x
         predicted = float(surrogate.predict(theta[None, :])[0])
-        sample = sampler.bandwidths(theta, f"verifying round {round_number + 1}")[0]
+        with sampler.spent.on("rounds"):
+            sample = sampler.bandwidths(theta, f"verifying round {round_number + 1}")[0]
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
@@ -115,9 +116,10 @@ def solve_nested(
                 2 * len(theta) + 1,
                 seed + round_number,
             )
-            samples += sampler.bandwidths(
-                _allowed(problem, new), f"refining round {round_number + 1}"
-            )
+            with sampler.spent.on("rounds"):
+                samples += sampler.bandwidths(
+                    _allowed(problem, new), f"refining round {round_number + 1}"
+                )
         elif not improved:
             radius *= 0.5
         elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone

@@ -1,7 +1,7 @@
 """The run folder's JSON files: result.json and controller.json."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,9 +14,10 @@ from ccd_casadi.codesign.mixed_verdict import verdict_of
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
-from ccd_casadi.codesign.verify import RobustCheck, VerifiedDesign
+from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -61,7 +62,7 @@ def result_dict(
     verified: VerifiedDesign,
     *,
     tolerance: float,
-    syntheses: int,
+    spent: Mapping[str, int],
     seconds: float,
     seed: int,
     quality: tuple[Quality, ...] = (),
@@ -125,10 +126,10 @@ def result_dict(
             }
             for check in verified.references
         },
-        **_robust(verified.robust),
+        **_robust(verified),
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        "syntheses": syntheses,
+        **spent_entry(spent, look is not None and look.moved),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),
@@ -164,14 +165,14 @@ def _compliance(verified: VerifiedDesign) -> dict[str, Any]:
 
 
 def infeasible_dict(
-    formulation: str, reason: str, *, syntheses: int, seconds: float, seed: int
+    formulation: str, reason: str, *, spent: Mapping[str, int], seconds: float, seed: int
 ) -> dict[str, Any]:
     """result.json where no certified design meets the constraints."""
     return {
         "status": "infeasible",
         "reason": reason,
         "formulation": formulation,
-        "syntheses": syntheses,
+        **spent_entry(spent),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),
@@ -214,18 +215,20 @@ def kkt_dict(certificate: KktCertificate) -> dict[str, Any]:
     }
 
 
-def _robust(check: RobustCheck | None) -> dict[str, Any]:
-    """What a robust design does on its nominal plant and on a dense set; nothing for others."""
+def _robust(verified: VerifiedDesign) -> dict[str, Any]:
+    """What a robust design does on its nominal plant and all along its set; nothing for others."""
+    check = verified.robust
     if check is None:
         return {}
     return {
         "robust": {
-            "nominal_sensitivity_peak": check.nominal.sensitivity_peak,
-            "stable": check.worst.certificate.stable,
-            "worst_sensitivity_peak": check.worst.sensitivity_peak,
+            "nominal_sensitivity_peak": check.nominal,
+            "stable": math.isfinite(check.peak),
+            "worst_sensitivity_peak": check.peak,
             "worst_shift": check.at.shift,
             "worst_damping": check.at.damping,
             "plants": check.plants,
+            **({} if verified.damping is None else verified.damping.entry),
         }
     }
 

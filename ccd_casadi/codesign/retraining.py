@@ -39,6 +39,7 @@ from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, UserError
@@ -157,7 +158,7 @@ class CoDesignTruth:
                 self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
             )
         result = solution.result
-        result["syntheses"] = self.spent
+        result |= spent_entry({"store": self.spent})
         end: Array | None = None
         if solution.verified is not None:
             end = solution.verified.x

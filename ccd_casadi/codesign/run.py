@@ -101,7 +101,8 @@ def co_design(
         elif isinstance(formulation, Lifted):
             outcome = solve_lifted(each, formulation, seed=seed, given=given)
         else:
-            outcome = solve_direct(each, formulation, seed=seed)
+            with each.spent.on("search"):
+                outcome = solve_direct(each, formulation, seed=seed)
         if outcome.x is None:
             outcome = rescue(each, outcome, seed)
         if outcome.x is None:
@@ -139,7 +140,7 @@ def solution_of_sections(
     quiet: bool = True,
 ) -> Solution:
     """result.json and the objects behind it."""
-    spent: dict[str, Any] = {"syntheses": found.syntheses, "seconds": seconds, "seed": seed}
+    spent: dict[str, Any] = {"spent": found.spent, "seconds": seconds, "seed": seed}
     if found.verified is None:
         return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
     verified = found.verified

@@ -33,7 +33,9 @@ def conclude_with_look(
     name = type(formulation).__name__.lower()
     verified = verify(sampler, outcome.x)
     J = verified.objective if verified.feasible else np.inf
-    look = look_over_box(sampler, verified.x, J, formulation.box_points, seed, outcome.surrogates)
+    with sampler.spent.on("box_look"):
+        points = formulation.box_points
+        look = look_over_box(sampler, verified.x, J, points, seed, outcome.surrogates)
     rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
     if look.x is not None or (
         len(outcome.iterates) <= rounds
@@ -48,7 +50,9 @@ def conclude_with_look(
         ends = [verify(sampler, end) for end in _distinct(x, outcome.x)]
         verified = _best([verified, *ends], formulation.tolerance)
     if verified.kkt.stationarity > KKT_LEVEL:
-        ends = [verify(sampler, end) for end in perturbed(sampler, verified.x, seed)]
+        with sampler.spent.on("polish"):
+            starts = perturbed(sampler, verified.x, seed)
+        ends = [verify(sampler, end) for end in starts]
         verified = _best([verified, *ends], formulation.tolerance)
         if isinstance(formulation, Direct):  # has no surrogate that could have promised another
             outcome = replace(outcome, x=verified.x, design=sampler.truth.at(verified.x))
@@ -114,7 +118,7 @@ def conclude(
         result = infeasible_dict(
             formulation,
             outcome.message,
-            syntheses=sampler.syntheses,
+            spent=sampler.spent.by_purpose,
             seconds=perf_counter() - began,
             seed=seed,
         )
@@ -127,7 +131,7 @@ def conclude(
         outcome,
         verified,
         tolerance=tolerance,
-        syntheses=sampler.syntheses,
+        spent=sampler.spent.by_purpose,
         seconds=perf_counter() - began,
         seed=seed,
         quality=quality,
@@ -140,7 +144,8 @@ def rescue(sampler: Sampler, outcome: FormulationResult, seed: int) -> Formulati
     """Ask the true inner problem at a few θ: is the case infeasible, or did a formulation fail?"""
     lower, upper = box(sampler.problem)
     points = design("sobol", lower, upper, 8, seed)
-    samples = sampler.bandwidths(points, "looking for a feasible design")
+    with sampler.spent.on("rescue"):
+        samples = sampler.bandwidths(points, "looking for a feasible design")
     feasible = [sample for sample in samples if sample.feasible]
     if not feasible:
         assert sampler.nearest is not None

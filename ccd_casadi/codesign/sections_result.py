@@ -1,6 +1,6 @@
 """result.json and controller.json of a co-design with a controller of fixed structure."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -22,6 +22,7 @@ from ccd_casadi.inner_problem.constraints import touched, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -163,6 +164,7 @@ def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str,
             for option, point in sections_of_problem(verified.problem).members
         ],
         "words": wide.words,
+        **({} if verified.damping is None else verified.damping.entry),
     }
 
 
@@ -192,7 +194,7 @@ def sections_result(
     verified: VerifiedSections,
     *,
     tolerance: float,
-    syntheses: int,
+    spent: Mapping[str, int],
     seconds: float,
     seed: int,
     quality: tuple[Quality, ...] = (),
@@ -207,7 +209,7 @@ def sections_result(
         "constraints": not unmet(problem, verified.theta),
         "prediction": bool(error <= tolerance),
         "inner_optimum": bool(verified.race_gap <= tolerance),
-        "robust": verified.wide.passed and not verified.proof.refuted,
+        "robust": verified.kept,
     }
     verdict = sections_verdict(
         verified, constraints=checks["constraints"], error=error, tolerance=tolerance,
@@ -253,7 +255,7 @@ def sections_result(
         "proof": proof_dict(verified.proof),
         "notes": notes,
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        "syntheses": syntheses,
+        **spent_entry(spent),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),

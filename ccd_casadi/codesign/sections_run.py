@@ -14,11 +14,13 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.robust_check import OtherDamping, other_damping, reach_of, survived
 from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
 from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.survival import Survival, loops_of
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.optimality import Envelope
@@ -29,6 +31,7 @@ from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -62,6 +65,15 @@ class VerifiedSections:
     predicted: float
     value: float
     rounds: int
+    survival: Survival | None
+    damping: OtherDamping | None
+
+    @property
+    def kept(self) -> bool:
+        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
+        found, ends = self.survival, reach_of(self.problem)
+        along = found is None or found.within(*ends)
+        return self.wide.passed and not self.proof.refuted and along
 
 
 @dataclass(frozen=True)
@@ -70,16 +82,17 @@ class SectionsRun:
 
     outcome: FormulationResult
     verified: VerifiedSections | None
-    syntheses: int
+    spent: dict[str, int]
 
 
 def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> SectionsRun:
     """Sections' co-design on the sampler's store and workers."""
-    quiet = sampler.quiet
+    quiet, spent = sampler.quiet, sampler.spent
     problem, first = seeded_and_prepared(
         sampler.store, sampler.problem, seed, quiet, sampler.workers
     )
-    sampler.also("race")
+    with spent.on("races"):
+        spent.once("race at the start", 1)
     rounds = 0
     while True:
         rounds += 1
@@ -90,10 +103,9 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
             if asked.nearest is not None:
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
-            return SectionsRun(outcome, None, sampler.syntheses)
+            return SectionsRun(outcome, None, spent.by_purpose)
         sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
-        asked.also("race at the end")
         if not (end.better or end.members) or rounds == AGAIN:
             break
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
@@ -101,7 +113,7 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     if not isinstance(formulation, Direct):
         outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
     sampler.trace.extend(asked.trace)
-    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), sampler.syntheses)
+    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent.by_purpose)
 
 
 def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:
@@ -109,9 +121,10 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
     if outcome.x is None:
         words = "" if sampler.nearest is None else sampler.nearest.shortfall
         outcome = replace(outcome, message=outcome.message or words)
-        return SectionsRun(outcome, None, sampler.syntheses)
+        return SectionsRun(outcome, None, sampler.spent.by_purpose)
     end = _end(sampler, outcome.x[: len(sampler.problem.names)])
-    return SectionsRun(outcome, _verified(sampler, outcome, end, 1), sampler.syntheses + 1)
+    verified = _verified(sampler, outcome, end, 1)
+    return SectionsRun(outcome, verified, sampler.spent.by_purpose)
 
 
 @dataclass(frozen=True)
@@ -141,9 +154,12 @@ class _End:
 
 def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
-    best = polish_sections(asked, theta)
+    with asked.spent.on("polish"):
+        best = polish_sections(asked, theta)
     found = sections_value(problem, best.theta)
     raced = raced_at(asked.store, problem, best.theta, quiet, asked.workers)
+    with asked.spent.on("races"):
+        asked.spent.once(f"race {problem_hash(problem.identity())} at {best.theta}", 1)
     tell = teller("at the end", quiet)
     worst, members = worst_members(problem, best.theta, found.design, 0, tell)
     return _End(best, found.design, found.envelope, raced, worst, members)
@@ -184,6 +200,9 @@ def _verified(
     problem, best, made = asked.problem, end.best, end.design
     assert made.controller is not None
     worst = end.worst
+    loops = loops_of(problem, best.theta, made.controller)
+    with asked.spent.on("checks"):
+        kkt = sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
     return VerifiedSections(
         problem=problem,
@@ -191,7 +210,7 @@ def _verified(
         design=made,
         objective=objective(problem, best),
         hardware_cost=hardware_cost(plant_of(problem), best.theta),
-        kkt=sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope),
+        kkt=kkt,
         race_gap=float(max(end.gap, 0.0)),
         raced=end.raced,
         wide=wide,
@@ -201,6 +220,8 @@ def _verified(
         predicted=_predicted(outcome, best),
         value=best.value,
         rounds=rounds,
+        survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
+        damping=other_damping(problem, loops),
     )
 
 
@@ -208,7 +229,8 @@ def _formulated(
     asked: Sampler, formulation: Nested | Lifted | Direct, seed: int
 ) -> FormulationResult:
     if isinstance(formulation, Direct):
-        return solve_direct_sections(asked, formulation.starts, seed=seed)
+        with asked.spent.on("search"):
+            return solve_direct_sections(asked, formulation.starts, seed=seed)
     return _nested(asked, formulation, seed)
 
 

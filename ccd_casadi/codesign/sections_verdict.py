@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from ccd_casadi.codesign.kkt import Kink
 from ccd_casadi.codesign.sections_run import VerifiedSections
-from ccd_casadi.codesign.verdict import Line, State, Verdict, predicted
+from ccd_casadi.codesign.verdict import Line, State, Verdict, margin_figures, predicted, survives
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.support.units import HZ, counted
 from surrogates import Quality
@@ -137,8 +137,7 @@ def _predicted(
 
 
 def _survives(verified: VerifiedSections) -> Line:
-    wide, excess = verified.wide, math.expm1(verified.worst.value)
-    proof = verified.proof
+    wide, excess, proof = verified.wide, math.expm1(verified.worst.value), verified.proof
     figures = {
         "plants": verified.checked,
         "worst_excess": excess,
@@ -146,24 +145,39 @@ def _survives(verified: VerifiedSections) -> Line:
         "proven": proof.levels,
     }
     where = f"{counted(verified.checked, 'plant')} of the box that [robust] names"
-    if not wide.passed:
-        return Line(State.FAILED, f"on {where}: {wide.words}", figures)
-    if proof.refuted:
-        return Line(State.FAILED, f"within every bound on {where}, but {proof.words}", figures)
     words = f"within every bound on {where}, the worst searched {100.0 * excess:+.2g} % of a bound"
-    if verified.checked <= 1:
-        return Line(State.WARNED, "[robust] names no plant but the model", figures)
-    return Line(State.PASSED, f"{words}; {proof.words}", figures)
+    robust: bool | None = verified.kept
+    if not wide.passed:
+        words = f"on {where}: {wide.words}"
+    elif proof.refuted:
+        words = f"within every bound on {where}, but {proof.words}"
+    elif verified.checked <= 1:
+        robust, words = None, "[robust] names no plant but the model"
+    elif robust:
+        words = f"{words}; {proof.words}"
+    else:
+        words = f"within every bound on {where}, but not all along its common resonance shift"
+    line = survives(
+        verified.survival,
+        S_max=verified.problem.inner.S_max,
+        robust=robust,
+        robust_words=words,
+        other_damping="" if verified.damping is None else verified.damping.words,
+        figures=figures,
+    )
+    state = State.WARNED if robust is None and line.state is State.PASSED else line.state
+    return Line(state, line.words, line.figures)
 
 
 def _deployable(verified: VerifiedSections) -> Line:
     sampling = sections_of_problem(verified.problem).sampling
     if sampling is None:
         words = "designed as if continuous: run deploy, or give rate_hz and delay_us in [loop]"
-        return Line(State.UNKNOWN, words, {})
+        return Line(State.UNKNOWN, words, margin_figures(verified.survival))
     words = (
         f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold and "
         "delay exact at the instants; run deploy for the code"
     )
     figures = {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
+    figures |= margin_figures(verified.survival)
     return Line(State.PASSED, words, figures)

@@ -205,11 +205,18 @@ def survives(
     S_max: float,
     robust: bool | None = None,
     robust_words: str = "",
+    other_damping: str = "",
     closer: Sequence[CloserModel] = (),
+    figures: Mapping[str, Any] | None = None,
 ) -> Line:
-    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none)."""
+    """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none).
+
+    `other_damping`: what that set does not keep, in words; `figures`: more of them.
+    """
     if found is None:
-        return Line(State.UNKNOWN, "the loop could not be perturbed", {})
+        if robust is False:
+            return Line(State.FAILED, robust_words, figures or {})
+        return Line(State.UNKNOWN, "the loop could not be perturbed", figures or {})
     state, said = State.PASSED, []
     low, high = found.stable_shift
     said.append(f"stable for resonances {_range(low, high)}")
@@ -233,10 +240,9 @@ def survives(
         if not model.stable:
             state = State.FAILED
             said.insert(0, f"unstable on {model.name}")
-    if robust is not None:
-        said.insert(0, robust_words)
-        if not robust:
-            state = State.FAILED
+    said[:0] = [words for words in (robust_words, other_damping) if words]
+    if robust is False:
+        state = State.FAILED
     rest = found.statics
     if rest.differentiates:
         said.append(
@@ -244,6 +250,7 @@ def survives(
             f"bandwidth, 1 N at rest moves the stage {metres(rest.compliance, 2)}"
         )
     figures = {
+        **(figures or {}),
         "stable_shift": list(found.stable_shift),
         "S_max_shift": list(found.S_max_shift),
         "shift_followed_to": REACH,
@@ -272,12 +279,14 @@ def deployable(found: Survival | None) -> Line:
         f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
         f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
     )
-    figures = {
-        "delay_margin": found.delay,
-        "phase_margin_deg": found.phase_deg,
-        "unstable_below_rate_hz": rate,
-    }
-    return Line(State.UNKNOWN, words, figures)
+    return Line(State.UNKNOWN, words, margin_figures(found) | {"unstable_below_rate_hz": rate})
+
+
+def margin_figures(found: Survival | None) -> dict[str, float]:
+    """The margins that a computer's delay takes from."""
+    if found is None:
+        return {}
+    return {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
 
 
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:
@@ -295,7 +304,8 @@ def reason(verdict: Verdict) -> str:
 
 def _range(low: float, high: float) -> str:
     beyond = [">" if abs(end) >= 0.999 * REACH else "" for end in (low, high)]
-    return f"{beyond[0]}{100 * low:+.2g} to {beyond[1]}{100 * high:+.2g} %"
+    shown = [float(round(100.0 * end, 3)) for end in (low, high)]  # less is none
+    return f"{beyond[0]}{shown[0]:+.2g} to {beyond[1]}{shown[1]:+.2g} %"
 
 
 def _count(number: int, noun: str) -> str:

@@ -8,14 +8,20 @@ from ccd_casadi.codesign.closer_models import ReferenceCheck, check_references
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
-from ccd_casadi.codesign.survival import Survival, survival
+from ccd_casadi.codesign.robust_check import (
+    OtherDamping,
+    RobustCheck,
+    check_robust,
+    other_damping,
+    survived,
+)
+from ccd_casadi.codesign.survival import Survival, loops_of
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
-from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
@@ -24,8 +30,6 @@ from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, syn
 
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
-PEAK = 1e-6  # relative; by how much S_max may be passed between the plants of a robust set
-DENSE = 41  # shifts of a robust set on which the design is measured at the end
 
 
 @dataclass(frozen=True)
@@ -48,33 +52,26 @@ class VerifiedDesign:
     feasible: bool
     unsuspended: DesignFigures
     references: tuple[ReferenceCheck, ...] = ()
-    robust: "RobustCheck | None" = None
+    robust: RobustCheck | None = None
+    damping: OtherDamping | None = None
     survival: Survival | None = None
-
-
-@dataclass(frozen=True)
-class RobustCheck:
-    """A robust design on its nominal plant, and on a denser set than it was designed for.
-
-    `worst` has the largest ‖S‖∞ of that set, at `at`; an unstable loop is worse than any.
-    """
-
-    nominal: DesignFigures
-    worst: DesignFigures
-    at: Perturbation
-    plants: int
-    passed: bool
 
 
 def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
     """Polish x on the true problem, ask the global inner problem there, certify what results."""
+    with sampler.spent.on("checks"):
+        return _verified(sampler, x)
+
+
+def _verified(sampler: Sampler, x: Array) -> VerifiedDesign:
     problem = sampler.problem
     count = len(problem.names)
     quantities = sampler.truth
     gap = np.inf
     design = None
     for _ in range(POLISH_ROUNDS):
-        with Progress(1, "polishing on the truth", quiet=sampler.quiet) as progress:
+        polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
+        with polishing as progress, sampler.spent.on("polish"):
             x, design, _ = polish(sampler, x)
             progress.advance()
         at_bounds = _snapped(problem, x)
@@ -106,6 +103,10 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         gamma=UNBOUNDED,
         omega_low=problem.inner.omega_low,
     )
+    loops = loops_of(problem, theta, final.controller)
+    found, robust = None, check_robust(problem, loops)
+    if final.figures.certified:
+        found, robust = survived(problem, loops, final.figures.bandwidth)
     cost = hardware_cost(plant_of(problem), theta)
     return VerifiedDesign(
         x=x,
@@ -121,39 +122,10 @@ def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
         references=check_references(
             problem, theta, final, workers=sampler.workers, quiet=sampler.quiet
         ),
-        robust=_check_robust(problem, theta, final),
-        survival=survival(problem, theta, final.controller, final.figures.bandwidth)
-        if final.figures.certified
-        else None,
+        robust=robust,
+        damping=other_damping(problem, loops),
+        survival=found,
     )
-
-
-def _check_robust(
-    problem: CoDesignProblem, theta: tuple[float, ...], design: Design
-) -> RobustCheck | None:
-    """The controller on `DENSE` shifts of the robust set; None where the problem has none."""
-    if problem.robust is None:
-        return None
-    system = mechanics(plant_of(problem), theta)
-
-    def measured(perturbation: Perturbation) -> DesignFigures:
-        return measure(
-            scale_plant(modal_plant(system, problem.suspension, perturbation), problem.weights.M_K),
-            design.controller,
-            design.weights,
-            gamma=UNBOUNDED,
-            omega_low=problem.inner.omega_low,
-        )
-
-    places = problem.robust.perturbations(DENSE)
-    found = [(measured(place), place) for place in places]
-
-    def badness(item: tuple[DesignFigures, Perturbation]) -> float:
-        return float(np.nan_to_num(item[0].sensitivity_peak, nan=np.inf))
-
-    worst, at = max(found, key=badness)
-    passed = badness((worst, at)) <= problem.inner.S_max * (1.0 + PEAK)
-    return RobustCheck(measured(Perturbation()), worst, at, len(places), passed)
 
 
 def _snapped(problem: CoDesignProblem, x: Array) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.verify import DENSE
+from ccd_casadi.codesign.robust_check import DENSE
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.fixed_structure.worst_plant import lattice

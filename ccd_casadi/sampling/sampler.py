@@ -23,6 +23,7 @@ from ccd_casadi.sampling.samples import (
     quantity_sample,
     sample_of,
 )
+from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import design_unit, frequencies, inner_unit
 from ccd_casadi.support.arrays import Array
@@ -60,7 +61,7 @@ class Sampler:
         self.hash = problem_hash(problem.identity())
         self.inner_hash = problem_hash({"problem": self.hash, "inner": problem.inner_identity()})
         store.put_problem(self.hash, problem.identity())
-        self._spent: dict[str, int] = {}
+        self.spent = Spent()
         self.trace: list[TraceEntry] = []
         self.nearest: BandwidthSample | None = None  # of the infeasible ones
         self.solved: dict[tuple[float, ...], BandwidthSample] = {}  # inner problems asked for
@@ -71,7 +72,7 @@ class Sampler:
         An easier problem's designs are worth nothing to this one: they are not traced.
         """
         other = Sampler(problem, self.store, self.workers, quiet=self.quiet)
-        other._spent = self._spent
+        other.spent = self.spent
         if traced:
             other.trace = self.trace
         return other
@@ -79,7 +80,7 @@ class Sampler:
     @property
     def syntheses(self) -> int:
         """Distinct true syntheses asked for so far."""
-        return sum(self._spent.values())
+        return self.spent.total
 
     def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
         """ω_b* at every row of `thetas`, in their order."""
@@ -149,10 +150,6 @@ class Sampler:
         self.store.put([sample], self.hash)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
 
-    def also(self, name: str) -> None:
-        """Count one more of what is no design at an asked θ, such as a race; each name once."""
-        self._spent[f"{self.hash} {name}"] = 1
-
     def _spend(
         self,
         key: str,
@@ -165,9 +162,8 @@ class Sampler:
 
         `value` is what J counts, where that is not the bandwidth.
         """
-        if key in self._spent:
+        if not self.spent.once(key, count):
             return
-        self._spent[key] = count
         objective, value = np.nan, bandwidth if value is None else value
         if np.isfinite(value) and not unmet(self.problem, theta):
             cost = hardware_cost(plant_of(self.problem), theta)

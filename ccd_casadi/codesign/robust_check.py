@@ -1,0 +1,175 @@
+"""A robust design all along its set, and on the set's extreme plants with the other damping.
+
+A resonance shift keeps the damping ratio of a plant whose damping is given by ratios, and the
+matrix of one whose damping is a matrix: there a mode's ratio grows as its frequency falls. Nobody
+knows which of the two a stage keeps.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import inf, log
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.loops_off_model import LoopsOffModel
+from ccd_casadi.codesign.reach import highest
+from ccd_casadi.codesign.survival import PEAK, Survival, survival_of
+from ccd_casadi.fixed_structure import Bounds, Certificate, certify
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of
+from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.plants.scaling import scale_plant
+
+DENSE = 41  # shifts of a robust set on which the design is looked at, at the least
+MATTERS = 0.01  # of a bound: what the other damping has to pass it by to be told
+KEPT = {
+    "ratio": "a resonance shift keeps every mode's damping ratio",
+    "matrix": "a resonance shift leaves the damping matrix alone: ratios grow as resonances fall",
+}
+
+
+@dataclass(frozen=True)
+class RobustCheck:
+    """The worst of the plants of a design's set that were looked at: ‖S‖∞ there, infinite where
+    the loop is unstable; `nominal` on the model."""
+
+    nominal: float
+    peak: float
+    at: Perturbation
+    plants: int
+    passed: bool
+
+    @property
+    def words(self) -> str:
+        """Whether the set is kept, and where it is worst."""
+        at = f"at {100 * self.at.shift:+.2g} %, damping x {self.at.damping:.3g}"
+        if self.peak == inf:
+            return f"unstable within its own robust set, {at}"
+        peak = f"peak of S {self.peak:.4g} {at}"
+        if self.passed:
+            return f"its own robust set is kept ({self.plants} plants, worst {peak})"
+        return f"its own robust set is not kept: {peak}"
+
+
+@dataclass(frozen=True)
+class OtherDamping:
+    """Figures over bounds on the set's extreme plants, with the damping that it keeps ("ratio" or
+    "matrix") and with the other; none where the loop is unstable on one of them."""
+
+    kept: str
+    own: Mapping[str, float]
+    other: Mapping[str, float]
+
+    @property
+    def words(self) -> str:
+        """What passes a bound by more than a hundredth with the other damping only, or nothing."""
+        how = f"with the damping {'matrix' if self.kept == 'ratio' else 'ratio'} kept instead"
+        if not self.own:
+            return ""
+        if not self.other:
+            return f"{how} the set holds a plant on which the loop is unstable"
+        found = [
+            f"{name} is {100.0 * (share - 1.0):.2g} % above its bound"
+            for name, share in self.other.items()
+            if share - max(1.0, self.own[name]) > MATTERS
+        ]
+        return f"{how} {', '.join(found)} on the set" if found else ""
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """Of result.json's `robust`."""
+        return {
+            "damping_kept": self.kept,
+            "damping_words": "; ".join(part for part in (KEPT[self.kept], self.words) if part),
+            "figures_over_bounds_other_damping": self.other,
+        }
+
+
+def reach_of(problem: CoDesignProblem) -> tuple[float, float]:
+    """The common shifts, down and up, that the set holds at the model's damping and gain."""
+    if problem.sections is None:
+        shift = 0.0 if problem.robust is None else problem.robust.shift
+        return -shift, shift
+    u = problem.sections.uncertainty
+    low, high = ((1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1))
+    return low, high
+
+
+def survived(
+    problem: CoDesignProblem, loops: LoopsOffModel, bandwidth: float
+) -> tuple[Survival, RobustCheck | None]:
+    """What the loop survives and whether its set is kept: neither says what the other denies.
+
+    The ranges are asked at the ends of the set and where it is worst, and the set at all that was
+    asked for the ranges.
+    """
+    check = check_robust(problem, loops)
+    marks = [abs(end) for end in reach_of(problem)]
+    if check is not None and check.at.damping == 1.0:
+        marks.append(abs(check.at.shift))
+    found = survival_of(problem, loops, bandwidth, marks)
+    return found, check_robust(problem, loops)
+
+
+def check_robust(problem: CoDesignProblem, loops: LoopsOffModel) -> RobustCheck | None:
+    """The loop all along a mixed-sensitivity design's set; None where it has none."""
+    if problem.robust is None:
+        return None
+    robust, level = problem.robust, problem.inner.S_max * (1.0 + PEAK)
+    factors = sorted({1.0, *robust.damping})
+    places = _places(loops, robust.shift, robust.shifts)
+    for factor in factors:
+
+        def excess(shift: float, factor: float = factor) -> float:
+            loop = loops.at(Perturbation(shift, factor))
+            return log(loop.peak / level) if loop.stable else 1.0
+
+        values = [excess(place) for place in places]
+        for i in range(len(places) - 2):
+            highest(excess, places[i : i + 3], values[i : i + 3])
+    seen = {
+        off: loop.peak if loop.stable else inf
+        for off, loop in loops.known.items()
+        if abs(off.shift) <= robust.shift and off.damping in factors
+    }
+    at = max(seen, key=lambda off: seen[off])
+    model = loops.at(Perturbation())
+    return RobustCheck(
+        model.peak if model.stable else inf, seen[at], at, len(seen), seen[at] <= level
+    )
+
+
+def _places(loops: LoopsOffModel, reach: float, shifts: int) -> list[float]:
+    """From end to end of a set, its own shifts among them."""
+    places = [-reach]
+    while places[-1] < reach:
+        step = min(loops.step(places[-1]), 2.0 * reach / (DENSE - 1))
+        places.append(min(places[-1] + step, reach))
+    return sorted({*places, *np.linspace(-reach, reach, shifts).tolist(), 0.0})
+
+
+def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDamping | None:
+    """None where the set shifts no resonance."""
+    low, high = reach_of(problem)
+    if not high > low:
+        return None
+    factors: Sequence[float] = (1.0,) if problem.robust is None else problem.robust.damping
+    gains, inner = [1.0], problem.inner
+    bounds = Bounds(inner.S_max, inner.S_low, inner.omega_low)
+    if problem.sections is not None:
+        u = problem.sections.uncertainty
+        factors, gains, bounds = u.damping, [1.0 - u.gain, 1.0 + u.gain], bounds_of(problem)
+    places = [Perturbation(s, d) for s, d in product((low, high), sorted({1.0, *factors}))]
+
+    def judged(of: LoopsOffModel) -> Certificate:
+        plants = []
+        for place, gain in product(places, sorted(set(gains))):
+            modal = of.modal(place)
+            modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
+            plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
+        return certify(plants, of.controller.continuous, bounds, of.controller.sampling)
+
+    kept = "matrix" if loops.given else "ratio"
+    return OtherDamping(kept, judged(loops).worst, judged(loops.other).worst)

@@ -1,0 +1,75 @@
+"""What a run spends, by purpose: every distinct design once, for what asked for it first."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+
+class Spent:
+    """Counts of true syntheses; `purpose` is what is being done."""
+
+    def __init__(self) -> None:
+        self.purpose = "samples"
+        self._units: dict[str, tuple[str, int]] = {}
+
+    @contextmanager
+    def on(self, purpose: str) -> Iterator[None]:
+        """What is asked for inside is spent on this."""
+        before, self.purpose = self.purpose, purpose
+        try:
+            yield
+        finally:
+            self.purpose = before
+
+    def once(self, unit: str, count: int) -> bool:
+        """Count a unit of work; whether it is a new one."""
+        new = unit not in self._units
+        if new:
+            self._units[unit] = (self.purpose, count)
+        return new
+
+    @property
+    def total(self) -> int:
+        """Of all purposes."""
+        return sum(count for _, count in self._units.values())
+
+    @property
+    def by_purpose(self) -> dict[str, int]:
+        """In the order in which they came up."""
+        found: dict[str, int] = {}
+        for purpose, count in self._units.values():
+            found[purpose] = found.get(purpose, 0) + count
+        return found
+
+
+def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
+    """Of result.json: all syntheses, by purpose, and those without which the design was not there.
+
+    A look over the box that `moved` the design is part of the way to it.
+
+    >>> spent_entry({"samples": 24, "box_look": 600})["syntheses_to_optimum"]
+    24
+    """
+    total = sum(spent.values())
+    beside = 0 if moved else spent.get("box_look", 0)
+    return {
+        "syntheses": total,
+        "syntheses_to_optimum": total - beside,
+        "spent": dict(spent),
+    }
+
+
+def was_moved(result: Mapping[str, Any]) -> bool:
+    """Whether a run's design is one that the look over the box led to."""
+    return bool(result.get("box_look", {}).get("moved"))
+
+
+def cost_words(result: Mapping[str, Any]) -> str:
+    """`700 syntheses (30 samples, 17 rounds, 653 box look), 6.1 s`.
+
+    >>> cost_words({"syntheses": 9, "spent": {"races": 2, "box_look": 7}, "seconds": 1.25})
+    '9 syntheses (2 races, 7 box look), 1.2 s'
+    """
+    parts = [f"{count} {name.replace('_', ' ')}" for name, count in result["spent"].items()]
+    inside = f" ({', '.join(parts)})" if parts else ""
+    return f"{result['syntheses']} syntheses{inside}, {result['seconds']:.1f} s"
