@@ -71,7 +71,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> BandwidthSample:
     candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
     best = min(candidates, key=lambda s: objective(problem, s))
     if sections_kkt(problem, best).stationarity > STATIONARY:
-        best = _by_pieces(truth, best)
+        best = by_pieces(truth, best)
     if sections_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
         return best
     program = nested_program(problem, truth)
@@ -88,7 +88,9 @@ def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
     return found.kink is not None and found.stationarity <= SMOOTH
 
 
-def _by_pieces(truth: TrueBandwidth, best: BandwidthSample) -> BandwidthSample:
+def by_pieces(
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+) -> BandwidthSample:
     """From a sample, and what was asked for near it, to where the pieces of J promise no more."""
     problem = truth.sampler.problem
     lower, upper = box(problem)
@@ -111,5 +113,5 @@ def _by_pieces(truth: TrueBandwidth, best: BandwidthSample) -> BandwidthSample:
     if start is None:
         return best
     others = [found for found in map(local, truth.known.values()) if found is not None]
-    descend(at, start, others, constraints, steps=STEPS * len(lower), settled=LEVEL)
+    descend(at, start, others, constraints, steps=STEPS * len(lower), settled=settled)
     return min(truth.known.values(), key=lambda sample: objective(problem, sample))

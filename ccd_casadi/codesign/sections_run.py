@@ -73,37 +73,59 @@ class SectionsRun:
     syntheses: int
 
 
+@dataclass(frozen=True)
+class Searched:
+    """What a search ends with: the sampler of its last round, the outcome, and the polished end
+    (None where no design was found)."""
+
+    asked: Sampler
+    outcome: FormulationResult
+    end: "_End | None"
+    rounds: int
+
+
 def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> SectionsRun:
     """Sections' co-design on the sampler's store and workers."""
-    quiet = sampler.quiet
-    spent = 0
-    problem, first = seeded_and_prepared(
-        sampler.store, sampler.problem, seed, quiet, sampler.workers
-    )
-    spent += 1
+    found = search_sections(sampler, formulation, seed)
+    made = None
+    if found.end is not None:
+        made = _verified(found.asked, found.outcome, found.end, found.rounds)
+    return SectionsRun(found.outcome, made, sampler.syntheses)
+
+
+def search_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> Searched:
+    """The same without the judge's look at the whole set; a problem that has anchors is not raced
+    at its start."""
+    problem, first = sampler.problem, ""
+    if not sections_of_problem(problem).anchors:
+        problem, first = seeded_and_prepared(
+            sampler.store, problem, seed, sampler.quiet, sampler.workers
+        )
+        sampler.raced(sampler.hash)
     rounds = 0
     while True:
         rounds += 1
-        asked = Sampler(problem, sampler.store, sampler.workers, quiet=quiet)
+        asked = sampler.of(problem)
         outcome = _formulated(asked, formulation, seed)
         if outcome.x is None:
             words = first if first and not sections_of_problem(problem).anchors else ""
             if asked.nearest is not None:
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
-            return SectionsRun(outcome, None, spent + asked.syntheses)
+            return Searched(asked, outcome, None, rounds)
         sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
-        spent += 1
         if not (end.better or end.members) or rounds == AGAIN:
             break
-        spent += asked.syntheses
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
         problem = joined(problem, kappa, end.members)
+        if end.members:  # what was found for fewer plants is worth nothing on these
+            sampler.trace[:] = [
+                replace(entry, bandwidth=np.nan, objective=np.nan) for entry in sampler.trace
+            ]
     if not isinstance(formulation, Direct):
         outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
-    sampler.trace.extend(asked.trace)
-    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent + asked.syntheses)
+    return Searched(asked, outcome, end, rounds)
 
 
 def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:
@@ -113,7 +135,7 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
         outcome = replace(outcome, message=outcome.message or words)
         return SectionsRun(outcome, None, sampler.syntheses)
     end = _end(sampler, outcome.x[: len(sampler.problem.names)])
-    return SectionsRun(outcome, _verified(sampler, outcome, end, 1), sampler.syntheses + 1)
+    return SectionsRun(outcome, _verified(sampler, outcome, end, 1), sampler.syntheses)
 
 
 @dataclass(frozen=True)
@@ -145,7 +167,7 @@ def _end(asked: Sampler, theta: Array) -> _End:
     problem, quiet = asked.problem, asked.quiet
     best = polish_sections(asked, theta)
     found = sections_value(problem, best.theta)
-    raced = raced_at(asked.store, problem, best.theta, quiet, asked.workers)
+    raced = raced_at(asked, best.theta)
     tell = teller("at the end", quiet)
     worst, members = worst_members(problem, best.theta, found.design, 0, tell)
     return _End(best, found.design, found.envelope, raced, worst, members)

@@ -77,6 +77,10 @@ class Sampler:
         """Distinct true syntheses asked for so far."""
         return sum(self._spent.values())
 
+    def raced(self, key: str) -> None:
+        """Count a race once, as one synthesis."""
+        self._spent.setdefault(key, 1)
+
     def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
         """ω_b* at every row of `thetas`, in their order."""
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]
