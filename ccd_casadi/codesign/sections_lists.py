@@ -66,16 +66,16 @@ class ListedSections:
             first = search_sections(sampler, self.formulation, self.seed)
             if first.end is None:
                 return _nothing(first.outcome.message)
-            self.members = sections_of_problem(first.asked.problem).members
-            return _found(first.asked.problem, first.end.best)
+            self.members = sections_of_problem(first.end.asked.problem).members
+            return _found(first.end.asked.problem, first.end.best)
         known = _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
             return _nothing("no theta was found near by that meets the constraints")
-        asked = sampler.of(carried(known, problem, self.members))
-        truth = TrueBandwidth(asked, "near by")
-        return _found(asked.problem, by_pieces(truth, truth.at(theta), SETTLED))
+        truth = TrueBandwidth(sampler.of(carried(known, problem, self.members)), "near by")
+        truth, best = by_pieces(truth, truth.at(theta), SETTLED)
+        return _found(truth.sampler.problem, best)
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""

@@ -75,10 +75,8 @@ class SectionsRun:
 
 @dataclass(frozen=True)
 class Searched:
-    """What a search ends with: the sampler of its last round, the outcome, and the polished end
-    (None where no design was found)."""
+    """What a search ends with; `end` None where no design was found."""
 
-    asked: Sampler
     outcome: FormulationResult
     end: "_End | None"
     rounds: int
@@ -89,7 +87,7 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     found = search_sections(sampler, formulation, seed)
     made = None
     if found.end is not None:
-        made = _verified(found.asked, found.outcome, found.end, found.rounds)
+        made = _verified(found.outcome, found.end, found.rounds)
     return SectionsRun(found.outcome, made, sampler.syntheses)
 
 
@@ -112,20 +110,20 @@ def search_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, see
             if asked.nearest is not None:
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
-            return Searched(asked, outcome, None, rounds)
+            return Searched(outcome, None, rounds)
         sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
         if not (end.better or end.members) or rounds == AGAIN:
             break
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
-        problem = joined(problem, kappa, end.members)
+        problem = joined(end.asked.problem, kappa, end.members)
         if end.members:  # what was found for fewer plants is worth nothing on these
             sampler.trace[:] = [
                 replace(entry, bandwidth=np.nan, objective=np.nan) for entry in sampler.trace
             ]
     if not isinstance(formulation, Direct):
-        outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
-    return Searched(asked, outcome, end, rounds)
+        outcome, end = _foreseen(formulation, seed, outcome, end, sampled)
+    return Searched(outcome, end, rounds)
 
 
 def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:
@@ -135,14 +133,15 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
         outcome = replace(outcome, message=outcome.message or words)
         return SectionsRun(outcome, None, sampler.syntheses)
     end = _end(sampler, outcome.x[: len(sampler.problem.names)])
-    return SectionsRun(outcome, _verified(sampler, outcome, end, 1), sampler.syntheses)
+    return SectionsRun(outcome, _verified(outcome, end, 1), sampler.syntheses)
 
 
 @dataclass(frozen=True)
 class _End:
-    """The polished θ with its design and that one's gradients, a race there, the worst plant, and
-    those to add."""
+    """The polished θ by a problem's sampler, its design and that one's gradients, a race there, the
+    worst plant, and those to add."""
 
+    asked: Sampler
     best: BandwidthSample
     design: SectionsDesign
     envelope: Envelope | None
@@ -164,28 +163,23 @@ class _End:
 
 
 def _end(asked: Sampler, theta: Array) -> _End:
-    problem, quiet = asked.problem, asked.quiet
-    best = polish_sections(asked, theta)
+    asked, best = polish_sections(asked, theta)
+    problem = asked.problem
     found = sections_value(problem, best.theta)
     raced = raced_at(asked, best.theta)
-    tell = teller("at the end", quiet)
+    tell = teller("at the end", asked.quiet)
     worst, members = worst_members(problem, best.theta, found.design, 0, tell)
-    return _End(best, found.design, found.envelope, raced, worst, members)
+    return _End(asked, best, found.design, found.envelope, raced, worst, members)
 
 
 def _foreseen(
-    asked: Sampler,
-    formulation: Nested | Lifted,
-    seed: int,
-    outcome: FormulationResult,
-    end: _End,
-    sampled: Array,
+    formulation: Nested | Lifted, seed: int, outcome: FormulationResult, end: _End, sampled: Array
 ) -> tuple[FormulationResult, _End]:
     """Where the surrogate misses the polished design it learns it, and goes on from there."""
     error = abs(_predicted(outcome, end.best) / end.best.value - 1.0)
     if error <= formulation.tolerance or len(outcome.iterates) > formulation.max_refinements:
         return outcome, end
-    thetas = np.unique(np.vstack([sampled, end.best.theta]), axis=0)
+    asked, thetas = end.asked, np.unique(np.vstack([sampled, end.best.theta]), axis=0)
     found = _nested(asked, formulation, seed, Surrogates((), thetas, ()))
     if found.x is None:
         return outcome, end
@@ -202,10 +196,9 @@ def _predicted(outcome: FormulationResult, sample: BandwidthSample) -> float:
     return float(outcome.surrogates[0].predict(np.array(sample.theta)[None, :])[0])
 
 
-def _verified(
-    asked: Sampler, outcome: FormulationResult, end: _End, rounds: int
-) -> VerifiedSections:
-    problem, best, made = asked.problem, end.best, end.design
+def _verified(outcome: FormulationResult, end: _End, rounds: int) -> VerifiedSections:
+    asked, best, made = end.asked, end.best, end.design
+    problem = asked.problem
     assert made.controller is not None
     worst = end.worst
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
