@@ -114,7 +114,7 @@ def test_a_built_stage_with_a_fixed_length_is_drawn_and_differentiated() -> None
 def quadratic(centre: np.ndarray, shape: np.ndarray) -> Any:
     """Solves a node of min |R (x - centre)|² over its box exactly, as a co-design would."""
 
-    def solve(sampler: Any) -> Any:
+    def solve(sampler: Any, near: Any = None) -> Any:
         own: CoDesignProblem = sampler.problem
         held = own.source.held
         names = ("m1", "m2", "m3")
@@ -124,6 +124,7 @@ def quadratic(centre: np.ndarray, shape: np.ndarray) -> Any:
         J = 2.0 * found.cost
         theta = dict(zip(own.names, found.x.tolist(), strict=True))
         result = {"status": "verified", "objective": J, "theta": theta, "reason": "", "checks": {}}
+        result["held"] = held
         return Found(result)
 
     return solve
@@ -142,7 +143,7 @@ class OneSampler(SimpleNamespace):
 
     spent = Spent()
 
-    def of(self, other: CoDesignProblem) -> "OneSampler":
+    def of(self, other: CoDesignProblem, *, traced: bool = True) -> "OneSampler":
         return OneSampler(problem=other)
 
 
@@ -177,13 +178,89 @@ def test_the_best_listed_values_are_found_where_nodes_are_solved_globally(seed: 
     rng = np.random.default_rng(seed)
     own = two_lists(rng)
     solve = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
-    best = best_of_lists(OneSampler(problem=own), solve)  # type: ignore[arg-type]
+    best = best_of_lists(OneSampler(problem=own), solve, solve)  # type: ignore[arg-type]
     every = [item.result["objective"] for item in all_listed(own, solve)]
     assert best.result["objective"] == pytest.approx(min(every), rel=1e-6, abs=1e-9)
     found = best.result["listed"]
     assert all(value in dict(own.listed)[name] for name, value in found["chosen"].items())
     whole = [tuple(map(tuple, node["lists"].values())) for node in found["nodes"]]
     assert len(whole) == len(set(whole))  # nothing is solved twice
+    assert found["solved"] + found["cut"] == found["combinations"]
+    assert found["between"] <= found["combinations"] // 2
+
+
+@few(max_examples=40)
+@given(st.integers(0, 2**31))
+def test_five_by_five_values_take_fewer_searches_than_combinations(seed: int) -> None:
+    """Bounds cut: the least of 25 takes 11 searches at most, of parts and combinations together."""
+    rng = np.random.default_rng(seed)
+    lists = [tuple(sorted(rng.choice(np.arange(50.0, 80.0), 5, False).tolist())) for _ in range(2)]
+    own = replace(
+        two_lists(rng), listed=(("m1", lists[0]), ("m2", lists[1])),
+        lower=(lists[0][0], lists[1][0], 50.0), upper=(lists[0][-1], lists[1][-1], 80.0),
+    )  # fmt: skip
+    solve = quadratic(rng.uniform(45.0, 85.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
+    best = best_of_lists(OneSampler(problem=own), solve, solve)  # type: ignore[arg-type]
+    assert len(best.result["listed"]["nodes"]) < 25
+    least = min(item.result["objective"] for item in all_listed(own, solve))
+    assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
+
+
+@few(max_examples=40)
+@given(st.integers(0, 2**31), st.floats(0.0, 50.0))
+def test_a_first_search_that_ends_too_high_cuts_nothing_that_is_better(
+    seed: int, missed: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    own = two_lists(rng)
+    exact = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
+
+    def between(sampler: Any, near: Any) -> Found:
+        found = exact(sampler)
+        if near is None:  # the first
+            return Found(found.result | {"objective": found.result["objective"] + missed})
+        return found
+
+    best = best_of_lists(OneSampler(problem=own), between, exact)  # type: ignore[arg-type]
+    least = min(item.result["objective"] for item in all_listed(own, exact))
+    assert best.result["objective"] == pytest.approx(least, rel=1e-6, abs=1e-9)
+
+
+@few(max_examples=20)
+@given(st.integers(0, 2**31), st.sampled_from([0.0, -1.0, -1e3]))
+def test_the_best_is_judged_and_another_follows_where_that_costs_it_more(
+    seed: int, shift: float
+) -> None:
+    """What a search finds is confirmed; what it says of J holds where J is zero or negative."""
+    rng = np.random.default_rng(seed)
+    own = two_lists(rng)
+    exact = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
+    dearer = {}  # by what judging adds to J
+
+    def shifted(found: Any, added: float = 0.0) -> Found:
+        return Found(found.result | {"objective": found.result["objective"] + shift + added})
+
+    def search(sampler: Any, near: Any) -> Found:
+        return shifted(exact(sampler))
+
+    def judge(sampler: Any, found: Any) -> Found:
+        held = tuple(sampler.problem.source.held.values())
+        dearer.setdefault(held, float(rng.uniform(0.0, 30.0)))
+        return shifted(exact(sampler), dearer[held])
+
+    best = best_of_lists(OneSampler(problem=own), search, search, judge)  # type: ignore[arg-type]
+    J, listed = best.result["objective"], best.result["listed"]
+    assert listed["judged"] == len(dearer)
+    for item in all_listed(own, exact):
+        held = tuple(item.result["held"].values())
+        bound = item.result["objective"] + shift
+        assert bound + dearer[held] >= J - 1e-6 if held in dearer else bound >= J - 1e-5
+    if listed["between"]:
+        assert listed["objective_above_free"] == J - listed["free_objective"]
+        words = best.result["notes"][-1]
+        above = listed["objective_above_free"]
+        assert (f"J is {above:.3g} above" if above > 0.0 else "J is no worse than") in words
+        assert "%" not in words
 
 
 @few(max_examples=30)
@@ -195,13 +272,13 @@ def test_a_design_that_is_not_verified_cuts_no_verified_one(seed: int) -> None:
     convex = quadratic(rng.uniform(50.0, 75.0, 3), np.triu(rng.normal(size=(3, 3))) + np.eye(3))
     bad = rng.choice(dict(own.listed)["m1"])
 
-    def solve(sampler: Any) -> Found:
+    def solve(sampler: Any, near: Any = None) -> Found:
         found = convex(sampler)
         if sampler.problem.source.held.get("m1") == bad:
             return Found(found.result | {"status": "not_verified", "objective": -1e9})
         return found
 
-    best = best_of_lists(OneSampler(problem=own), solve)  # type: ignore[arg-type]
+    best = best_of_lists(OneSampler(problem=own), solve, solve)  # type: ignore[arg-type]
     verified = [i.result for i in all_listed(own, solve) if i.result["status"] == "verified"]
     assert best.result["status"] == "verified"
     least = min(item["objective"] for item in verified)
@@ -328,4 +405,4 @@ def test_what_sections_spend_is_counted_over_all_nodes(
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
         found = sections_run.run_sections(sampler.of(own), Direct(), 0)
-        assert found.syntheses == sampler.syntheses == 6  # five designs and a race
+        assert sum(found.spent.values()) == sampler.syntheses == 6  # five designs and a race

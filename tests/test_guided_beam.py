@@ -94,7 +94,7 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
     """Both ways along the bound on the volume J rises, and only both sides together say why."""
     with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
         sampler = Sampler(anchored, store, pool)
-        best = polish_sections(sampler, np.array([0.0546, 0.0054]))
+        best = polish_sections(sampler, np.array([0.0546, 0.0054]))[1]
         found = sections_value(anchored, best.theta)
         assert best.bandwidth / HZ == pytest.approx(118.3463, abs=2e-4)
         truth = TrueBandwidth(sampler, "certificate")

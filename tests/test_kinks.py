@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.codesign.bundle import Local, descend
 from ccd_casadi.codesign.kkt import KktCertificate
+from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_kkt import joint_residual, sections_kkt
 from ccd_casadi.codesign.sections_truth import TrueBandwidth
 from ccd_casadi.codesign.sections_verdict import KKT_LEVEL, _optimal
@@ -261,3 +262,31 @@ def test_where_one_gradient_is_enough_there_is_no_kink() -> None:
     smooth = certificate(told, of.minimiser, np.zeros((2, 2)))
     assert smooth.kink is None
     assert smooth.stationarity <= KKT_LEVEL
+
+
+class TwoControllers(SimpleNamespace):
+    """A sampler whose climbs lose the better controller at a cliff, but from that one's own κ."""
+
+    def of(self, other: CoDesignProblem) -> "TwoControllers":
+        return TwoControllers(problem=other, slope=self.slope, cliff=self.cliff)
+
+    def bandwidths(self, theta: np.ndarray, label: str) -> list[BandwidthSample]:
+        z = (float(theta[0]) - 55.0) / 15.0
+        better = z < self.cliff or (1.0,) in self.problem.sections.anchors
+        value = 300.0 + self.slope * z - 40.0 * z**2 if better else 250.0 + 10.0 * z
+        bent = self.slope - 80.0 * z if better else 10.0
+        at, kappa, nan = tuple(map(float, theta)), (1.0 if better else 2.0,), float("nan")
+        return [
+            BandwidthSample(at, value, (bent / 15.0, 0.0), nan, nan, (), "", 0.0, 1, kappa),
+        ]
+
+
+@few(max_examples=20)
+@given(st.floats(0.1, 0.3), st.floats(30.0, 60.0))
+def test_a_jump_of_the_bandwidth_is_passed_by_its_controller(cliff: float, slope: float) -> None:
+    case = problem(sections=SectionsProblem(anchors=((2.0,),)), w1=0.0, w2=-1.0)
+    truth = TrueBandwidth(cast(Any, TwoControllers(problem=case, slope=slope, cliff=cliff)), "")
+    after, best = by_pieces(truth, truth.at(np.array([55.0, 60.0])))
+    assert best.theta[0] == pytest.approx(55.0 + 15.0 * slope / 80.0, abs=0.02)
+    assert best.kappa == (1.0,)
+    assert len(truth.known) + len(after.known) < 60

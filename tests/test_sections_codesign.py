@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
+from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
@@ -142,3 +144,21 @@ def test_an_impossible_case_says_what_falls_short(tmp_path: Path) -> None:
     found = solve(case, Direct(starts=1))
     assert found.result["status"] == "infeasible"
     assert found.result["reason"]
+
+
+def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
+    anchored: CoDesignProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honest, initial = sections_bandwidth.synthesise, []
+
+    def early(*arguments: Any, **more: Any) -> SectionsDesign:
+        made = honest(*arguments, **more)
+        initial.append(more["initial"])
+        return replace(made, kkt_residual=2.5e-2) if len(initial) == 1 else made
+
+    monkeypatch.setattr(sections_bandwidth, "synthesise", early)
+    value = sections_value(anchored, (61.0, 58.0))
+    assert value.feasible
+    assert np.isfinite(value.gradient).all()
+    assert value.design.kkt_residual < 1e-3
+    assert (len(initial), value.syntheses) == (2, 2)

@@ -25,6 +25,8 @@ BENT = 0.5  # of the largest slope, per share of the box: by what a piece is low
 RESTORED = 5  # Newton's steps back to λ <= 0
 INSIDE = 1e-10  # of λ
 CURVED = (1e-4, 1e-8)  # of d and t, in the programme's own units: its answer is then one point
+JUMP = 10.0  # times the slopes on both sides: what is steeper is no kink
+BESIDE = 1e-3  # of the box: so near by no other piece is as steep
 
 Constraints = Callable[[Array], tuple[Array, Array]]
 
@@ -47,6 +49,13 @@ class _Step:
     gradient: Array
 
 
+def jumps(a: Local, b: Local) -> bool:
+    """Whether J is not continuous between two points near by, as the slopes at both tell."""
+    away = float(np.abs(b.z - a.z).max())
+    steepest = max(float(np.abs(one.gradient).sum()) for one in (a, b))
+    return away < BESIDE and abs(b.value - a.value) > JUMP * steepest * away
+
+
 def descend(
     at: Callable[[Array], Local | None],
     start: Local,
@@ -56,7 +65,8 @@ def descend(
     steps: int,
     settled: float,
 ) -> Local:
-    """The best point after at most `steps` new ones, or where the pieces promise no more.
+    """The best point after at most `steps` new ones, where the pieces promise no more, or beside a
+    jump of J.
 
     `at` gives None where J is not known; `constraints` λ (m,) and ∇λ (m, n). `settled` is relative
     to J. `known` are further points that were met before; `start` keeps λ <= 0.
@@ -80,6 +90,8 @@ def descend(
         elif gained > 0.7 * step.promised and length > 0.9 * radius:
             radius = min(2.0 * radius, LARGEST)
         if there is not None:
+            if gained < 0.0 and jumps(best, there):
+                break
             pieces.append(there)
         if there is not None and gained > 0.0:
             moved, best = there.z - best.z, there

@@ -1,18 +1,21 @@
-"""Parameters that are one of a few values: branch and bound over whole co-designs.
+"""Parameters that are one of a few values: branch and bound, the most promising part first.
 
     min over z in lists, θ of J(θ, z)  >=  min over z in [least, largest], θ of J(θ, z)
 
-A node has the listed parameters within ranges of their lists. Its bound is the co-design with these
-taken as continuous; where an optimum is between two values of a list the node falls into those up
-to the lower and those from the upper one. What is left with one value of each is a co-design at
-these values. A node is cut where its bound is no better than the best design so far: bounds are
-optima that were found, best of so many starts, so what is cut is no better as far as those hold.
+A part has the listed parameters within ranges of their lists. Its bound is the least J that a
+search finds with these taken as continuous. Where that is between two values of a list the part
+falls into those up to the lower and those from the upper one; where all are on values that
+combination is the best of the part. A search begins at the nearest optimum that is known. The first
+combination whose bound is the least of all is the best one, and what is left is cut: bounds are
+optima that were found, so what is cut is no better as far as those hold. A search that beats its
+bound shows by how much bounds may be wrong: all others are lowered by twice as much.
 
 Source: Land and Doig, Econometrica 28 (1960).
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from time import perf_counter
 from typing import Any
 
@@ -23,24 +26,50 @@ from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import spent_entry, was_moved
+from ccd_casadi.support.units import counted
 
 Lists = dict[str, tuple[float, ...]]
+Search = Callable[[Sampler, Solution | None], Solution]
+Judge = Callable[[Sampler, Solution], Solution]
 AT = 1e-6  # of a range: this close to a value of its list an optimum is on it
-NO_BETTER = 1e-6  # relative: a bound that is lower by less is cut
+NO_BETTER = 1e-6  # of the terms of J: a bound that is lower by less is cut
+FEW = 4  # combinations that are searched one by one: bounds for some of them would save no search
 
 
 @dataclass(frozen=True)
 class Node:
-    """What was solved: the values left of each list, status and J (inf: none was found)."""
+    """What was searched: the values left of each list, status and J (inf: none was found), and
+    what J is made of in words."""
 
     lists: Lists
     status: str
     objective: float
+    words: str
 
     @property
     def whole(self) -> bool:
         """Whether each list has come down to one value."""
         return all(len(values) == 1 for values in self.lists.values())
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is left of each list, a bound of its J, and where that was found, by name.
+
+    `found`: of one combination that was searched, but not judged. `lost`: part of one where nothing
+    was found, looked at where nothing else is left.
+    """
+
+    lists: Lists
+    bound: float
+    theta: Mapping[str, float]
+    found: Solution | None = None
+    lost: bool = False
+
+    @property
+    def count(self) -> int:
+        """How many combinations it has."""
+        return int(np.prod([len(values) for values in self.lists.values()]))
 
 
 def restricted(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]]) -> CoDesignProblem:
@@ -68,40 +97,74 @@ def restricted(problem: CoDesignProblem, lists: Mapping[str, tuple[float, ...]])
     )
 
 
-def best_of_lists(sampler: Sampler, solve: Callable[[Sampler], Solution]) -> Solution:
-    """The best co-design with every listed parameter on a value of its list; `solve` does one.
+def best_of_lists(
+    sampler: Sampler, between: Search, at: Search, judge: Judge | None = None
+) -> Solution:
+    """The best co-design with every listed parameter on a value of its list.
 
-    `listed` in the result: what was solved, what cut, and how far J is above that of the root.
+    `between` searches a part, `at` a combination, both near a solution that is given; with `judge`
+    what `at` finds is only good for its J, and the best is judged from there.
     """
     began, problem = perf_counter(), sampler.problem
-    open_: list[tuple[Lists, float]] = [(dict(problem.listed), -np.inf)]
-    nodes: list[Node] = []
+    width = {name: high - low for name, low, high in
+             zip(problem.names, problem.lower, problem.upper, strict=True)}  # fmt: skip
+
+    def away(lists: Lists, theta: Mapping[str, float]) -> float:
+        """How far a point is from a part, in shares of the ranges."""
+        ends = [(values[0], theta[name], values[-1], width[name]) for name, values in lists.items()
+                if name in theta]  # fmt: skip
+        return sum(abs(float(np.clip(v, low, high)) - v) / size for low, v, high, size in ends)
+
+    open_ = [_Part(dict(problem.listed), -np.inf, {})]
+    nodes: dict[tuple[tuple[float, ...], ...], Node] = {}
+    known: list[Solution] = []
     best: Solution | None = None
-    cut = 0
+    judged, count = 0, open_[0].count
+    most = count // 2 if count > FEW else 0
     while open_:
-        lists, bound = open_.pop()
-        if bound >= _least(best):
-            cut += 1
+        part = min(open_, key=lambda p: (p.lost, p.bound, p.count > 1, away(p.lists, p.theta)))
+        least = _least(problem, best)
+        if part.bound >= least or (part.lost and np.isfinite(least)):
+            break
+        open_.remove(part)
+        if part.count > 1 and sum(not node.whole for node in nodes.values()) >= most:
+            rows = product(*part.lists.values())
+            open_ += [
+                replace(part, lists={n: (v,) for n, v in zip(part.lists, row, strict=True)})
+                for row in rows
+            ]
             continue
-        own = restricted(problem, lists)
-        found = solve(sampler.of(own))
-        found = replace(found, problem=found.problem or own)
-        node = Node(lists, found.result["status"], found.result.get("objective", np.inf))
-        nodes.append(node)
-        if node.whole:
-            best = found if best is None else min(best, found, key=order)
-        elif node.objective < _least(best):
-            theta = found.result["theta"]
-            open_ += [(child, node.objective) for child in _children(problem, lists, theta)]
-        elif np.isinf(_least(best)):  # none was found between the values: on them may be one
-            open_ += [(child, -np.inf) for child in _halves(lists)]
+        own, whole = restricted(problem, part.lists), part.count == 1
+        near = min(known, key=lambda item: away(part.lists, _point(item)), default=None)
+        each = sampler.of(own, traced=whole)
+        if judge is not None and part.found is not None:
+            found, judged = judge(each, part.found), judged + 1
         else:
-            cut += 1
+            found = (at if whole else between)(each, near)
+        found = replace(found, problem=found.problem or own)
+        J = found.result.get("objective", np.inf)
+        node = Node(part.lists, found.result["status"], J, _made_of(problem, found.result))
+        nodes[tuple(part.lists.values())] = node
+        known += [found] if np.isfinite(J) else []
+        gained = part.bound - J if node.status != "not_verified" else 0.0
+        if gained > _same(problem, found) or (part.found and -gained > _same(problem, found)):
+            lower = 2.0 * max(gained, 0.0)
+            open_ = [replace(other, bound=other.bound - lower, found=None) for other in open_]
+        if whole and judge is not None and part.found is None and np.isfinite(J):
+            open_.append(replace(part, bound=J, found=found))
+        elif whole:
+            best = found if best is None else min(best, found, key=order)
+        elif np.isfinite(J):
+            theta = _point(found)
+            open_ += [_Part(child, J, theta) for child in _children(width, part.lists, theta)]
+        else:
+            open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
     assert best is not None
+    cut = sum(part.count for part in open_)
     result = best.result | {
         "seconds": perf_counter() - began,
         **spent_entry(sampler.spent.by_purpose, was_moved(best.result)),
-        "listed": _listed(problem, best, nodes, cut),
+        "listed": _listed(problem, best, [*nodes.values()], cut, judged),
     }
     words = _words(problem, result)
     notes = [*result.get("notes", ()), words]
@@ -110,36 +173,47 @@ def best_of_lists(sampler: Sampler, solve: Callable[[Sampler], Solution]) -> Sol
     return replace(best, result=result | {"notes": notes})
 
 
-def _least(best: Solution | None) -> float:
-    """The J from which on a node is cut: a design that is not verified cuts nothing."""
+def _point(found: Solution) -> dict[str, float]:
+    """θ of a solution and the values that were held, by name."""
+    assert found.problem is not None
+    return found.problem.source.held | found.result["theta"]
+
+
+def _same(problem: CoDesignProblem, found: Solution) -> float:
+    """By how much J may differ and count as the same."""
+    cost, J = (float(found.result.get(key, 0.0)) for key in ("hardware_cost", "objective"))
+    share = problem.w1 * cost
+    return NO_BETTER * (abs(share) + abs(J - share)) if np.isfinite(J) else 0.0
+
+
+def _least(problem: CoDesignProblem, best: Solution | None) -> float:
+    """The J from which on a part is cut: a design that is not verified cuts nothing."""
     if best is None or best.result["status"] != "verified":
         return np.inf
-    J = float(best.result["objective"])
-    return J - NO_BETTER * abs(J)
+    return float(best.result["objective"]) - _same(problem, best)
 
 
-def _children(problem: CoDesignProblem, lists: Lists, theta: Mapping[str, float]) -> list[Lists]:
-    """The parts of a node, the one to go on with last.
+def _children(width: Mapping[str, float], lists: Lists, theta: Mapping[str, float]) -> list[Lists]:
+    """The parts of a part: on both sides of θ in the list whose values are furthest from it.
 
-    The list whose optimum is furthest from its values is split there. Where all are on values these
-    come first, then the rest on both sides of one of them.
+    Where all of θ is on values these are a part, and what is beside them are others.
     """
-    width = {name: high - low for name, low, high in
-             zip(problem.names, problem.lower, problem.upper, strict=True)}  # fmt: skip
     several = [name for name, values in lists.items() if len(values) > 1]
     nearest = {name: min(lists[name], key=lambda v: abs(v - theta[name])) for name in several}
     away = {name: abs(nearest[name] - theta[name]) / width[name] for name in several}
-    name = max(several, key=lambda item: (away[item], len(lists[item])))
-    value, on_values = nearest[name], away[name] <= AT
-    middle = value if on_values else theta[name]
-    low = tuple(v for v in lists[name] if v < middle)
-    high = tuple(v for v in lists[name] if v > middle)
-    parts: list[Lists] = [{name: part} for part in ((low, high) if value in high else (high, low))]
-    if on_values:
-        if len(several) > 1:
-            parts.append({name: (value,)})
-        parts.append({item: (nearest[item],) for item in several})
-    return [lists | part for part in parts if all(part.values())]
+    furthest = max(several, key=lambda item: (away[item], len(lists[item])))
+    on_values = away[furthest] <= AT
+    held: Lists = {}
+    parts: list[Lists] = []
+    for name in several if on_values else [furthest]:
+        middle = nearest[name] if on_values else theta[name]
+        for side in (
+            [v for v in lists[name] if v < middle],
+            [v for v in lists[name] if v > middle],
+        ):
+            parts += [held | {name: tuple(side)}] if side else []
+        held = held | {name: (nearest[name],)}
+    return [lists | part for part in (*parts, *([held] if on_values else []))]
 
 
 def _halves(lists: Lists) -> list[Lists]:
@@ -150,30 +224,43 @@ def _halves(lists: Lists) -> list[Lists]:
 
 
 def _listed(
-    problem: CoDesignProblem, best: Solution, nodes: list[Node], cut: int
+    problem: CoDesignProblem, best: Solution, nodes: list[Node], cut: int, judged: int
 ) -> dict[str, Any]:
-    root = nodes[0].objective
+    whole = sum(node.whole for node in nodes)
+    free = np.inf if nodes[0].whole else nodes[0].objective
     J = best.result.get("objective", np.inf)
-    found = bool(np.isfinite(J)) and bool(np.isfinite(root))
     assert best.problem is not None
     held = best.problem.source.held
     return {
         "values": {name: list(values) for name, values in problem.listed},
         "chosen": {name: held[name] for name, _ in problem.listed},
         "combinations": int(np.prod([len(values) for _, values in problem.listed])),
-        "solved": len(nodes),
+        "solved": whole,
+        "between": len(nodes) - whole,
+        "judged": judged,
         "cut": cut,
-        "free_objective": root if np.isfinite(root) else None,
-        "above_free": (J - root) / abs(root) if found and root else None,
+        "free_objective": free if np.isfinite(free) else None,
+        "objective_above_free": J - free if np.isfinite([J, free]).all() else None,
         "nodes": [
             {
                 "lists": {name: list(values) for name, values in node.lists.items()},
                 "status": node.status,
                 "objective": node.objective if np.isfinite(node.objective) else None,
+                "words": node.words,
             }
             for node in nodes
         ],
     }
+
+
+def _made_of(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+    """What J is made of: the bandwidth or the error, at the hardware cost."""
+    if "hardware_cost" not in result:
+        return ""
+    value = f"{result['bandwidth_hz']:.4g} Hz"
+    if result.get("error_rms_of_set") is not None:
+        value = f"{1e9 * result['error_rms_of_set']:.4g} nm RMS"
+    return f"{value} at {result['hardware_cost']:.4g} {problem.cost_unit}".strip()
 
 
 def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
@@ -183,11 +270,14 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
         f"{name} = {value:g} {units[name]}".strip() + f" of {len(found['values'][name])}"
         for name, value in found["chosen"].items()
     )
-    above = found["above_free"]
-    free = ""
+    above, free = found["objective_above_free"], ""
     if above is not None:
-        far = f"{100 * above:.2g} % above" if above > NO_BETTER else "no worse than"
-        free = f"; J is {far} that with all values between them allowed"
-    counts = f"{found['solved']} co-designs for {found['combinations']} combinations"
-    cut = f", {found['cut']} branches cut by optima that are best of their starts"
+        far = f"{above:.3g} above" if above > 0.0 else "no worse than"
+        there, here = found["nodes"][0]["words"], _made_of(problem, result)
+        figures = f" ({there} there, {here} here)" if there else ""
+        free = f"; J is {far} what was found with all values between them allowed{figures}"
+    counts = f"{found['solved']} of {counted(found['combinations'], 'combination')} searched"
+    if found["between"]:
+        counts += f", and {counted(found['between'], 'part')} with all values between them allowed"
+    cut = f", {found['cut']} cut by bounds that are the best of their searches"
     return f"listed values: {named}{free}; {counts}{cut if found['cut'] else ''}"

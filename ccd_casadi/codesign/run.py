@@ -1,5 +1,6 @@
 """One co-design: sample, fit, solve with IPOPT, verify."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -19,6 +20,7 @@ from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.result import infeasible_dict
 from ccd_casadi.codesign.second_look import conclude, conclude_with_look, rescue
+from ccd_casadi.codesign.sections_lists import ListedSections
 from ccd_casadi.codesign.sections_result import beside_dict, sections_result
 from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
@@ -82,7 +84,7 @@ def co_design(
     if sampler.problem.listed:
         if given is not None:
             raise UserError("--surrogate: starts no solve with lists of values; leave it out")
-        return best_of_lists(sampler, lambda each: co_design(each, formulation, seed))
+        return _of_lists(sampler, formulation, seed)
     began = perf_counter()
     name = type(formulation).__name__.lower()
 
@@ -110,6 +112,19 @@ def co_design(
         return conclude_with_look(each, formulation, outcome, seed, began)
 
     return best_over_design_plants(sampler, solved, concluded)
+
+
+def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
+    """A co-design with parameters from lists."""
+    if sampler.problem.sections is not None:
+        of = ListedSections(formulation, seed, lambda each: co_design(each, formulation, seed))
+        return best_of_lists(sampler, of.search, of.search, of.judge)
+    quick = replace(formulation, box_points=0)  # a bound needs no look at the box
+    return best_of_lists(
+        sampler,
+        lambda each, near: co_design(each, quick, seed),
+        lambda each, near: co_design(each, formulation, seed),
+    )
 
 
 def _of_sections(

@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from ccd_casadi.codesign.bundle import Local, descend
+from ccd_casadi.codesign.bundle import Local, descend, jumps
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -19,7 +19,7 @@ from ccd_casadi.codesign.sections_truth import (
     objective_gradient,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -29,6 +29,7 @@ STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
 PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
 SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
 LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
+FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω_b*
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
@@ -57,8 +58,9 @@ def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> Formul
     return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
 
 
-def polish_sections(sampler: Sampler, theta: Array) -> BandwidthSample:
-    """From a design nearly optimal to the best θ that is found near it on the true problem.
+def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
+    """From a design nearly optimal to the best θ that is found near it on the true problem, and
+    the sampler of the problem that has it: with more anchors, where the given ones lose it.
 
     By pieces (`bundle`), which know kinks; by IPOPT where J has one gradient and that is not yet
     zero to what it is known to.
@@ -71,14 +73,15 @@ def polish_sections(sampler: Sampler, theta: Array) -> BandwidthSample:
     candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
     best = min(candidates, key=lambda s: objective(problem, s))
     if sections_kkt(problem, best).stationarity > STATIONARY:
-        best = _by_pieces(truth, best)
+        truth, best = by_pieces(truth, best)
+    sampler, problem = truth.sampler, truth.sampler.problem
     if sections_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
-        return best
+        return sampler, best
     program = nested_program(problem, truth)
     program = type(program)(**{**vars(program), "exact_hessian": False})
     with suppress(OuterFailure):  # what it has asked for on its way counts
         solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
-    return min(truth.known.values(), key=lambda s: objective(problem, s))
+    return sampler, min(truth.known.values(), key=lambda s: objective(problem, s))
 
 
 def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
@@ -88,8 +91,28 @@ def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
     return found.kink is not None and found.stationarity <= SMOOTH
 
 
-def _by_pieces(truth: TrueBandwidth, best: BandwidthSample) -> BandwidthSample:
-    """From a sample, and what was asked for near it, to where the pieces of J promise no more."""
+def by_pieces(
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+) -> tuple[TrueBandwidth, BandwidthSample]:
+    """From a sample, and what was asked for near it, to where the pieces of J promise no more.
+
+    Where ω_b* jumps beside the best θ the climbs from the anchors have lost its controller: that
+    one becomes an anchor, and the search goes on.
+    """
+    for _ in range(FOLLOWED):
+        best, jumped = _by_pieces(truth, best, settled)
+        if not jumped:
+            break
+        problem = joined(truth.sampler.problem, np.array(best.kappa), ())
+        truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
+        best = truth.at(np.array(best.theta))
+    return truth, best
+
+
+def _by_pieces(
+    truth: TrueBandwidth, best: BandwidthSample, settled: float
+) -> tuple[BandwidthSample, bool]:
+    """The best sample of one function ω_b*, and whether that jumps beside it."""
     problem = truth.sampler.problem
     lower, upper = box(problem)
     width = upper - lower
@@ -109,7 +132,9 @@ def _by_pieces(truth: TrueBandwidth, best: BandwidthSample) -> BandwidthSample:
 
     start = local(best)
     if start is None:
-        return best
+        return best, False
     others = [found for found in map(local, truth.known.values()) if found is not None]
-    descend(at, start, others, constraints, steps=STEPS * len(lower), settled=LEVEL)
-    return min(truth.known.values(), key=lambda sample: objective(problem, sample))
+    end = descend(at, start, others, constraints, steps=STEPS * len(lower), settled=settled)
+    met = (found for found in map(local, truth.known.values()) if found is not None)
+    jumped = any(found.value > end.value and jumps(end, found) for found in met)
+    return min(truth.known.values(), key=lambda sample: objective(problem, sample)), jumped

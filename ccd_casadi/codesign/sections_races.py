@@ -15,6 +15,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, too_slow
 from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool
 
@@ -81,19 +82,15 @@ def seeded_and_prepared(
     return replace(problem, sections=sections), words
 
 
-def raced_at(
-    store: SampleStore,
-    problem: CoDesignProblem,
-    theta: tuple[float, ...],
-    quiet: bool,
-    workers: Pool | None = None,
-) -> Raced:
-    """A full race at θ, from the store where it was run before."""
-    owner = problem_hash({"race": problem_hash(problem.identity())})
+def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> Raced:
+    """A full race at θ, from the store where it was run before; counted."""
+    problem, store = sampler.problem, sampler.store
+    owner = problem_hash({"race": sampler.hash})
     key = sample_key(owner, theta, 0.0, 0.0)
+    sampler.raced(key)
     stored = store.get_result(key)
     if stored is None:
-        made = race(problem, theta, teller("race at the end", quiet), workers)
+        made = race(problem, theta, teller("race at the end", sampler.quiet), sampler.workers)
         error = None
         if made.certified and sections_of_problem(problem).of_error:
             found = valued(problem, theta, plants_of(problem, theta), made, 1)

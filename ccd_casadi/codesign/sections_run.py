@@ -31,7 +31,6 @@ from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -85,35 +84,57 @@ class SectionsRun:
     spent: dict[str, int]
 
 
+@dataclass(frozen=True)
+class Searched:
+    """What a search ends with; `end` None where no design was found."""
+
+    outcome: FormulationResult
+    end: "_End | None"
+    rounds: int
+
+
 def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> SectionsRun:
     """Sections' co-design on the sampler's store and workers."""
-    quiet, spent = sampler.quiet, sampler.spent
-    problem, first = seeded_and_prepared(
-        sampler.store, sampler.problem, seed, quiet, sampler.workers
-    )
-    with spent.on("races"):
-        spent.once("race at the start", 1)
+    found = search_sections(sampler, formulation, seed)
+    made = None
+    if found.end is not None:
+        made = _verified(found.outcome, found.end, found.rounds)
+    return SectionsRun(found.outcome, made, sampler.spent.by_purpose)
+
+
+def search_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: int) -> Searched:
+    """The same without the judge's look at the whole set; a problem that has anchors is not raced
+    at its start."""
+    problem, first = sampler.problem, ""
+    if not sections_of_problem(problem).anchors:
+        problem, first = seeded_and_prepared(
+            sampler.store, problem, seed, sampler.quiet, sampler.workers
+        )
+        sampler.raced(sampler.hash)
     rounds = 0
     while True:
         rounds += 1
-        asked = sampler.of(problem, traced=False)  # a smaller set of plants is an easier problem
+        asked = sampler.of(problem)
         outcome = _formulated(asked, formulation, seed)
         if outcome.x is None:
             words = first if first and not sections_of_problem(problem).anchors else ""
             if asked.nearest is not None:
                 words = asked.nearest.shortfall
             outcome = replace(outcome, message=words or outcome.message)
-            return SectionsRun(outcome, None, spent.by_purpose)
+            return Searched(outcome, None, rounds)
         sampled = np.array([*asked.solved])
         end = _end(asked, outcome.x[: len(problem.names)])
         if not (end.better or end.members) or rounds == AGAIN:
             break
         kappa = np.array(end.raced.kappa) if end.better else end.design.kappa
-        problem = joined(problem, kappa, end.members)
+        problem = joined(end.asked.problem, kappa, end.members)
+        if end.members:  # what was found for fewer plants is worth nothing on these
+            sampler.trace[:] = [
+                replace(entry, bandwidth=np.nan, objective=np.nan) for entry in sampler.trace
+            ]
     if not isinstance(formulation, Direct):
-        outcome, end = _foreseen(asked, formulation, seed, outcome, end, sampled)
-    sampler.trace.extend(asked.trace)
-    return SectionsRun(outcome, _verified(asked, outcome, end, rounds), spent.by_purpose)
+        outcome, end = _foreseen(formulation, seed, outcome, end, sampled)
+    return Searched(outcome, end, rounds)
 
 
 def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsRun:
@@ -123,15 +144,16 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
         outcome = replace(outcome, message=outcome.message or words)
         return SectionsRun(outcome, None, sampler.spent.by_purpose)
     end = _end(sampler, outcome.x[: len(sampler.problem.names)])
-    verified = _verified(sampler, outcome, end, 1)
+    verified = _verified(outcome, end, 1)
     return SectionsRun(outcome, verified, sampler.spent.by_purpose)
 
 
 @dataclass(frozen=True)
 class _End:
-    """The polished θ with its design and that one's gradients, a race there, the worst plant, and
-    those to add."""
+    """The polished θ by a problem's sampler, its design and that one's gradients, a race there, the
+    worst plant, and those to add."""
 
+    asked: Sampler
     best: BandwidthSample
     design: SectionsDesign
     envelope: Envelope | None
@@ -153,31 +175,24 @@ class _End:
 
 
 def _end(asked: Sampler, theta: Array) -> _End:
-    problem, quiet = asked.problem, asked.quiet
     with asked.spent.on("polish"):
-        best = polish_sections(asked, theta)
+        asked, best = polish_sections(asked, theta)
+    problem = asked.problem
     found = sections_value(problem, best.theta)
-    raced = raced_at(asked.store, problem, best.theta, quiet, asked.workers)
-    with asked.spent.on("races"):
-        asked.spent.once(f"race {problem_hash(problem.identity())} at {best.theta}", 1)
-    tell = teller("at the end", quiet)
+    raced = raced_at(asked, best.theta)
+    tell = teller("at the end", asked.quiet)
     worst, members = worst_members(problem, best.theta, found.design, 0, tell)
-    return _End(best, found.design, found.envelope, raced, worst, members)
+    return _End(asked, best, found.design, found.envelope, raced, worst, members)
 
 
 def _foreseen(
-    asked: Sampler,
-    formulation: Nested | Lifted,
-    seed: int,
-    outcome: FormulationResult,
-    end: _End,
-    sampled: Array,
+    formulation: Nested | Lifted, seed: int, outcome: FormulationResult, end: _End, sampled: Array
 ) -> tuple[FormulationResult, _End]:
     """Where the surrogate misses the polished design it learns it, and goes on from there."""
     error = abs(_predicted(outcome, end.best) / end.best.value - 1.0)
     if error <= formulation.tolerance or len(outcome.iterates) > formulation.max_refinements:
         return outcome, end
-    thetas = np.unique(np.vstack([sampled, end.best.theta]), axis=0)
+    asked, thetas = end.asked, np.unique(np.vstack([sampled, end.best.theta]), axis=0)
     found = _nested(asked, formulation, seed, Surrogates((), thetas, ()))
     if found.x is None:
         return outcome, end
@@ -194,10 +209,9 @@ def _predicted(outcome: FormulationResult, sample: BandwidthSample) -> float:
     return float(outcome.surrogates[0].predict(np.array(sample.theta)[None, :])[0])
 
 
-def _verified(
-    asked: Sampler, outcome: FormulationResult, end: _End, rounds: int
-) -> VerifiedSections:
-    problem, best, made = asked.problem, end.best, end.design
+def _verified(outcome: FormulationResult, end: _End, rounds: int) -> VerifiedSections:
+    asked, best, made = end.asked, end.best, end.design
+    problem = asked.problem
     assert made.controller is not None
     worst = end.worst
     loops = loops_of(problem, best.theta, made.controller)

@@ -72,7 +72,10 @@ def _optimal(verified: VerifiedSections, tolerance: float) -> Line:
         words = f"a race found a controller with {more} at this theta"
         return Line(State.FAILED, words, figures)
     if not math.isfinite(residual):
-        return Line(State.WARNED, f"KKT residual over theta unknown; {known}", figures)
+        off = verified.design.kkt_residual
+        words = f"no gradient over theta, since the search over the controller ended {off:.1e} from"
+        words += f" its optimum: a limit of ours; {known}"
+        return Line(State.WARNED, words, figures)
     if residual > KKT_LEVEL:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {KKT_LEVEL:g}"
         return Line(State.FAILED, f"{words}; {known}", figures)

@@ -16,7 +16,7 @@ from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import least_error
-from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
@@ -40,6 +40,8 @@ from ccd_casadi.support.units import HZ
 MOST_ANCHORS = 3
 DISTINCT = 0.1  # relative: local optima further below the best are no anchors
 ROUNDS = 6  # of a design on the set and a search for plants that are worse
+FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
+LOST = 1e-6  # relative: of the bandwidth, by rounding
 FEW = 8  # starts of the race at a θ where no anchor ends certified
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
@@ -91,6 +93,15 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
+    while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
+        again = synthesise(
+            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
+            initial=[made.kappa], only_initial=True, frequencies=sections.frequencies,
+        )  # fmt: skip
+        spent += 1
+        if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
+            break
+        made = again
     return valued(problem, theta, plants, made, spent)
 
 

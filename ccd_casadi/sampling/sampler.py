@@ -82,6 +82,11 @@ class Sampler:
         """Distinct true syntheses asked for so far."""
         return self.spent.total
 
+    def raced(self, key: str) -> None:
+        """Count a race once, as one synthesis."""
+        with self.spent.on("races"):
+            self.spent.once(f"race {key}", 1)
+
     def bandwidths(self, thetas: Array, label: str = "sampling") -> list[BandwidthSample]:
         """ω_b* at every row of `thetas`, in their order."""
         points = [tuple(float(v) for v in theta) for theta in np.atleast_2d(thetas)]

@@ -1,0 +1,155 @@
+"""Searches over lists of values with a controller of fixed structure, each near another's end.
+
+The first is a whole one, with races. From then on a search begins at the nearest θ and controller
+that are known and takes local steps on the true function. What is found so is good for its J; the
+best combination is then designed as any other case, from that controller.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.outer_problem import (
+    NonlinearProgram,
+    OuterFailure,
+    solve_program,
+    unmet_constraint,
+)
+from ccd_casadi.codesign.sections_direct import by_pieces
+from ccd_casadi.codesign.sections_run import search_sections
+from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import with_range
+from ccd_casadi.inner_problem.sections_plant_set import (
+    bounds_of,
+    plants_of,
+    sections_of_problem,
+    structure_of,
+    with_sections,
+)
+from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_warm import warm_starts
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+SETTLED = 1e-7  # of J: what local steps promise less than that is not looked for
+INSIDE = 1e-7  # of λ
+
+
+@dataclass
+class ListedSections:
+    """`search` and `judge` as `best_of_lists` asks for them; `solve` is a whole co-design.
+
+    `members`: all plants that were found worse than those of the set, at any of the θ.
+    """
+
+    formulation: Formulation
+    seed: int
+    solve: Callable[[Sampler], Solution]
+    members: tuple[Member, ...] = ()
+
+    def search(self, sampler: Sampler, near: Solution | None) -> Solution:
+        """The least J that is found with every value in the ranges of the sampler's problem."""
+        problem = sampler.problem
+        forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
+        if forbidden:
+            return _nothing(forbidden)
+        if near is None:
+            first = search_sections(sampler, self.formulation, self.seed)
+            if first.end is None:
+                return _nothing(first.outcome.message)
+            self.members = sections_of_problem(first.end.asked.problem).members
+            return _found(first.end.asked.problem, first.end.best)
+        known = _start(near)
+        values = known.source.held | dict(zip(known.names, known.start, strict=True))
+        theta = _allowed(problem, np.array([values[name] for name in problem.names]))
+        if theta is None:
+            return _nothing("no theta was found near by that meets the constraints")
+        truth = TrueBandwidth(sampler.of(carried(known, problem, self.members)), "near by")
+        truth, best = by_pieces(truth, truth.at(theta), SETTLED)
+        return _found(truth.sampler.problem, best)
+
+    def judge(self, sampler: Sampler, found: Solution) -> Solution:
+        """The whole co-design of a combination, from the controller that was found for it."""
+        solution = self.solve(sampler.of(carried(_start(found), sampler.problem, self.members)))
+        if solution.sections is not None:
+            self.members = sections_of_problem(solution.sections.problem).members
+        return solution
+
+
+def carried(
+    near: CoDesignProblem, problem: CoDesignProblem, members: tuple[Member, ...]
+) -> CoDesignProblem:
+    """A problem with the anchors of one like it, moved from that one's start to its own."""
+    problem = with_sections(problem, seed=sections_of_problem(near).seed, members=members)
+    problem = with_range(problem)
+    plants, bounds = plants_of(problem, problem.start), bounds_of(problem)
+    moved = {}
+    for name in ("anchors", "error_anchors"):
+        of = with_sections(near, anchors=getattr(sections_of_problem(near), name))
+        kappas = warm_starts(of, structure_of(problem), plants, bounds)
+        moved[name] = tuple(tuple(map(float, kappa)) for kappa in kappas)
+    return with_sections(problem, **moved)
+
+
+def _start(found: Solution) -> CoDesignProblem:
+    """The problem of a solution with its θ as the start and its controller as the anchor."""
+    made = found.sections
+    if made is None:
+        assert found.problem is not None
+        return found.problem
+    return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
+
+
+def _at(
+    problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
+) -> CoDesignProblem:
+    of_error = sections_of_problem(problem).of_error
+    own = with_sections(problem, anchors=(kappa,), error_anchors=(kappa,) if of_error else ())
+    return replace(own, start=theta)
+
+
+def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
+    J = objective(problem, best)
+    if not np.isfinite(J):
+        return _nothing(best.shortfall)
+    result = {
+        "status": "searched",
+        "objective": J,
+        "theta": dict(zip(problem.names, best.theta, strict=True)),
+        "hardware_cost": hardware_cost(plant_of(problem), best.theta),
+        "bandwidth_hz": best.bandwidth / HZ,
+        "error_rms_of_set": best.error,
+    }
+    outcome = FormulationResult(np.array(best.theta), None, (), (), None, True, "")
+    return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
+
+
+def _nothing(words: str) -> Solution:
+    result = {"status": "infeasible", "reason": words, "syntheses": 0}
+    return Solution(result, FormulationResult(None, None, (), (), None, False, words), None)
+
+
+def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
+    """The nearest θ within the box and λ(θ) <= 0; None where none is found."""
+    lower, upper = box(problem)
+    plant, x = plant_of(problem), ca.MX.sym("theta", len(lower))
+    lam = plant.hardware(x)[1]
+    theta = np.clip(theta, lower, upper)
+    f = ca.sumsqr((x - theta) / (upper - lower))
+    program = NonlinearProgram(
+        x, f, lam + INSIDE, lower, upper, problem.names, plant.constraint_names,
+        exact_hessian=plant.exact_hessian,
+    )  # fmt: skip
+    try:
+        return np.clip(solve_program(program, theta).best.x, lower, upper) if lam.numel() else theta
+    except OuterFailure:
+        return None
