@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Reset
-from bokeh.models import ColumnDataSource, CrosshairTool, CustomJS, HoverTool, Range1d
+from bokeh.models import (
+    BoxZoomTool,
+    ColumnDataSource,
+    CrosshairTool,
+    CustomJS,
+    HoverTool,
+    Range1d,
+    WheelZoomTool,
+)
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
@@ -28,6 +36,15 @@ PADDING = 0.1  # of the data, that an axis reaches beyond them
 # After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
 FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
   range.have_updated_interactively = false"""
+# At any width of the page both axes have one scale, so that a circle is round: ±`half` fits in.
+ROUND = """const {inner_width: wide, inner_height: tall, x_range, y_range} = figure
+if (!(wide > 0 && tall > 0)) return
+const scale = Math.max(2 * half[0] / wide, 2 * half[1] / tall)
+for (const [range, middle, size] of [[x_range, centre, wide], [y_range, 0, tall]]) {
+  const start = middle - scale * size / 2, end = middle + scale * size / 2
+  range.setv({start, end, reset_start: start, reset_end: end}, {sync: false})
+}"""
+CENTRE, HALF = -0.8, (2.4, 2.0)  # of the Nyquist plot, and what it shows at least to both sides
 
 
 @dataclass(frozen=True)
@@ -139,12 +156,21 @@ class Figures:
         return made
 
     def _nyquist(self) -> Any:
-        made = self._figure(
-            "nyquist", "Re L", "Im L", x_range=(-3.2, 1.6), y_range=(-2.0, 2.0), match_aspect=True
+        made = self._figure("nyquist", "Re L", "Im L", x_range=(-3.2, 1.6), y_range=(-2.0, 2.0))
+        for tool in made.tools:  # what is zoomed keeps one scale too
+            if isinstance(tool, BoxZoomTool):
+                tool.match_aspect = True
+            if isinstance(tool, WheelZoomTool):
+                tool.zoom_on_axis = False
+        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)}, code=ROUND)
+        for size in ("inner_width", "inner_height"):
+            made.js_on_change(size, fit)
+        # ellipses: true in both axes, whatever these do, where a circle would take that across
+        made.ellipse(
+            0.0, 0.0, width=2.0, height=2.0, fill_color=None, line_color=GREY, line_dash="dotted"
         )
-        made.circle(0.0, 0.0, radius=1.0, fill_color=None, line_color=GREY, line_dash="dotted")
-        self.disk = made.circle(
-            -1.0, 0.0, radius=0.5, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE
+        self.disk = made.ellipse(
+            -1.0, 0.0, width=1.0, height=1.0, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE
         )
         made.scatter([-1.0], [0.0], marker="cross", size=9, line_color=self.ink)
         self._pins(made, "nyquist")
@@ -189,7 +215,7 @@ class Figures:
         certified = look.standing is not Standing.REFUSED
         found: list[Change] = [
             (self.S_max, {"bottom": inner.S_max}),
-            (self.disk.glyph, {"radius": 1.0 / inner.S_max}),
+            (self.disk.glyph, dict.fromkeys(("width", "height"), 2.0 / inner.S_max)),
             (self.S_low, {"right": inner.omega_low / (2 * np.pi), "bottom": inner.S_low}),
             *((glyph, line) for glyph in self.lines),
             (self.bandwidth, {"location": look.bandwidth_hz if certified else None}),
