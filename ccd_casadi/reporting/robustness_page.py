@@ -141,6 +141,12 @@ def _moved(found: Study, i: int) -> str:
     )
 
 
+def _place(omega: float) -> str:
+    if omega in (0.0, np.inf):
+        return "at rest" if omega == 0.0 else "towards infinite frequency"
+    return f"at {number(omega / HZ, 4)} Hz"
+
+
 def _time(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
 
@@ -183,7 +189,7 @@ def _margins(found: Study) -> Section:
         rows.append((f"all {name} at once", *([nothing] * 4), *disk(margin)))
     words = (
         "Gains are factors: the nearest above and below 1 at which stability is lost. A disk "
-        "margin covers gain and phase errors at once; it is taken on a grid of frequencies."
+        "margin covers gain and phase errors at once."
     )
     return Section("Margins", table_html(Table(head, tuple(rows))) + paragraph(words))
 
@@ -191,12 +197,10 @@ def _margins(found: Study) -> Section:
 def _gains(run: FinishedRun, found: Study) -> Section:
     names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
     tops = [
-        (
-            name,
-            number(factor * float(row.max())),
-            f"at {number(float(found.hz[row.argmax()]), 4)} Hz",
+        (name, number(factor * peak), _place(omega))
+        for name, (peak, omega), factor in zip(
+            names, found.peaks, (1.0, 1.0, 1e6, 1.0), strict=True
         )
-        for name, row, factor in zip(names, found.gains, (1.0, 1.0, 1e6, 1.0), strict=True)
     ]
     n, d = found.noise, found.demands
     # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
@@ -231,7 +235,8 @@ def _gains(run: FinishedRun, found: Study) -> Section:
 def _perturbed(run: FinishedRun, found: Study) -> Section:
     caption = (
         "Above: all flexible frequencies shifted together, mode shapes kept. Below: all damping "
-        "multiplied. The controller stays. A gap in a curve is an unstable loop."
+        "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
+        f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
     drawn = figure_html(
         figures.perturbed(run, found), caption,
@@ -247,11 +252,19 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
 
 
 def _tolerances(run: FinishedRun, found: Study) -> Section:
-    hard = found.tolerances
+    hard, shown = found.tolerances, figures.shown_peak(run, found)
+    count = len(hard.judged)
+    lost = sum(not item.stable for item in hard.judged)
+    beyond = sum(item.stable and item.peak > shown for item in hard.judged)
     caption = (
-        f"{len(hard.judged)} plants with every hardware parameter uniformly within "
+        f"{count} plants with every hardware parameter uniformly within "
         f"±{100 * hard.tolerance:g} % of its value: the share of them below a peak of S, and below "
-        "a bandwidth. A curve that ends below 1 leaves out what is unstable."
+        f"a bandwidth. {lost} are unstable: both curves end at {number(1.0 - lost / count, 3)}."
+        + (
+            f" {beyond} more are stable and lie right of the axis, above a peak of {shown:.4g}."
+            if beyond
+            else ""
+        )
     )
     theta = theta_words({
         "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
