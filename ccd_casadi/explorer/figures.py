@@ -14,6 +14,7 @@ from bokeh.models import (
     ColumnDataSource,
     CrosshairTool,
     CustomJS,
+    FixedTicker,
     HoverTool,
     Range1d,
     WheelZoomTool,
@@ -24,6 +25,8 @@ from bokeh.plotting import figure
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
+from ccd_casadi.reporting.bode import phase_deg
+from ccd_casadi.reporting.nyquist import FAR
 from ccd_casadi.reporting.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 
 HEIGHT = 230
@@ -31,7 +34,7 @@ TOP = 1e12  # above every gain: a shaded region ends there
 SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
-DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.REFUSED: [6]}
+DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.NEAR: [2, 3], Standing.REFUSED: [6]}
 PADDING = 0.1  # of the data, that an axis reaches beyond them
 # After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
 FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
@@ -66,6 +69,7 @@ class Figures:
         self.gains = ColumnDataSource({k: [] for k in columns}, name="gains")
         self.sampled = ColumnDataSource({"hz": [], "S": []})
         self.loci = ColumnDataSource({"xs": [], "ys": []})
+        self.loop = ColumnDataSource({"hz": [], "size": [], "phase": []})
         self.poles = {
             name: ColumnDataSource({"hz": [], "damping": []}) for name in ("loop", "K", "G")
         }
@@ -73,13 +77,14 @@ class Figures:
         self.move = ColumnDataSource({"ms": [], "um": []})
         self.pinned = {
             name: ColumnDataSource({"xs": [], "ys": [], "colour": [], "name": []})
-            for name in ("S", "KS", "T", "nyquist", "step", "move")
+            for name in ("S", "KS", "T", "nyquist", "size", "phase", "step", "move")
         }
         self.lines: list[Any] = []  # those of the present design, whose look says its standing
         self.cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
         hz = Range1d(start=0.1, end=1e4)
         self.of_gain = [self._gain(name, label, hz) for name, label in GAINS]
         self.hz = hz
+        self.loop_size, self.loop_phase = self._bode(hz)
         self.nyquist = self._nyquist()
         self.pole_map = self._poles()
         self.step_figure = self._time("step", "ms", "y after a step of r", self.step, "y")
@@ -91,8 +96,11 @@ class Figures:
         """Figures by the name of their place on the page."""
         names = [f"gain_{name}" for name, _ in GAINS]
         found = dict(zip(names, self.of_gain, strict=True))
-        others = (self.nyquist, self.pole_map, self.step_figure, self.move_figure)
-        return found | dict(zip(("nyquist", "poles", "step", "move"), others, strict=True))
+        others = {
+            "nyquist": self.nyquist, "loop": self.loop_size, "phase": self.loop_phase,
+            "poles": self.pole_map, "step": self.step_figure, "move": self.move_figure,
+        }  # fmt: skip
+        return found | others
 
     def _figure(self, name: str, x: str, y: str, **options: Any) -> Any:
         made = figure(
@@ -178,6 +186,33 @@ class Figures:
         self.lines.append(found.glyph)
         return made
 
+    def _bode(self, hz: Range1d) -> tuple[Any, Any]:
+        """|L| and its phase, with 1 and the odd multiples of 180° where the two decide."""
+        made = []
+        for name, label, axis, at in (
+            ("size", "|L|", "log", [1.0]), ("phase", "phase of L (°)", "linear", [-540, -180, 180]),
+        ):  # fmt: skip
+            y_range = (
+                Range1d(start=1e-3, end=1e3) if name == "size" else Range1d(start=-540, end=90)
+            )
+            on = self._figure(
+                name, "frequency (Hz)", label, x_axis_type="log", y_axis_type=axis, x_range=hz,
+                y_range=y_range,
+            )  # fmt: skip
+            for level in at:
+                on.add_layout(
+                    Span(location=level, dimension="width", line_color=GREY, line_dash="dotted")
+                )
+            self._pins(on, name)
+            found = on.multi_line(
+                "hz", name, source=self.loop, line_color=self.main, line_width=2.0
+            )
+            self.lines.append(found.glyph)
+            on.add_tools(CrosshairTool(overlay=self.cursor))
+            made.append(on)
+        made[1].yaxis.ticker = FixedTicker(ticks=[*range(-1080, 1081, 180)])
+        return made[0], made[1]
+
     def _poles(self) -> Any:
         ranges = {"x_range": Range1d(start=0.1, end=1e4), "y_range": Range1d(start=-0.08, end=1.08)}
         made = self._figure("poles", "|pole| (Hz)", "damping ratio", x_axis_type="log", **ranges)
@@ -210,8 +245,8 @@ class Figures:
         """
         look, c, s = drawn.look, drawn.curves, drawn.sampled
         inner = look.problem.inner
-        colour = {Standing.KEPT: self.main, Standing.MISSED: AMBER, Standing.REFUSED: GREY}
-        line = {"line_color": colour[look.standing], "line_dash": DASHES[look.standing]}
+        colour = {Standing.KEPT: self.main, Standing.MISSED: AMBER}.get(look.standing, GREY)
+        line = {"line_color": colour, "line_dash": DASHES[look.standing]}
         certified = look.standing is not Standing.REFUSED
         found: list[Change] = [
             (self.S_max, {"bottom": inner.S_max}),
@@ -223,14 +258,19 @@ class Figures:
             else _data(self.sampled, hz=s.hz, S=s.gain),
         ]  # fmt: skip
         if c is None:
-            sources = (self.gains, self.loci, self.step, self.move, *self.poles.values())
+            sources = (self.gains, self.loci, self.loop, self.step, self.move, *self.poles.values())
             return found + [_data(source, **{key: [] for key in source.data}) for source in sources]
         columns = {"hz": c.hz, "top": np.full(len(c.hz), TOP)}
         for i, (name, _) in enumerate(GAINS):
             nothing = np.full(len(c.hz), np.nan)
             columns |= {name: c.gains[i], f"b{name}": c.bounds[i] if certified else nothing}
+        size, phase = _bode_of(c)
         xs, ys = _lines(c.loci)
-        found += [_data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys)]
+        hz = [c.hz] * len(size)
+        found += [
+            _data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys),
+            _data(self.loop, hz=hz, size=size, phase=phase),
+        ]  # fmt: skip
         at_poles = []
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
             upper = roots[roots.imag >= 0.0]
@@ -248,6 +288,8 @@ class Figures:
         spans = [(made.y_range, [c.gains[i]], True) for i, made in enumerate(self.of_gain)]
         spans += [
             (self.pole_map.x_range, at_poles, True),
+            (self.loop_size.y_range, size, True),
+            (self.loop_phase.y_range, phase, False),
             (self.step_figure.x_range, [1e3 * each.step_time for each in known], False),
             (self.step_figure.y_range, [each.step for each in known], False),
             (self.move_figure.x_range, [1e3 * each.move.time for each in known], False),
@@ -272,6 +314,8 @@ class Figures:
                 rows[gain].append((c.hz, c.gains[k], colour, name))
             for x, y in zip(*_lines(c.loci), strict=True):
                 rows["nyquist"].append((x, y, colour, name))
+            for name_, lines in zip(("size", "phase"), _bode_of(c), strict=True):
+                rows[name_] += [(c.hz, line, colour, name) for line in lines]
             rows["step"].append((1e3 * c.step_time, c.step, colour, name))
             rows["move"].append((1e3 * c.move.time, 1e6 * c.move.error, colour, name))
         for name, source in self.pinned.items():
@@ -301,7 +345,13 @@ def _spanned(axis: Range1d, values: Sequence[np.ndarray], log: bool) -> Change:
     return _ends(axis, low - margin, high + margin)
 
 
+def _bode_of(c: Curves) -> tuple[list[Any], list[Any]]:
+    """Sizes of the eigenvalues of L, and their phases in degrees."""
+    return list(np.abs(c.loci).T), list(phase_deg(c.loci).T)
+
+
 def _lines(loci: np.ndarray) -> tuple[list[Any], list[Any]]:
+    loci = np.where(np.abs(loci) <= FAR, loci, np.nan)
     return [line.real for line in loci.T], [line.imag for line in loci.T]
 
 
