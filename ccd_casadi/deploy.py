@@ -25,6 +25,7 @@ LEADS = {"auto": None, "on": True, "off": False}
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.later_lines import told
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
@@ -35,6 +36,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.pipeline import deploy
     from ccd_casadi.deployment.structured_text import FILE as ST_FILE
     from ccd_casadi.deployment.structured_text import structured_text
+    from ccd_casadi.deployment.words import deployed_line
 
     require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
@@ -95,6 +97,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"report        {folder / 'report.html'}")
     from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
 
+    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     write_report(folder / "report.html", finished, found, moved)
     if found.passed:
         return ExitCode.DONE

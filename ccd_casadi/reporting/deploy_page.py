@@ -13,7 +13,7 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
-from ccd_casadi.deployment.words import reason_words
+from ccd_casadi.deployment.words import reason_words, short_status
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.deploy_move import move_html
@@ -64,9 +64,8 @@ def write_report(
     ]
     if found.stable:
         sections.append(Section("The code", _code(found)))
-    status = "verified" if found.passed else "not verified"
     head = header(
-        title, found.passed, status, reason, meta, _conclusion(run, found),
+        title, found.passed, short_status(run, found), reason, meta, _conclusion(run, found),
         warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
     )  # fmt: skip
     inside = path.resolve().parent.parent == run.folder.resolve()

@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.later_lines import at_solve
+from ccd_casadi.codesign.verdict import Line as VerdictLine
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -284,6 +287,43 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "runs": [_move(move) for move in found.moves],
         },
     }
+
+
+def survival_line(run: FinishedRun, found: Study) -> VerdictLine:
+    """`survives` of the run's verdict: what the solve said, and what the study adds to it."""
+    before, hard, d = at_solve(run.result, "survives"), found.tolerances, found.demands
+    lost = sum(not item.stable for item in hard.judged)
+    said = []
+    low, high = found.shift.stable
+    ends = [f"below {100.0 * low:+.2g} %"] * (low > -d.shift)
+    ends += [f"above {100.0 * high:+.2g} %"] * (high < d.shift)
+    if ends:
+        said.append(f"unstable for resonance shifts {' and '.join(ends)}")
+    if lost or not hard.worst.stable:
+        of = f"{lost} of {len(hard.judged)} plants with hardware within +-{100 * d.tolerance:g} %"
+        said.append(f"{of} unstable{'' if lost else ', the worst that was searched is'}")
+    tried = (
+        f"shifts of +-{100 * d.shift:g} %, damping times {d.damping[0]:g} to {d.damping[1]:g}, "
+        f"hardware within +-{100 * d.tolerance:g} %"
+    )
+    words = f"robustness: stable on all plants tried ({tried})"
+    if not found.survives:
+        words = f"robustness: {'; '.join(said) or f'not stable on all plants tried ({tried})'}"
+    state = State(before.get("state", State.UNKNOWN))
+    if not found.survives and state is not State.FAILED:
+        state = State.WARNED
+    elif state is State.UNKNOWN:
+        state = State.PASSED
+    figures = {key: value for key, value in before.items() if key not in ("state", "words")}
+    figures["robustness"] = {
+        "stable_on_all": found.survives,
+        "stable_between": list(found.shift.stable),
+        "hardware": {
+            "tolerance": hard.tolerance, "plants": len(hard.judged), "unstable": lost,
+            "worst_stable": hard.worst.stable,
+        },
+    }  # fmt: skip
+    return VerdictLine(state, "; ".join(filter(None, (words, before.get("words")))), figures)
 
 
 def _disk(margin: DiskMargin) -> dict[str, float]:
