@@ -183,7 +183,8 @@ def _theta(
     outcome = solution.outcome
     processes, iterates = outcome.surrogates, outcome.iterates
     best = float(solution.result["bandwidth_hz"])
-    extra = caption_disagreement(problem, processes, truths)
+    missed = solution.quality[0].missed if solution.quality else None
+    extra = caption_disagreement(problem, processes, truths, verified.theta, missed)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, processes, truths, radius, verified.theta)
