@@ -107,7 +107,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import status_words
+    from ccd_casadi.deployment.words import against, status_words
 
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
@@ -133,8 +133,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
                 f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
                 f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
                 f"{figures.sensitivity_peak:.6g} "
-                f"({100 * (figures.sensitivity_peak / run.problem.inner.S_max - 1):+.2f} % of "
-                "S_max)",
+                f"({against(figures.sensitivity_peak, run.problem.inner.S_max)})",
             ))  # fmt: skip
     if found.members:
         worst, count = found.worst, 1 + len(found.measured_members)

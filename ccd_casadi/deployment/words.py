@@ -44,6 +44,12 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
     return Line(State.PASSED, kept, figures)
 
 
+def against(peak: float, S_max: float) -> str:
+    """`3.10 % above S_max`."""
+    over = round(100.0 * (peak / S_max - 1.0), 2)
+    return f"{abs(over):.2f} % {'above' if over > 0.0 else 'below'} S_max" if over else "S_max"
+
+
 def _over(run: FinishedRun, found: Deployment) -> float:
     """How far the largest peak exceeds S_max, in %."""
     peak = found.worst.figures.sensitivity_peak

@@ -9,6 +9,7 @@ from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.reporting.loops import section_bounds
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of
 from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of
 from ccd_casadi.support.arrays import Array
@@ -103,15 +104,11 @@ def sampling_of(look: Look) -> Sampling | None:
 
 
 def bounds_of(look: Look, hz: Array) -> Array:
-    """What σ_max of S, KS and T must not pass (3, k): γ/|W|, or the bounds of the sections."""
+    """What σ_max of S, KS and T must not exceed (3, k): γ/|W|, or the bounds of the sections."""
+    if look.problem.sections is not None:
+        return section_bounds(look.problem, hz, look.bandwidth_hz)
     size = np.abs(look.weights.responses(HZ * hz))
-    sections = look.problem.sections
-    if sections is None:
-        return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
-    level = np.nan if sections.weighted_level is None else sections.weighted_level
-    shape = np.nan if sections.shape is None else sections.shape
-    below = np.where(hz <= look.bandwidth_hz, shape * hz / look.bandwidth_hz * 2.0**-0.5, np.nan)
-    return np.array([below, *(level / size[1:])])
+    return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
 
 
 def grid_of(look: Look) -> Array:

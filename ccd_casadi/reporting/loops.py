@@ -94,6 +94,31 @@ def forbidden(inner: InnerProblem | Bounds, low: float, high: float, top: float)
     )
 
 
+def above(hz: Array, bound: Array, top: float) -> Areas:
+    """Where a gain may not be, over Hz: above a bound that is NaN where nothing is asked."""
+    asked = np.isfinite(bound) & (bound < top)
+    if not asked.any():
+        return ()
+    x, y = hz[asked], bound[asked]
+    ends = np.array([complex(x[-1], top), complex(x[0], top)])
+    return ((np.concatenate([x + 1j * y, ends]), ORANGE),)
+
+
+def section_bounds(problem: CoDesignProblem, hz: Array, bandwidth_hz: float) -> Array:
+    """What S, KS (N/m) and T of a fixed structure may not exceed beside S_max and S_low (3, k).
+
+    The shape, and weighted_level/|W|; NaN where nothing is asked.
+    """
+    sections = problem.sections
+    assert sections is not None
+    size = np.abs(problem.weights.responses(HZ * hz))
+    level = np.nan if sections.weighted_level is None else sections.weighted_level
+    shape = np.nan if sections.shape is None else sections.shape
+    share = hz / bandwidth_hz
+    below = np.where(share <= 1.0, np.minimum(shape * share, 1.0) * 2.0**-0.5, np.nan)
+    return np.array([below, *(level / size[1:])])
+
+
 def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
     return np.array([complex(x, y) for x, y in (
         (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
@@ -138,8 +163,8 @@ def caption_gains(loop: Loop, *, S_max: float) -> str:
         others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
         words += f"; further local peaks {', '.join(others)}." if others else "."
     return (
-        f"σ_max(S) first passes -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
-        f"passes its bound γ/|W|, as certified: {', '.join(parts)}."
+        f"σ_max(S) first crosses -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
+        f"exceeds its bound γ/|W|, as certified: {', '.join(parts)}."
     )
 
 

@@ -153,10 +153,14 @@ def structured_table(bound: StructuredBound) -> Table:
     return Table(("Hz", "μ, complex errors"), rows)
 
 
+def shown_until(found: Move) -> float:
+    """Where the figure of a move ends, s."""
+    return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+
+
 def move(found: Move, key: str) -> str:
     """Setpoint, error and forces over time, the first part of the tail included."""
-    until = found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
-    shown = found.time <= until
+    shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
     t = 1e3 * found.time[pick]
     end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)

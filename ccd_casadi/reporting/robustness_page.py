@@ -21,6 +21,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
+from ccd_casadi.robust.move import Move
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ, metres
@@ -129,6 +130,7 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
     way = "with mass feedforward" if move.feedforward else "without feedforward"
+    way += f", {'its rigid bodies free' if found.free else 'on its soft suspension'}"
     settled = (
         f"settles {_time(move.settling)} after its end"
         if np.isfinite(move.settling)
@@ -145,6 +147,16 @@ def _place(omega: float) -> str:
     if omega in (0.0, np.inf):
         return "at rest" if omega == 0.0 else "towards infinite frequency"
     return f"at {number(omega / HZ, 4)} Hz"
+
+
+def _cut(move: Move) -> str:
+    """What the figure does not show of a move that settles after its end."""
+    until = figures.shown_until(move)
+    later = np.abs(move.error[move.time > until])
+    if move.duration + move.settling <= until or not later.size:
+        return ""
+    most = metres(float(later.max()))
+    return f" The figure ends before, at {_time(until)}: after that the error is up to {most}."
 
 
 def _time(seconds: float) -> str:
@@ -301,7 +313,11 @@ def _move(found: Study) -> Section:
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [
-        figure_html(figures.move(move, f"move{i}"), _moved(found, i), figures.move_table(move))
+        figure_html(
+            figures.move(move, f"move{i}"),
+            f"{_moved(found, i)}{_cut(move)}",
+            figures.move_table(move),
+        )
         for i, move in enumerate(found.moves)
     ]
     words = (

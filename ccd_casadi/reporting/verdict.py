@@ -72,6 +72,7 @@ def run_header(title: str, result: Mapping[str, Any], meta: str, lead: str) -> s
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
     reason = head_words(result) if good else str(result.get("reason") or "")
+    reason = f"{reason.rstrip('.')}. {advice(result)}".strip()
     return header(
         title, good, STATUS.get(result["status"], "not verified"), reason, meta, lead,
         warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
@@ -88,6 +89,25 @@ def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
         if old is not None and new is not None:
             text = text[: old.start()] + new[0] + text[old.end() :]
     return text
+
+
+def advice(result: Mapping[str, Any]) -> str:
+    """What to do with the design, in a sentence; nothing of a run without a verdict."""
+    states = {line.name: line.state for line in lines_of(result)}
+    failed = [name for name, state in states.items() if state is State.FAILED]
+    if not states:
+        return ""
+    if failed or result.get("status") != "verified":
+        return f"Do not build this: {', '.join(failed) or 'it is not verified'}."
+    if states.get("survives") is State.WARNED:
+        return (
+            "Do not build this loop as it is: a plant a little off its model is not survived. "
+            "Next: a [robust] set in the case."
+        )
+    warned = [name for name, state in states.items() if state is State.WARNED]
+    if warned:
+        return f"Look at {', '.join(warned)} before it is built."
+    return "Next: deploy." if states.get("deployable") is State.UNKNOWN else ""
 
 
 def head_words(result: Mapping[str, Any]) -> str:
