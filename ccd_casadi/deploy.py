@@ -25,6 +25,7 @@ LEADS = {"auto": None, "on": True, "off": False}
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.codesign.later_lines import told
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
@@ -35,6 +36,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.pipeline import deploy
     from ccd_casadi.deployment.structured_text import FILE as ST_FILE
     from ccd_casadi.deployment.structured_text import structured_text
+    from ccd_casadi.deployment.words import deployed_line
 
     require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
@@ -95,6 +97,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"report        {folder / 'report.html'}")
     from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
 
+    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     write_report(folder / "report.html", finished, found, moved)
     if found.passed:
         return ExitCode.DONE
@@ -104,7 +107,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import status_words
+    from ccd_casadi.deployment.words import against, status_words
 
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
@@ -130,8 +133,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
                 f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
                 f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
                 f"{figures.sensitivity_peak:.6g} "
-                f"({100 * (figures.sensitivity_peak / run.problem.inner.S_max - 1):+.2f} % of "
-                "S_max)",
+                f"({against(figures.sensitivity_peak, run.problem.inner.S_max)})",
             ))  # fmt: skip
     if found.members:
         worst, count = found.worst, 1 + len(found.measured_members)

@@ -38,6 +38,7 @@ POOR = 0.9
 SAME = 1e-6
 SIGMAS = 3.0
 SHARE = 1e-3
+NEAR = 0.05  # share of the box: samples this close to the point of interest are around it
 
 
 # s = r² (n, n) to φ(s) and φ'(s), of which ν = 1/2 has none at 0, where only s φ' counts.
@@ -80,6 +81,20 @@ class Roughness(StrEnum):
     JUMPS = "jumps"
 
 
+@dataclass(frozen=True)
+class Missed:
+    """A sample at or around the point of interest, left out: error in `unit`, and in deviations."""
+
+    error: float
+    sigmas: float
+    at_point: bool
+
+    @property
+    def where(self) -> str:
+        """Of it, as the subject of a sentence."""
+        return "the design" if self.at_point else "a sample beside the design"
+
+
 @dataclass(frozen=True, eq=False)
 class Quality:
     """One output, its errors in `unit`.
@@ -89,6 +104,7 @@ class Quality:
     loo, kfold: errors left out one by one and in ten folds. extrapolates: what is amiss at the
     point of interest, nothing where samples support it. at_point: where that point is itself a
     sample, the error there without it in `unit` and in predicted deviations; None elsewhere.
+    around: the same of every sample around that point, itself included.
 
     roughness: a kink across a surface has Sobolev regularity just below 3/2, a jump just below
     1/2, and sample paths of a Matérn process regularity ν. Each ν is fitted by maximum
@@ -114,6 +130,27 @@ class Quality:
     roughness: Roughness
     extrapolates: tuple[str, ...]
     at_point: tuple[float, float] | None = None
+    around: tuple[Missed, ...] = ()
+
+    @property
+    def missed(self) -> Missed | None:
+        """The worst sample at or around the point that the others miss by more than they say."""
+        span = 100.0 if self.unit == "%" else float(np.ptp(self.true))
+        bad = [m for m in self.around if m.sigmas > SIGMAS and abs(m.error) > SHARE * span]
+        return max(bad, key=lambda m: (m.at_point, abs(m.error)), default=None)
+
+    @property
+    def at_design(self) -> str:
+        """Whether the samples support the point of interest, and if so how well they do."""
+        if self.unsupported:
+            return self.unsupported
+        most = max((abs(m.error) for m in self.around), default=0.0)
+        sigmas = max((m.sigmas for m in self.around), default=0.0)
+        if sigmas <= SIGMAS:
+            return "supported"
+        return (
+            f"supported to {most:.2g} {self.unit}, but bands too narrow ({sigmas:.0f} deviations)"
+        )
 
     @property
     def poor(self) -> bool:
@@ -136,15 +173,14 @@ class Quality:
             return "; ".join(self.extrapolates)
         if self.poor:
             return f"followed to Q² {self.kfold.q2:.3g} only"
-        if self.at_point is not None:
-            error, sigmas = self.at_point
-            span = 100.0 if self.unit == "%" else float(np.ptp(self.true))
-            if sigmas > SIGMAS and abs(error) > SHARE * span:
-                return (
-                    f"the design is a sample that the others miss by {abs(error):.3g} {self.unit}, "
-                    f"{sigmas:.1f} deviations"
-                )
-        return ""
+        missed = self.missed
+        if missed is None:
+            return ""
+        what = "a sample" if missed.at_point else "one"
+        return (
+            f"{missed.where} is {what} that the others miss by {abs(missed.error):.3g} "
+            f"{self.unit}, {missed.sigmas:.1f} deviations"
+        )
 
     @property
     def smooth_enough(self) -> bool:
@@ -176,9 +212,11 @@ def quality_of(
     predicted = samples.Y - residuals
     unit_x = (np.asarray(x, float) - process.lower) / (process.upper - process.lower)
     away = np.abs(process.X - unit_x).max(axis=1)
-    at, at_point = int(np.argmin(away)), None
-    if away[at] <= SAME:
-        at_point = (float(factor * residuals[at]), float(abs(standardised[at])))
+    around = tuple(
+        Missed(float(factor * residuals[i]), float(abs(standardised[i])), bool(away[i] <= SAME))
+        for i in np.flatnonzero(away <= NEAR)
+    )
+    at_point = next(((m.error, m.sigmas) for m in around if m.at_point), None)
     return Quality(
         name=name,
         unit=unit,
@@ -191,6 +229,7 @@ def quality_of(
         roughness=_roughness_of(process, seed),
         extrapolates=extrapolation(process, samples.X, x).reasons,
         at_point=at_point,
+        around=around,
     )
 
 

@@ -15,6 +15,15 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support import optional_packages
 
 PATIENCE = 240e3  # ms: the machine may be busy
+# Pixels of one unit of Re L and of Im L.
+SCALES = """(() => {
+  const of = view => view.model.name === "nyquist" ? view
+    : (view.child_views ?? []).map(of).find(found => found != null)
+  const found = Object.values(globalThis.Bokeh?.index ?? {}).map(of).find(v => v != null)
+  if (found?.frame?.x_scale == null) return []
+  const {x_scale: x, y_scale: y} = found.frame
+  return [Math.abs(x.compute(1) - x.compute(0)), Math.abs(y.compute(1) - y.compute(0))]
+})()"""
 READY = "Bokeh?.documents[0]?.get_model_by_name('answer')?.data.serial[0] > 0"
 
 
@@ -109,17 +118,38 @@ def test_a_solve_from_here_tells_how_far_it_is_and_ends_with_its_report(browser,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1300, 390])
+@pytest.mark.parametrize(
+    ("width", "scheme"),
+    [(1920, "light"), (1400, "dark"), (800, "light"), (390, "light"), (390, "dark")],
+)
 def test_it_fits_and_does_not_complain(browser, server, width, scheme):
     page, heard = opened(browser, server[1], width, scheme)
     page.wait_for_timeout(2000)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert page.locator("canvas").count() > 8
+    across, up = page.evaluate(SCALES)
+    assert across == pytest.approx(up, rel=0.01)  # the disk of S_max is round
     ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
     light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
     assert light == (scheme == "light")
     assert not heard
+
+
+def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):
+    embed = pytest.importorskip("bokeh.embed", reason="bokeh is not installed")
+    from bokeh.resources import INLINE
+
+    from ccd_casadi.explorer.figures import Figures
+
+    place = tmp_path / "nyquist.html"
+    place.write_text(embed.file_html(Figures(False).nyquist, INLINE), encoding="utf-8")
+    page = browser.new_page()
+    page.goto(place.as_uri())
+    for width in (1920, 1400, 800, 390):
+        page.set_viewport_size({"width": width, "height": 600})
+        page.wait_for_timeout(300)
+        page.wait_for_function(f"(([x, y]) => Math.abs(x / y - 1) < 0.01)({SCALES})", timeout=10e3)
+    page.close()
 
 
 def test_without_the_token_every_path_is_refused(tmp_path):

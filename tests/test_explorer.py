@@ -12,16 +12,17 @@ from ccd_casadi import inner
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.explorer.background import Solve
-from ccd_casadi.explorer.curves import curves_of, sampled_of
+from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.landscape import field_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import end_words
+from ccd_casadi.explorer.words import end_words, move_words, standing_html, survival_words
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
 
@@ -147,6 +148,54 @@ def test_hold_and_delay_take_their_share_of_the_margin(searched_look):
     assert searched_look.figures.sensitivity_peak < late[0].peak < late[1].peak
     for found in late:
         assert found.gain.max() <= found.peak * (1.0 + 1e-6)
+
+
+def test_the_standing_is_that_of_the_worst_that_was_judged(searched_look):
+    """Certified, and unstable as it would run: "certified, keeps its bounds" is not what it is."""
+    order = list(Standing)
+    for rate, delay, worst in ((1e5, 0.0, Standing.KEPT), (1e4, 100.0, Standing.MISSED),
+                               (3162.0, 300.0, Standing.REFUSED)):  # fmt: skip
+        knobs = replace(searched_look.knobs, rate_hz=rate, delay_us=delay)
+        loose = replace(searched_look.problem.inner, S_max=1.01 * searched_look.problem.inner.S_max)
+        problem = replace(searched_look.problem, inner=loose)
+        for before in (Standing.KEPT, Standing.MISSED, Standing.NEAR, Standing.REFUSED):
+            look = replace(searched_look, knobs=knobs, standing=before, problem=problem)
+            found = as_sampled(look.plant, look.controller, rate, delay)
+            after = with_sampled(look, found)
+            assert after.standing == max(before, worst, key=order.index)
+    assert "unstable as sampled at 3162 Hz" in after.reason
+    assert np.isnan(after.bandwidth_hz)
+
+
+def test_another_plant_than_the_models_own_certifies_nothing(session, searched_look):
+    own = elements_at(searched_look.problem, searched_look.theta)
+    for error, kept in ((0.0, True), (0.01, True), (0.05, False), (np.inf, False)):
+        near = replace(own, error=error, words="a plant nearby")
+        point = searched_look.figures.omega_S, searched_look.figures.omega_T
+        look = present(searched_look.problem, searched_look.knobs, near, point)
+        assert (look.standing is Standing.KEPT) == kept
+        assert (look.standing is Standing.NEAR) != kept
+        assert np.isfinite(look.objective) == kept  # no J of one θ's mass and another's bandwidth
+        words = standing_html(look, curves_of(look), None)
+        assert ("certified, keeps its bounds" in words) == kept
+        assert ("a plant nearby" in words) == (error > 0.0) or kept
+
+
+def test_the_margins_told_are_where_stability_ends(session, searched_look):
+    assert "K by itself is stable" in survival_words(curves_of(searched_look))
+    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
+    c, G, K = curves_of(look), look.plant.plant_si(), look.controller
+
+    def stable(factor):
+        loop = closed_loop(G, replace(K, C=factor * K.C, D=factor * K.D))
+        return np.linalg.eigvals(loop.A).real.max() < 0.0
+
+    for gain, inwards in ((c.margins.gain_down, 1.0 + 1e-6), (c.margins.gain_up, 1.0 - 1e-6)):
+        assert stable(gain * inwards)
+        assert not stable(gain / inwards)
+    assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
+    assert "feedforward" in move_words(c)
+    assert "without feedforward" in move_words(replace(c, move=replace(c.move, feedforward=False)))
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

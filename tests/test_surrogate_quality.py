@@ -18,6 +18,7 @@ from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
 from ccd_casadi.sampling.samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, Roughness, design, errors, fit
+from surrogates.quality import Missed
 
 HZ = 2.0 * np.pi
 BOX = {"lower": [50.0, 50.0], "upper": [70.0, 70.0]}
@@ -60,6 +61,34 @@ def test_what_predicts_left_out_samples_badly_is_called_neither_smooth_nor_suppo
     assert not poor.smooth_enough
     assert "0.84" in poor.unsupported
     assert "support the design" not in recommendation([poor])
+
+
+@pytest.mark.parametrize("roughness", list(Roughness))
+def test_the_sentence_and_the_table_say_the_same_of_the_samples(roughness) -> None:
+    """ "Kinked or torn", said the sentence; "nearly smooth", said the table below it."""
+    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    for q2 in (0.5, 0.91, 0.99, 0.9951, 1.0 - 1e-7):
+        found = replace(q, roughness=roughness, kfold=replace(q.kfold, q2=q2))
+        look = table_trust([found]).rows[0][-2]
+        said = recommendation([found])
+        assert ("are rough" in said) == (look in ("kinked", "jumps"))
+        assert ("predicted poorly" in said) == (look == "poorly followed")
+        if look not in ("smooth", "nearly smooth"):
+            assert "support the design" not in said
+
+
+def test_a_design_beside_samples_that_are_missed_is_not_supported() -> None:
+    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    assert table_trust([q]).rows[0][-1] == "supported"
+    for error, sigmas, at_point in ((3.0, 10.0, False), (3.0, 10.0, True), (-3.0, 9.4, False)):
+        far = replace(q, around=(Missed(error, sigmas, at_point), Missed(1e-9, 0.1, False)))
+        cell = str(table_trust([far]).rows[0][-1])
+        assert f"the others miss by 3 Hz, {sigmas:.1f} deviations" in cell
+        assert ("beside" in cell) != at_point
+        assert "support the design" not in recommendation([far])
+    slight = replace(q, around=(Missed(1e-6, 11.0, False),))  # by nothing, but the bands are wrong
+    assert "11 deviations" in str(table_trust([slight]).rows[0][-1])
+    assert not slight.unsupported
 
 
 def test_a_design_beyond_the_samples_is_flagged() -> None:

@@ -151,7 +151,7 @@ def sentences(stages: Sequence[Stage]) -> list[str]:
         names = ", ".join(stage.label for stage in corners)
         found.append(
             f"Marked (corners), {names}: certified on the plants of the design; a last search of "
-            f"the box finds plants that pass a bound by up to "
+            f"the box finds plants that exceed a bound by up to "
             f"{100.0 * max(stage.excess for stage in corners):.1f} %, so that the bandwidth is "
             "a little less on all of the set."
         )

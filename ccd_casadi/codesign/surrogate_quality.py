@@ -8,6 +8,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess, Quality, quality_of
+from surrogates.quality import Roughness
 
 # Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
 # fitted is a logarithm.
@@ -17,6 +18,7 @@ OUTPUTS = (
     ("sensitivity_low", "%", 100.0, True),
     ("compliance", "%", 100.0, True),
 )
+ROUGH = (Roughness.KINKED, Roughness.JUMPS)  # as `Quality.samples_look` has it
 ERROR = ("rms_error", "nm", 1e9, False)
 
 
@@ -63,12 +65,13 @@ def recommendation(qualities: Sequence[Quality]) -> str:
             f"Left-out samples of {which} are predicted poorly: more samples are needed before the "
             "surrogate says anything away from the design."
         )
-    rough = [q.name.replace("_", " ") for q in qualities if not (q.smooth_enough or q.poor)]
+    looks = {q.name.replace("_", " "): q.samples_look for q in qualities}
+    rough = [f"{name} ({look})" for name, look in looks.items() if look in ROUGH]
     if rough:
         what = ", ".join(rough)
         said.append(
-            f"The samples of {what} look kinked or torn: one smooth surrogate follows them only "
-            "near the design. "
+            f"The samples of {what} are rough: one smooth surrogate follows them only near the "
+            "design. "
             + (
                 "Solve with --formulation lifted, whose outputs are smooth where the best "
                 "bandwidth is not."

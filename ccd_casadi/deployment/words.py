@@ -1,14 +1,59 @@
 """A deployment's verdict in words: what is kept, by how much, and on which plant."""
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
+from ccd_casadi.support.units import HZ
 
 
 def status_words(run: FinishedRun, found: Deployment) -> str:
     """`verified`, or not, and the reason beside it."""
-    status = "verified" if found.passed else "not verified"
-    return f"{status}  {reason_words(run, found)}".rstrip()
+    return f"{short_status(run, found)}  {reason_words(run, found)}".rstrip()
+
+
+def short_status(run: FinishedRun, found: Deployment) -> str:
+    """`verified` without more where every bound is kept as the case gives it."""
+    if not found.passed:
+        return "not verified"
+    if _over(run, found) > 0.0:
+        return f"verified to {100.0 * found.target.excess:.2g} % of S_max"
+    return "verified"
+
+
+def deployed_line(run: FinishedRun, found: Deployment) -> Line:
+    """`deployable` of the run's verdict."""
+    K = found.sampled
+    at = f"at {found.rate_hz:.6g} Hz with a delay of {1e6 * found.delay:.4g} us"
+    figures = {
+        "rate_hz": found.rate_hz,
+        "delay": found.delay,
+        "needed_hz": found.needed_hz,
+        "order": len(found.realisation.system.A),
+        "stable": found.stable,
+        "bandwidth_hz": K.bandwidth / HZ,
+        "sensitivity_peak": found.worst.figures.sensitivity_peak,
+        "plants": 1 + len(found.members),
+    }
+    if found.shortfalls:
+        return Line(State.FAILED, f"{at}: {found.shortfalls[0]}", figures)
+    kept = f"{at}: bandwidth {K.bandwidth / HZ:.4g} Hz, peak of S {figures['sensitivity_peak']:.5g}"
+    reason = reason_words(run, found)
+    if reason:
+        return Line(State.WARNED, f"{kept}; {reason}", figures)
+    return Line(State.PASSED, kept, figures)
+
+
+def against(peak: float, S_max: float) -> str:
+    """`3.10 % above S_max`."""
+    over = round(100.0 * (peak / S_max - 1.0), 2)
+    return f"{abs(over):.2f} % {'above' if over > 0.0 else 'below'} S_max" if over else "S_max"
+
+
+def _over(run: FinishedRun, found: Deployment) -> float:
+    """How far the largest peak exceeds S_max, in %."""
+    peak = found.worst.figures.sensitivity_peak
+    return 100.0 * (peak / run.problem.inner.S_max - 1.0)
 
 
 def reason_words(run: FinishedRun, found: Deployment) -> str:
@@ -18,13 +63,12 @@ def reason_words(run: FinishedRun, found: Deployment) -> str:
         parts.append(f"the run itself is not verified: {found.unverified}")
     if found.shortfalls:
         return "; ".join([*parts, found.shortfalls[0]])
-    S_max, worst = run.problem.inner.S_max, found.worst
-    over = 100.0 * (worst.figures.sensitivity_peak / S_max - 1.0)
-    where = f" ({place_words(worst.at)})" if found.members else ""
+    S_max, over = run.problem.inner.S_max, _over(run, found)
+    where = f" ({place_words(found.worst.at)})" if found.members else ""
     if over > 0.0:
         allowed = 100.0 * found.target.excess
         parts.append(
-            f"within {allowed:.2g} % of S_max = {S_max:g}: hold and delay bring the peak of S "
-            f"{over:.2f} % above it{where}"
+            f"hold and delay bring the peak of S {over:.2f} % above S_max = {S_max:g}{where}; a "
+            f"deployment may take {allowed:.2g} %"
         )
     return "; ".join(parts)

@@ -70,7 +70,8 @@ class Background:
     def fill(self, session: Session, problem: CoDesignProblem, told: Callable[[], None]) -> None:
         """Sample a slow plant over its box and fit the surrogate of its modes again and again.
 
-        `told` is called after every fit. What was sampled is kept in the session's folder.
+        `told` is called after every sample and every fit. What was sampled is kept in the session's
+        folder.
         """
         known = session.known
         assert known is not None
@@ -90,13 +91,18 @@ class Background:
 
         def sampled(found: tuple[Theta, Mechanics]) -> None:
             known.exact[found[0]] = found[1]
+            ended()
             refit()
 
+        def ended(error: BaseException | None = None) -> None:
+            known.missing -= 1
+            told()
+
         refit()
-        for theta in plan(problem.lower, problem.upper):
-            if theta not in known.exact:
-                task = (problem, theta)
-                self._submit("filling", _sample, task, sampled, lambda error: None)
+        wanted = [t for t in plan(problem.lower, problem.upper) if t not in known.exact]
+        known.missing = len(wanted)
+        for theta in wanted:
+            self._submit("filling", _sample, (problem, theta), sampled, ended)
 
     def _submit(
         self, pool: str, work: Callable[[Any], Any], task: Any, then: Then,

@@ -1,16 +1,20 @@
 """What is drawn of one design: gains, Nyquist, poles, a step and a move; pure functions of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ccd_casadi.explorer.designs import Look, Standing
-from ccd_casadi.fixed_structure import Sampling, ShapeEnd
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.reporting.loops import section_bounds
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of
 from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
 from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 180  # of the frequency grid, besides those around resonances
@@ -21,21 +25,27 @@ SAME = 1e-9  # relative distance of two frequencies below which they are one
 class Curves:
     """Of one design. Gains are largest singular values of S, KS (N/m) and T, rows (3, k) over Hz.
 
-    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `loci` (k, p): eigenvalues of L = GK, NaN where one
-    is too large to be drawn. `poles` of the closed loop, of K and of G in Hz, complex. `step`: y of
-    the first output after a step of its reference, over s.
+    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `loci` (k, p): eigenvalues of L = GK. `margins`: the
+    least of the loops broken one at a time at the plant's inputs. `poles` of the closed loop, of K
+    and of G in Hz, complex. `step`: y of the first output after a step of its reference, over s.
     """
 
     hz: Array
     gains: Array
     bounds: Array
     loci: np.ndarray
+    margins: ClassicalMargins
     poles: np.ndarray
     controller_poles: np.ndarray
     plant_poles: np.ndarray
     step_time: Array
     step: Array
     move: Moved
+
+    @property
+    def unstable(self) -> bool:
+        """Of the loop: it has no step, no move and no margins."""
+        return not self.poles.real.max() < 0.0
 
 
 @dataclass(frozen=True)
@@ -59,12 +69,15 @@ def curves_of(look: Look) -> Curves | None:
     plant, K = look.plant, look.controller
     hz = grid_of(look)
     run_at = sampling_of(look)
-    if run_at is None:
-        G, k, S = responses(plant, K, HZ * hz)
-    else:  # it was designed for hold and delay
+
+    def respond(omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        return responses(plant, K, omega)[:2]
+
+    if run_at is not None:  # it was designed for hold and delay
         hz = hz[hz < 0.499 * run_at.rate_hz]
-        G, k = in_discrete_time(K, run_at).responses(plant, HZ * hz)
-        S = np.linalg.inv(np.eye(G.shape[1]) + G @ k)
+        respond = partial(in_discrete_time(K, run_at).responses, plant)
+    G, k = respond(HZ * hz)
+    S = np.linalg.inv(np.eye(G.shape[1]) + G @ k)
     KS = k @ S
     gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in (S, KS, G @ KS)])
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
@@ -73,7 +86,8 @@ def curves_of(look: Look) -> Curves | None:
         hz=hz,
         gains=gains,
         bounds=bounds_of(look, hz),
-        loci=loci_of(G @ k),
+        loci=loci_of(G @ k, np.inf),
+        margins=least_margins(respond, HZ * hz),
         poles=signals.poles / HZ,
         controller_poles=np.linalg.eigvals(K.A) / HZ,
         plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
@@ -90,17 +104,11 @@ def sampling_of(look: Look) -> Sampling | None:
 
 
 def bounds_of(look: Look, hz: Array) -> Array:
-    """What σ_max of S, KS and T must not pass (3, k): γ/|W|, or the bounds of the sections."""
+    """What σ_max of S, KS and T must not exceed (3, k): γ/|W|, or the bounds of the sections."""
+    if look.problem.sections is not None:
+        return section_bounds(look.problem, hz, look.bandwidth_hz)
     size = np.abs(look.weights.responses(HZ * hz))
-    sections = look.problem.sections
-    if sections is None:
-        return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
-    level = np.nan if sections.weighted_level is None else sections.weighted_level
-    shape = np.nan if sections.shape is None else sections.shape
-    rising = shape * hz / look.bandwidth_hz * 2.0**-0.5
-    ends = look.bandwidth_hz if sections.shape_ends is ShapeEnd.CROSSING else np.inf
-    below = (hz <= ends) & (rising <= look.problem.inner.S_max)
-    return np.array([np.where(below, rising, np.nan), *(level / size[1:])])
+    return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
 
 
 def grid_of(look: Look) -> Array:
@@ -127,6 +135,20 @@ def sampled_of(look: Look) -> AsSampled | None:
     if look.standing is Standing.REFUSED:
         return None
     return as_sampled(look.plant, look.controller, look.knobs.rate_hz, look.knobs.delay_us)
+
+
+def with_sampled(look: Look, found: AsSampled | None) -> Look:
+    """The look with the standing that its sampled loop leaves it."""
+    k, S_max = look.knobs, look.problem.inner.S_max
+    if found is None or (found.stable and found.peak <= S_max):
+        return look
+    at = f"as sampled at {k.rate_hz:.4g} Hz with a delay of {k.delay_us:.4g} µs"
+    if not found.stable:
+        return replace(look, standing=Standing.REFUSED, reason=f"the loop is unstable {at}")
+    if look.standing is not Standing.KEPT:
+        return look  # it is no better already
+    over = missed_by(found.peak, S_max)
+    return replace(look, standing=Standing.MISSED, reason=f"{at} the peak of S is {over}")
 
 
 def as_sampled(

@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from ccd_casadi.codesign.verdict import LEAST_SHIFT
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import (
@@ -38,22 +39,34 @@ class How(StrEnum):
 
 
 class Standing(StrEnum):
-    """What may be said of a design."""
+    """What may be said of a design, from the best to the worst."""
 
     KEPT = "certified, keeps its bounds"
     MISSED = "certified, misses a bound"
+    NEAR = "not certified yet: the plant is not the model's own"
     REFUSED = "not certified"
 
 
 @dataclass(frozen=True)
 class Elements:
-    """The plant's matrices at θ, and what they are: `exact` ones are the model's own."""
+    """The plant's matrices at θ, what they are, and their stated `error`, of a frequency, relative.
+
+    The model's own have none.
+    """
 
     system: Mechanics
-    exact: bool = True
+    error: float = 0.0
     words: str = "the model's own"
 
+    @property
+    def exact(self) -> bool:
+        """Whether they are the model's own."""
+        return self.error == 0.0
 
+
+# Stated error of the frequencies up to which matrices pass for the model's own: what every verdict
+# asks a loop to survive.
+OWN = LEAST_SHIFT
 # Name of a bound -> the figure that it is on, in words.
 FIGURES = {"S_max": "peak of S", "S_low": "|S(jω_low)|", "compliance_max": "compliance"}
 
@@ -63,9 +76,10 @@ class Look:
     """A design that was looked at: where, on which plant, what it is worth.
 
     `figures` (rad/s) are NaN past the point where a synthesis failed; `reason` says in words why
-    a design is not KEPT. `controller` in SI, None where a synthesis ended before there was one.
-    `problem` has its design plant chosen, `weights` the frequencies that were used. `kappa`: of a
-    fixed structure.
+    a design is not KEPT. `standing` is the worst of all that was judged: the synthesis, how far the
+    plant is the model's own, and the sampled loop where one is asked for. `controller` in SI, None
+    where a synthesis ended before there was one. `problem` has its design plant chosen, `weights`
+    the frequencies that were used. `kappa`: of a fixed structure.
     """
 
     knobs: Knobs
@@ -97,7 +111,9 @@ class Look:
 
     @property
     def objective(self) -> float:
-        """J = w1 f(θ) + w2 ω_b."""
+        """J = w1 f(θ) + w2 ω_b; NaN where ω_b is that of another θ's plant."""
+        if self.standing is Standing.NEAR:
+            return np.nan
         return self.problem.w1 * self.cost + self.problem.w2 * HZ * self.bandwidth_hz
 
 
@@ -163,6 +179,8 @@ def _look(
     made = handed_out(plant, made, inner.omega_low)
     cost, broken = hardware_at(problem, knobs.theta)
     standing, reason = judged(problem, made.figures, broken)
+    if elements.error > OWN and standing is not Standing.REFUSED:
+        standing, reason = Standing.NEAR, ""
     finite = all(np.isfinite(part).all() for part in vars(made.controller).values())
     return Look(
         knobs=knobs,

@@ -9,13 +9,24 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Reset
-from bokeh.models import ColumnDataSource, CrosshairTool, CustomJS, HoverTool, Range1d
+from bokeh.models import (
+    BoxZoomTool,
+    ColumnDataSource,
+    CrosshairTool,
+    CustomJS,
+    FixedTicker,
+    HoverTool,
+    Range1d,
+    WheelZoomTool,
+)
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
+from ccd_casadi.reporting.bode import phase_deg
+from ccd_casadi.reporting.nyquist import FAR
 from ccd_casadi.reporting.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 
 HEIGHT = 230
@@ -23,11 +34,20 @@ TOP = 1e12  # above every gain: a shaded region ends there
 SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
-DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.REFUSED: [6]}
+DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.NEAR: [2, 3], Standing.REFUSED: [6]}
 PADDING = 0.1  # of the data, that an axis reaches beyond them
 # After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
 FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
   range.have_updated_interactively = false"""
+# At any width of the page both axes have one scale, so that a circle is round: ±`half` fits in.
+ROUND = """const {inner_width: wide, inner_height: tall, x_range, y_range} = figure
+if (!(wide > 0 && tall > 0)) return
+const scale = Math.max(2 * half[0] / wide, 2 * half[1] / tall)
+for (const [range, middle, size] of [[x_range, centre, wide], [y_range, 0, tall]]) {
+  const start = middle - scale * size / 2, end = middle + scale * size / 2
+  range.setv({start, end, reset_start: start, reset_end: end}, {sync: false})
+}"""
+CENTRE, HALF = -0.8, (2.4, 2.0)  # of the Nyquist plot, and what it shows at least to both sides
 
 
 @dataclass(frozen=True)
@@ -49,6 +69,7 @@ class Figures:
         self.gains = ColumnDataSource({k: [] for k in columns}, name="gains")
         self.sampled = ColumnDataSource({"hz": [], "S": []})
         self.loci = ColumnDataSource({"xs": [], "ys": []})
+        self.loop = ColumnDataSource({"hz": [], "size": [], "phase": []})
         self.poles = {
             name: ColumnDataSource({"hz": [], "damping": []}) for name in ("loop", "K", "G")
         }
@@ -56,13 +77,14 @@ class Figures:
         self.move = ColumnDataSource({"ms": [], "um": []})
         self.pinned = {
             name: ColumnDataSource({"xs": [], "ys": [], "colour": [], "name": []})
-            for name in ("S", "KS", "T", "nyquist", "step", "move")
+            for name in ("S", "KS", "T", "nyquist", "size", "phase", "step", "move")
         }
         self.lines: list[Any] = []  # those of the present design, whose look says its standing
         self.cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
         hz = Range1d(start=0.1, end=1e4)
         self.of_gain = [self._gain(name, label, hz) for name, label in GAINS]
         self.hz = hz
+        self.loop_size, self.loop_phase = self._bode(hz)
         self.nyquist = self._nyquist()
         self.pole_map = self._poles()
         self.step_figure = self._time("step", "ms", "y after a step of r", self.step, "y")
@@ -74,8 +96,11 @@ class Figures:
         """Figures by the name of their place on the page."""
         names = [f"gain_{name}" for name, _ in GAINS]
         found = dict(zip(names, self.of_gain, strict=True))
-        others = (self.nyquist, self.pole_map, self.step_figure, self.move_figure)
-        return found | dict(zip(("nyquist", "poles", "step", "move"), others, strict=True))
+        others = {
+            "nyquist": self.nyquist, "loop": self.loop_size, "phase": self.loop_phase,
+            "poles": self.pole_map, "step": self.step_figure, "move": self.move_figure,
+        }  # fmt: skip
+        return found | others
 
     def _figure(self, name: str, x: str, y: str, **options: Any) -> Any:
         made = figure(
@@ -139,18 +164,54 @@ class Figures:
         return made
 
     def _nyquist(self) -> Any:
-        made = self._figure(
-            "nyquist", "Re L", "Im L", x_range=(-3.2, 1.6), y_range=(-2.0, 2.0), match_aspect=True
+        made = self._figure("nyquist", "Re L", "Im L", x_range=(-3.2, 1.6), y_range=(-2.0, 2.0))
+        for tool in made.tools:  # what is zoomed keeps one scale too
+            if isinstance(tool, BoxZoomTool):
+                tool.match_aspect = True
+            if isinstance(tool, WheelZoomTool):
+                tool.zoom_on_axis = False
+        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)}, code=ROUND)
+        for size in ("inner_width", "inner_height"):
+            made.js_on_change(size, fit)
+        # ellipses: true in both axes, whatever these do, where a circle would take that across
+        made.ellipse(
+            0.0, 0.0, width=2.0, height=2.0, fill_color=None, line_color=GREY, line_dash="dotted"
         )
-        made.circle(0.0, 0.0, radius=1.0, fill_color=None, line_color=GREY, line_dash="dotted")
-        self.disk = made.circle(
-            -1.0, 0.0, radius=0.5, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE
+        self.disk = made.ellipse(
+            -1.0, 0.0, width=1.0, height=1.0, fill_color=ORANGE, fill_alpha=0.28, line_color=ORANGE
         )
         made.scatter([-1.0], [0.0], marker="cross", size=9, line_color=self.ink)
         self._pins(made, "nyquist")
         found = made.multi_line("xs", "ys", source=self.loci, line_color=self.main, line_width=2.0)
         self.lines.append(found.glyph)
         return made
+
+    def _bode(self, hz: Range1d) -> tuple[Any, Any]:
+        """|L| and its phase, with 1 and the odd multiples of 180° where the two decide."""
+        made = []
+        for name, label, axis, at in (
+            ("size", "|L|", "log", [1.0]), ("phase", "phase of L (°)", "linear", [-540, -180, 180]),
+        ):  # fmt: skip
+            y_range = (
+                Range1d(start=1e-3, end=1e3) if name == "size" else Range1d(start=-540, end=90)
+            )
+            on = self._figure(
+                name, "frequency (Hz)", label, x_axis_type="log", y_axis_type=axis, x_range=hz,
+                y_range=y_range,
+            )  # fmt: skip
+            for level in at:
+                on.add_layout(
+                    Span(location=level, dimension="width", line_color=GREY, line_dash="dotted")
+                )
+            self._pins(on, name)
+            found = on.multi_line(
+                "hz", name, source=self.loop, line_color=self.main, line_width=2.0
+            )
+            self.lines.append(found.glyph)
+            on.add_tools(CrosshairTool(overlay=self.cursor))
+            made.append(on)
+        made[1].yaxis.ticker = FixedTicker(ticks=[*range(-1080, 1081, 180)])
+        return made[0], made[1]
 
     def _poles(self) -> Any:
         ranges = {"x_range": Range1d(start=0.1, end=1e4), "y_range": Range1d(start=-0.08, end=1.08)}
@@ -184,12 +245,12 @@ class Figures:
         """
         look, c, s = drawn.look, drawn.curves, drawn.sampled
         inner = look.problem.inner
-        colour = {Standing.KEPT: self.main, Standing.MISSED: AMBER, Standing.REFUSED: GREY}
-        line = {"line_color": colour[look.standing], "line_dash": DASHES[look.standing]}
+        colour = {Standing.KEPT: self.main, Standing.MISSED: AMBER}.get(look.standing, GREY)
+        line = {"line_color": colour, "line_dash": DASHES[look.standing]}
         certified = look.standing is not Standing.REFUSED
         found: list[Change] = [
             (self.S_max, {"bottom": inner.S_max}),
-            (self.disk.glyph, {"radius": 1.0 / inner.S_max}),
+            (self.disk.glyph, dict.fromkeys(("width", "height"), 2.0 / inner.S_max)),
             (self.S_low, {"right": inner.omega_low / (2 * np.pi), "bottom": inner.S_low}),
             *((glyph, line) for glyph in self.lines),
             (self.bandwidth, {"location": look.bandwidth_hz if certified else None}),
@@ -197,14 +258,19 @@ class Figures:
             else _data(self.sampled, hz=s.hz, S=s.gain),
         ]  # fmt: skip
         if c is None:
-            sources = (self.gains, self.loci, self.step, self.move, *self.poles.values())
+            sources = (self.gains, self.loci, self.loop, self.step, self.move, *self.poles.values())
             return found + [_data(source, **{key: [] for key in source.data}) for source in sources]
         columns = {"hz": c.hz, "top": np.full(len(c.hz), TOP)}
         for i, (name, _) in enumerate(GAINS):
             nothing = np.full(len(c.hz), np.nan)
             columns |= {name: c.gains[i], f"b{name}": c.bounds[i] if certified else nothing}
+        size, phase = _bode_of(c)
         xs, ys = _lines(c.loci)
-        found += [_data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys)]
+        hz = [c.hz] * len(size)
+        found += [
+            _data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys),
+            _data(self.loop, hz=hz, size=size, phase=phase),
+        ]  # fmt: skip
         at_poles = []
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
             upper = roots[roots.imag >= 0.0]
@@ -222,6 +288,8 @@ class Figures:
         spans = [(made.y_range, [c.gains[i]], True) for i, made in enumerate(self.of_gain)]
         spans += [
             (self.pole_map.x_range, at_poles, True),
+            (self.loop_size.y_range, size, True),
+            (self.loop_phase.y_range, phase, False),
             (self.step_figure.x_range, [1e3 * each.step_time for each in known], False),
             (self.step_figure.y_range, [each.step for each in known], False),
             (self.move_figure.x_range, [1e3 * each.move.time for each in known], False),
@@ -246,6 +314,8 @@ class Figures:
                 rows[gain].append((c.hz, c.gains[k], colour, name))
             for x, y in zip(*_lines(c.loci), strict=True):
                 rows["nyquist"].append((x, y, colour, name))
+            for name_, lines in zip(("size", "phase"), _bode_of(c), strict=True):
+                rows[name_] += [(c.hz, line, colour, name) for line in lines]
             rows["step"].append((1e3 * c.step_time, c.step, colour, name))
             rows["move"].append((1e3 * c.move.time, 1e6 * c.move.error, colour, name))
         for name, source in self.pinned.items():
@@ -275,7 +345,13 @@ def _spanned(axis: Range1d, values: Sequence[np.ndarray], log: bool) -> Change:
     return _ends(axis, low - margin, high + margin)
 
 
+def _bode_of(c: Curves) -> tuple[list[Any], list[Any]]:
+    """Sizes of the eigenvalues of L, and their phases in degrees."""
+    return list(np.abs(c.loci).T), list(phase_deg(c.loci).T)
+
+
 def _lines(loci: np.ndarray) -> tuple[list[Any], list[Any]]:
+    loci = np.where(np.abs(loci) <= FAR, loci, np.nan)
     return [line.real for line in loci.T], [line.imag for line in loci.T]
 
 

@@ -131,6 +131,7 @@ class KnownModes:
     upper: Theta
     key: str
     exact: dict[Theta, Mechanics] = field(default_factory=dict)
+    missing: int = 0  # of the samples that a surrogate is made of
     surrogate: ModeSurrogate | None = None
 
     def at(self, theta: Theta) -> Elements:
@@ -141,13 +142,26 @@ class KnownModes:
         if theta in self.exact:
             return Elements(self.exact[theta])
         if self.surrogate is not None:
-            return Elements(self.surrogate.at(theta), False, self.surrogate.words)
+            worst = float(self.surrogate.errors.max())
+            return Elements(self.surrogate.at(theta), worst, self.surrogate.words)
         nearest = min(self.exact, key=lambda other: self.distance(theta, other), default=None)
         if nearest is None:
             raise KeyError(theta)
         share = 100.0 * self.distance(theta, nearest)
         words = f"those of the nearest exact θ, {share:.2g} % of the box away"
-        return Elements(self.exact[nearest], False, words)
+        return Elements(self.exact[nearest], np.inf, words)
+
+    @property
+    def progress(self) -> str:
+        """How far the samples are; empty when all are there."""
+        if not self.missing:
+            return ""
+        done = max(SIZES) - self.missing
+        last = "" if self.surrogate is None else f"; surrogate of {self.surrogate.samples}"
+        return (
+            f"the model is being solved behind this page: {done} of {max(SIZES)} θ{last}. Drawn in "
+            "grey is what is not the model's own; let a slider go to have the model itself solved"
+        )
 
     def distance(self, one: Theta, other: Theta) -> float:
         """Largest difference as a share of the box."""

@@ -12,7 +12,7 @@ from bokeh.models.widgets.markups import Div
 
 from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.controls import Controls
-from ccd_casadi.explorer.curves import curves_of, sampled_of
+from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Look
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.knobs import Knobs
@@ -23,7 +23,7 @@ from ccd_casadi.explorer.modes import frequency_error, in_modal_form
 from ccd_casadi.explorer.pins import Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
-from ccd_casadi.explorer.words import end_words, standing_html
+from ccd_casadi.explorer.words import end_words, move_words, standing_html
 from ccd_casadi.reporting.machine import machine_html
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
@@ -64,6 +64,7 @@ class Page:
         self._message.applied_in(document)
         self.pins.table.tags = [self.answer, self._message]  # so that they are sent
         self.note, self.output = Div(name="note"), Div(name="output")
+        self.filling = Div(name="filling")
         self.modes = Div(stylesheets=[WIDE])
         self.design = _button("Design sections here", "design", self.design_sections)
         self.solve_button = _button("Solve from here", "solve", self.start_solve)
@@ -82,7 +83,7 @@ class Page:
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
         roots: dict[str, list[Any]] = {
             "controls": self.controls.all(),
-            "note_place": [self.note],
+            "note_place": [self.note, self.filling],
             "modes": [self.modes],
             "pins_place": [wrapped, self.output, self.pins.table],
             "map_place": [self.map.root()],
@@ -115,8 +116,15 @@ class Page:
         self.document.add_timeout_callback(still, TOGETHER)
 
     def improved(self) -> None:
-        """There is a better surrogate of the modes."""
-        if self.now is not None and not self.now.look.elements.exact:
+        """There is a sample more of the modes; what is drawn is so anew where it is better so."""
+        known = self.session.known
+        assert known is not None
+        words = known.progress
+        self.filling.text = f"<p>{words}</p>" if words else ""
+        if (
+            self.now is not None
+            and self.now.look.elements.words != known.at(self.now.look.theta).words
+        ):
             self.moved(False)
 
     def _answer(self) -> None:
@@ -145,6 +153,7 @@ class Page:
     def show(self, look: Look) -> None:
         """Draw a design, and say that this is the answer."""
         sampled = sampled_of(look) if look.knobs.sampled else None
+        look = with_sampled(look, sampled)
         self.now = Drawn(look, curves_of(look), sampled)
         session, pinned = self.session, [drawn for _, drawn in self.pins.pinned]
         machine = machine_html(
@@ -153,7 +162,11 @@ class Page:
         )  # fmt: skip
         self._serial += 1
         answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
-        words = {"verdict": standing_html(look, sampled), "machine": machine}
+        curves = self.now.curves
+        words = {
+            "verdict": standing_html(look, curves, sampled), "machine": machine,
+            "move_words": move_words(curves),
+        }  # fmt: skip
         self._message.send(words, [
             *self.figures.changes(self.now, pinned),
             *(self.figures.frame(self.now) if look.how is not How.PRESENT else []),

@@ -5,28 +5,28 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.explorer.curves import AsSampled
+from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.reporting.page import escape, number
 from ccd_casadi.support.units import HZ
 
-CLASSES = {Standing.KEPT: "kept", Standing.MISSED: "missed", Standing.REFUSED: "refused"}
 
-
-def standing_html(look: Look, sampled: AsSampled | None) -> str:
-    """The verdict, the figures, how the controller was chosen and on which plant."""
+def standing_html(look: Look, curves: Curves | None, sampled: AsSampled | None) -> str:
+    """The verdict, the figures, what it survives, how it was chosen and on which plant."""
     f, on = look.figures, look.elements
     standing = look.standing.value + (f": {look.reason}" if look.reason else "")
-    if not on.exact and look.standing is not Standing.REFUSED:
-        standing += "; on a plant close to the model, not on the model"
+    near = look.standing is Standing.NEAR
+    if not (on.exact or near or look.standing is Standing.REFUSED):
+        standing += f"; on a plant whose frequencies are the model's to {100.0 * on.error:.2g} %"
     facts = []
     if look.standing is not Standing.REFUSED:
         c = f.certificate
+        same = "of that plant ≈" if near else "="
         facts = [
-            f"ω_b = {number(look.bandwidth_hz, 5)} Hz",
-            f"‖S‖∞ = {number(f.sensitivity_peak, 5)} at "
+            f"ω_b {same} {number(look.bandwidth_hz, 5)} Hz",
+            f"‖S‖∞ {same} {number(f.sensitivity_peak, 5)} at "
             f"{number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
-            f"J = {number(look.objective, 6)}",
+            *([] if near else [f"J = {number(look.objective, 6)}"]),
             f"hardware cost {number(look.cost, 6)}",
         ]
         if look.kappa is None:
@@ -39,11 +39,35 @@ def standing_html(look: Look, sampled: AsSampled | None) -> str:
         if look.active:
             facts.append(f"binding: {', '.join(look.active)}")
     how = f"{look.how.value}; modes: {on.words}"
-    shown = f'<p class="{CLASSES[look.standing]}"><b>{escape(standing)}</b></p>'
+    if curves is not None:
+        how = f"{survival_words(curves)}; {how}"
+    shown = f'<p class="{look.standing.name.lower()}"><b>{escape(standing)}</b></p>'
     shown += f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
     if sampled is not None:
         shown += f"<p>{escape(sampled_words(sampled, look.problem.inner.S_max))}</p>"
     return shown
+
+
+def survival_words(curves: Curves) -> str:
+    """The margins of the loop that is drawn, and whether its controller is stable by itself."""
+    m, unstable = curves.margins, curves.controller_poles
+    unstable = unstable[(unstable.real > 1e-9 * np.abs(unstable)) & (unstable.imag >= 0.0)]
+    gain = f"gain × {number(m.gain_down, 3)} to {number(m.gain_up, 3)}"
+    margins = "the loop drawn is unstable: no margins" if curves.unstable else (
+        f"the loop drawn is stable for {gain}; phase margin {number(m.phase_deg, 3)}°, delay "
+        f"margin {number(1e6 * m.delay, 3)} µs"
+    )  # fmt: skip
+    if not unstable.size:
+        return f"{margins}; K by itself is stable"
+    at = ", ".join(number(float(hz), 4) for hz in np.sort(np.abs(unstable))[:3])
+    return f"{margins}; K by itself is UNSTABLE (poles at {at} Hz)"
+
+
+def move_words(curves: Curves | None) -> str:
+    """What the figure of the move shows."""
+    if curves is None or curves.unstable:
+        return ""
+    return f"the default one of robustness, {curves.move.words}; dashed: its end"
 
 
 def sampled_words(sampled: AsSampled, S_max: float) -> str:

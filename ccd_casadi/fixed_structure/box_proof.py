@@ -38,7 +38,7 @@ class ProofOutcome(StrEnum):
     PROVEN = "every bound holds, with its slack, on the whole box"
     LOOSER = "stable on the whole box; some bound is only proven with a larger factor"
     OPEN = "stability is not proven on the whole box within the number of boxes"
-    REFUTED = "a plant of the box passes a bound by more than the slack"
+    REFUTED = "a plant of the box exceeds a bound by more than the slack"
     UNSTABLE = "the model's own loop is not stable"
     TOO_MANY_PARAMETERS = "more than four uncertain parameters"
     SEVERAL_CHANNELS = "the plant has several inputs or outputs"
@@ -69,7 +69,7 @@ class Proof:
 
     @property
     def refuted(self) -> bool:
-        """Whether a plant of the box passes a bound by more than the slack."""
+        """Whether a plant of the box exceeds a bound by more than the slack."""
         return self.outcome is ProofOutcome.REFUTED
 
     @property

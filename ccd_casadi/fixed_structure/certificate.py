@@ -122,7 +122,7 @@ def certify(
               if not ratio <= 1.0 + TOLERANCE]  # fmt: skip
     lost = [i for i, figures in enumerate(found, 1) if not figures.confirmed]
     if broken:
-        words = f"passes its bound on {', '.join(broken)} (relative)"
+        words = f"exceeds its bound on {', '.join(broken)} (relative)"
     elif not bandwidth > 0.0:
         words = "S does not start below -3 dB on every plant"
     elif lost:

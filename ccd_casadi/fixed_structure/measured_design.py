@@ -95,7 +95,7 @@ def design_on_data(
         end, count = descend(model, point, model.box, -np.inf, 1.0, MARGIN)
         steps += count
         ends.append(end)
-        tell(f"{np.exp(end.tau) / HZ:.2f} Hz, bounds passed by {end.violation:.1g}")
+        tell(f"{np.exp(end.tau) / HZ:.2f} Hz, bounds exceeded by {end.violation:.1g}")
     best = min(ends, key=lambda end: (end.violation > 1e-5, -end.tau))
     controller = state_space(structure, best.kappa)
     figures = judge(
@@ -106,7 +106,7 @@ def design_on_data(
               if figures.stable and not ratio <= 1.0 + 1e-5]  # fmt: skip
     words = figures.words
     if broken:
-        words = f"passes its bound on {', '.join(broken)} (relative); {words}"
+        words = f"exceeds its bound on {', '.join(broken)} (relative); {words}"
     usable = figures.stable and figures.sure and not broken
     return MeasuredDesign(
         structure, best.kappa, controller, figures.bandwidth, figures, usable, words, steps

@@ -83,7 +83,7 @@ def run_race(
         lead = field[0].point
         going = sum(runner.running for runner in field)
         tell(f"{len(running)} searches, {sum(runner.evaluations for runner in field)} loops, "
-             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds passed by "
+             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
              f"{lead.assessment.violation:.1g}")  # fmt: skip
     return field
 

@@ -58,7 +58,7 @@ def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bod
         values = {channel: part[k] for channel, part in parts.items()}
         size = {channel: np.abs(v) for channel, v in values.items()}
         sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **look[name]))
-        angle = {channel: _phase(v) for channel, v in values.items()}
+        angle = {channel: phase_deg(v) for channel, v in values.items()}
         phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0, legend=None))
     return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
 
@@ -131,7 +131,7 @@ def table_bode(loop: Loop) -> Table:
     if loop.plant.shape[1:] == (1, 1):
         head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
         G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])
-        phases = [_phase(part[:, 0, 0]) for part in (loop.plant, loop.controller)]
+        phases = [phase_deg(part[:, 0, 0]) for part in (loop.plant, loop.controller)]
         columns = [loop.hz, G, phases[0], K, phases[1]]
     else:
         G, K = _singular_values(loop.plant), _singular_values(loop.controller)
@@ -148,8 +148,9 @@ def _singular_values(response: NDArray[np.complex128]) -> Array:
     return np.asarray(np.linalg.svd(response, compute_uv=False), dtype=float)
 
 
-def _phase(response: NDArray[np.complex128]) -> Array:
-    phase = np.degrees(np.unwrap(np.angle(response)))
+def phase_deg(response: NDArray[np.complex128]) -> Array:
+    """Without jumps along the first axis, from within ±180° on."""
+    phase = np.degrees(np.unwrap(np.angle(response), axis=0))
     return phase - 360.0 * np.round(phase[0] / 360.0)
 
 

@@ -55,7 +55,8 @@ def move_html(found: OnHardware) -> str:
         "Settled: from the start until the error stays within "
         f"{number(1e6 * found.window)} µm; last error: the largest over the last quarter of "
         f"{number(1e3 * found.ways[0].move.time[-1])} ms, the amplitude of a limit cycle if there "
-        "is one."
+        "is one. On the plant with its soft suspension, hold and delay exact (robustness lets the "
+        "rigid bodies go where that loop is stable)."
     )
     return figure_html(svg, caption, Table(head, rows)) + paragraph(_limit_words(found))
 

@@ -13,7 +13,7 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
-from ccd_casadi.deployment.words import reason_words
+from ccd_casadi.deployment.words import against, reason_words, short_status
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.deploy_move import move_html
@@ -64,9 +64,8 @@ def write_report(
     ]
     if found.stable:
         sections.append(Section("The code", _code(found)))
-    status = "verified" if found.passed else "not verified"
     head = header(
-        title, found.passed, status, reason, meta, _conclusion(run, found),
+        title, found.passed, short_status(run, found), reason, meta, _conclusion(run, found),
         warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
     )  # fmt: skip
     inside = path.resolve().parent.parent == run.folder.resolve()
@@ -81,13 +80,22 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
+    how = "as designed" if run.problem.sections is not None else (
+        f"instead of {before} (synthesised: {len(run.controller.A)})"
+    )  # fmt: skip
     return (
-        f"{orders} states instead of {before} (synthesised: {len(run.controller.A)}), at "
+        f"{orders} states {how}{_added(found, ', and ')}, at "
         f"{number(found.rate_hz)} Hz with a delay of "
         f"{number(1e6 * found.delay, 4)} µs: bandwidth {number(K.bandwidth / HZ)} Hz "
         f"({_percent(K.bandwidth, full.bandwidth)}), peak of S {number(K.sensitivity_peak)} "
-        f"({_percent(K.sensitivity_peak, run.problem.inner.S_max)} of S_max).{rest}"
+        f"({against(K.sensitivity_peak, run.problem.inner.S_max)}).{rest}"
     )
+
+
+def _added(found: Deployment, before: str) -> str:
+    """The states beside those of the reduced controller."""
+    more = len(found.realisation.system.A) - found.order
+    return f"{before}{more} of the lead" if more and found.conversion.lead else ""
 
 
 def _percent(value: float, reference: float) -> str:
@@ -128,7 +136,7 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         "frequency (Hz)", "σ_max(S) (–)", tuple(curves),
         levels=(
             Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY),
-            Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz", True),
+            Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz, continuous", True),
         ),
         log_x=True, log_y=True, x_range=(low, nyquist), legend="lower right",
     )  # fmt: skip
@@ -179,7 +187,7 @@ def _facts(run: FinishedRun, found: Deployment) -> str:
 
     def remark(peak: float, bandwidth: float) -> str:
         return (
-            f"peak {number(peak, 6)} ({_percent(peak, S_max)} of S_max); bandwidth "
+            f"peak {number(peak, 6)} ({against(peak, S_max)}); bandwidth "
             f"{_percent(bandwidth, full.bandwidth)}"
         )
 
@@ -344,7 +352,9 @@ def _code(found: Deployment) -> str:
     sizes = f"{K.blocks.count(1)} of one state, {K.blocks.count(2)} of two"
     larger = len(K.blocks) - K.blocks.count(1) - K.blocks.count(2)
     words = (
-        f"controller.c holds {len(K.system.A)} states, A block-diagonal ({sizes}"
+        f"controller.c holds {len(K.system.A)} states"
+        f"{_added(found, f' ({found.order} of the controller, ')}"
+        f"{')' if _added(found, '') else ''}, A block-diagonal ({sizes}"
         f"{f', {larger} larger' if larger else ''}). Call controller_step every "
         f"{number(1e6 * K.system.period, 6)} µs. controller_test.c compares it with forces that "
         "the Python difference equation gave; controller.st is the same as structured text "

@@ -18,7 +18,7 @@ from ccd_casadi.reporting.signals import Moved, signals_of
 from ccd_casadi.reporting.svg import GREEN, GREY
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.support.units import HZ, counted
-from ccd_casadi.synthesis.classical_margins import classical_margins
+from ccd_casadi.synthesis.classical_margins import least_margins
 from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 
@@ -56,12 +56,7 @@ def glance(problem: CoDesignProblem, verified: "VerifiedDesign", bandwidth_hz: f
         f"{number(1.0 / peak, 3)} from -1."
     )
     if L.shape[1:] == (1, 1):
-
-        def open_loop(omega: np.ndarray) -> np.ndarray:
-            G, k, _ = responses(plant, K, omega)
-            return np.asarray((G @ k)[:, 0, 0])
-
-        m = classical_margins(open_loop, HZ * fine)
+        m = least_margins(lambda omega: responses(plant, K, omega)[:2], HZ * fine)
         words += (
             f" The gain may fall to {number(m.gain_down, 3)} or rise to {number(m.gain_up, 3)} "
             f"times; the phase margin is {number(m.phase_deg, 3)}° and the delay margin "
@@ -144,12 +139,10 @@ def _move(move: Moved) -> Panel:
 
 def _move_words(move: Moved) -> str:
     limits = Demands().limits
-    ahead = "with mass feedforward" if move.feedforward else "without feedforward"
-    where = "" if move.free else ", on the suspended plant,"
     return (
-        f" A move of {number(1e3 * limits.stroke)} mm in {number(1e3 * move.end, 4)} ms {ahead}"
-        f"{where} errs by at most {number(1e6 * float(np.abs(move.error).max()), 3)} µm on the "
-        "model (other moves: robustness)."
+        f" A move of {number(1e3 * limits.stroke)} mm in {number(1e3 * move.end, 4)} ms "
+        f"({move.words}) errs by at most {number(1e6 * float(np.abs(move.error).max()), 3)} µm on "
+        "the model (other moves: robustness)."
     )
 
 

@@ -6,11 +6,10 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.facts import conclusion
-from ccd_casadi.reporting.page import INDEX, Section, Table, escape, header, page, table_html
+from ccd_casadi.reporting.page import INDEX, Section, Table, escape, page, table_html
 from ccd_casadi.reporting.sections_page import sections_conclusion
-from ccd_casadi.reporting.verdict import verdict_html, worst
+from ccd_casadi.reporting.verdict import refreshed, run_header
 from surrogates.files import write_whole
 
 PAGES = {
@@ -35,32 +34,44 @@ def index_of(folder: Path) -> str:
 def write_index(folder: Path) -> None:
     """Write index.html anew after a page was added; nothing where the folder holds no run.
 
-    Links are to what the folder holds now.
+    Links are to what the folder holds now. The verdict, to which `deploy` and `robustness` write
+    their lines, is put anew into every page that shows it.
     """
     try:
         result = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        status = str(result["status"])
+        result["status"] = str(result["status"])
     except (OSError, ValueError, KeyError):
         return
+    pages = _pages(folder)
+    for place in pages:
+        text = place.read_text(encoding="utf-8")
+        now = refreshed(text, result, whole=place == folder / "report.html")
+        if now != text:
+            write_whole(place, now)
     items = "\n".join(
         f'<li><a href="{quote(place.relative_to(folder).as_posix())}">{escape(_title(place))}</a>'
         f": {escape(words)}</li>"
-        for name, words in PAGES.items()
-        for place in sorted(folder.glob(name))
+        for place, words in pages.items()
     )
     files = tuple((n, words) for n, words in FILES.items() if (folder / n).exists())
     name = folder.resolve().name
     lead = sections_conclusion(result) if "race" in result else conclusion(result)
-    head = header(
-        f"Run: {name}", status == "verified", status.replace("_", " "),
-        str(result.get("reason") or ""), f"{result.get('formulation', '')} formulation", lead,
-        warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
-    )  # fmt: skip
+    head = run_header(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
     sections = [
         Section("Pages", f"<ul>{items}</ul>"),
         Section("Files", table_html(Table(("file", "what it is"), files))),
     ]
     write_whole(folder / INDEX, page(f"Run: {name}", sections, head, index=""))
+
+
+def _pages(folder: Path) -> dict[Path, str]:
+    """What there is, and what it is; a folder with a run of its own is no deployment."""
+    return {
+        place: words
+        for name, words in PAGES.items()
+        for place in sorted(folder.glob(name))
+        if place.parent == folder or not (place.parent / "result.json").exists()
+    }
 
 
 def _title(place: Path) -> str:

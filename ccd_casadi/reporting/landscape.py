@@ -12,6 +12,7 @@ from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess
+from surrogates.quality import Missed
 
 GRID = 25  # points per parameter of a landscape
 COARSER = 17  # the same where there are many samples
@@ -144,16 +145,24 @@ def _steepest(land: Landscape) -> str:
     width = float(axis[1] - axis[0])
     ratio = largest / max(usual, 1e-12)
     return (
-        f" The steepest place is at {land.names[0]} = {number(float(land.first[i]), 4)}, "
+        " By the surrogate the steepest place is at "
+        f"{land.names[0]} = {number(float(land.first[i]), 4)}, "
         f"{land.names[1]} = {number(float(land.second[j]), 4)}: {number(largest, 3)} Hz over "
         f"{number(width, 3)} {land.units[k]} of {land.names[k]}, {ratio:.0f} times the usual."
     )
 
 
 def caption_disagreement(
-    problem: CoDesignProblem, processes: tuple[GaussianProcess, ...], truths: Truths
+    problem: CoDesignProblem,
+    processes: tuple[GaussianProcess, ...],
+    truths: Truths,
+    design: tuple[float, ...],
+    missed: Missed | None = None,
 ) -> str:
-    """How far the surrogate's ω_b* is from the true one where it was not fitted to it."""
+    """How far the surrogate's ω_b* is from the true one where it was not fitted to it.
+
+    `missed`: by how much the samples around the design do so, left out.
+    """
     if not processes:
         return ""
     process = processes[0]
@@ -162,6 +171,11 @@ def caption_disagreement(
         f"{' with gradients' if process.has_gradients else ''}; left out one by one, they are "
         f"predicted to {number(process.loo.rms / HZ, 2)} Hz (root mean square)."
     )
+    if missed is not None:
+        words += (
+            f" Left out, {missed.where} is missed by {number(abs(missed.error), 2)} Hz: around the "
+            "design believe the colours, and their slope, no better than that."
+        )
     known = np.isfinite(truths.bandwidth_hz)
     if len(processes) == 1:  # it interpolates its own samples
         unit = (truths.theta - process.lower) / (process.upper - process.lower)
@@ -179,13 +193,17 @@ def caption_disagreement(
         for name, v in zip(problem.names, theta[worst], strict=True)
     )
     size = number(float(error[worst]), 2)
+    width = np.array(problem.upper) - np.array(problem.lower)
+    away = float((np.abs(theta - np.array(design)) / width).max(axis=1).min())
+    near = f"; the nearest of them is {100.0 * away:.2g} % of the box away from the design"
     if len(error) == 1:
         return (
-            f"{words} At the one other θ whose true ω_b* is known ({place}) it is off by {size} %."
+            f"{words} At the one other θ whose true ω_b* is known ({place}) it is off by {size} %"
+            f"{near}."
         )
     return (
         f"{words} At the {len(error)} other θ whose true ω_b* is known it is off by at most {size} "
-        f"% (at {place}), {number(float(np.nanmedian(error)), 2)} % in the median."
+        f"% (at {place}), {number(float(np.nanmedian(error)), 2)} % in the median{near}."
     )
 
 

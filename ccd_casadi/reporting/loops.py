@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
@@ -94,6 +94,33 @@ def forbidden(inner: InnerProblem | Bounds, low: float, high: float, top: float)
     )
 
 
+def above(hz: Array, bound: Array, top: float) -> Areas:
+    """Where a gain may not be, over Hz: above a bound that is NaN where nothing is asked."""
+    asked = np.isfinite(bound) & (bound < top)
+    if not asked.any():
+        return ()
+    x, y = hz[asked], bound[asked]
+    ends = np.array([complex(x[-1], top), complex(x[0], top)])
+    return ((np.concatenate([x + 1j * y, ends]), ORANGE),)
+
+
+def section_bounds(problem: CoDesignProblem, hz: Array, bandwidth_hz: float) -> Array:
+    """What S, KS (N/m) and T of a fixed structure may not exceed beside S_max and S_low (3, k).
+
+    The shape, and weighted_level/|W|; NaN where nothing is asked.
+    """
+    sections = problem.sections
+    assert sections is not None
+    size = np.abs(problem.weights.responses(HZ * hz))
+    level = np.nan if sections.weighted_level is None else sections.weighted_level
+    shape = np.nan if sections.shape is None else sections.shape
+    below = hz <= bandwidth_hz
+    rising = shape * hz / bandwidth_hz * 2.0**-0.5
+    most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
+    bounded = (below | (sections.shape_ends is ShapeEnd.S_MAX)) & (most <= problem.inner.S_max)
+    return np.array([np.where(bounded, most, np.nan), *(level / size[1:])])
+
+
 def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
     return np.array([complex(x, y) for x, y in (
         (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
@@ -138,8 +165,8 @@ def caption_gains(loop: Loop, *, S_max: float) -> str:
         others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
         words += f"; further local peaks {', '.join(others)}." if others else "."
     return (
-        f"σ_max(S) first passes -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
-        f"passes its bound γ/|W|, as certified: {', '.join(parts)}."
+        f"σ_max(S) first crosses -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
+        f"exceeds its bound γ/|W|, as certified: {', '.join(parts)}."
     )
 
 

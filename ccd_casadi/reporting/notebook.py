@@ -9,7 +9,6 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.verdict import State
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
@@ -31,9 +30,8 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.sections_loops import gains_html, loops_of
 from ccd_casadi.reporting.sections_page import controller_html, sections_conclusion
-from ccd_casadi.reporting.solve_page import STATUS
 from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
+from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -170,13 +168,8 @@ def _(item: ModalFit) -> str:
 
 
 def _result_head(result: Mapping[str, Any]) -> str:
-    good = result["status"] == "verified"
     said = sections_conclusion if "race" in result else conclusion
-    reason = head_words(result) if good else result["reason"]
-    return header(
-        "Co-design", good, STATUS[result["status"]], reason, "", said(dict(result)),
-        warned=worst(result) is State.WARNED, verdict=verdict_html(result),
-    )  # fmt: skip
+    return run_header("Co-design", result, "", said(dict(result)))
 
 
 def _theta(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:

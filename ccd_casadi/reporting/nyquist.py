@@ -36,14 +36,14 @@ def nyquist_panel(loci: Sequence[np.ndarray], S_max: float, height: float) -> Pa
     )  # fmt: skip
 
 
-def loci_of(L: np.ndarray) -> np.ndarray:
-    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > FAR."""
+def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
+    """Eigenvalues of L (k, p, p) as p continuous curves (k, p), NaN where |λ| > `far`."""
     values = np.linalg.eigvals(L)
     if values.shape[1] > 1:
         for i in range(1, len(values)):
             away = np.abs(values[i - 1][:, None] - values[i][None, :])
             values[i] = values[i][linear_sum_assignment(away)[1]]
-    return np.where(np.abs(values) <= FAR, values, np.nan)
+    return np.where(np.abs(values) <= far, values, np.nan)
 
 
 def around_resonances(plant: ScaledPlant, controller: StateSpace | None) -> Array:

@@ -241,7 +241,7 @@ def header(
         kind, sign = "warn", "!"
     badge = f'<span class="badge {kind}">{sign} {escape(status)}</span>'
     return (
-        f"<h1>{escape(title)}</h1>\n<p>{badge} {escape(typeset(reason))}</p>\n"
+        f"<h1>{escape(title)}</h1>\n<p class='standing'>{badge} {escape(typeset(reason))}</p>\n"
         f'<p class="meta">{escape(meta)}</p>\n<p class="lead">{escape(typeset(lead))}</p>\n'
         f"{verdict}"
     )

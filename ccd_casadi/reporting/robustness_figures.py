@@ -14,6 +14,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 SHOWN = 45  # rows of a table
+SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
 
 
@@ -60,10 +61,10 @@ def perturbed(run: FinishedRun, found: Study) -> str:
     ):
         x, peak, bandwidth = _columns(line)
         # the axis shows what matters about S_max; a loop near instability has any peak
-        top = min(float(np.nanmax(peak)) * 1.05, 3.0 * S_max)
+        top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
         limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
         ends = (factor * float(x[0]), factor * float(x[-1]))
-        curve = Curve(factor * x, np.where(peak <= top, peak, np.nan), marker=".")
+        curve = Curve(factor * x, peak, marker=".")
         span = (1.0, max(top, 1.1 * S_max))
         lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
         faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
@@ -95,6 +96,13 @@ def line_table(name: str, line: Line) -> Table:
     return Table((name, "stable", "ω_b Hz", "‖S‖∞"), rows)
 
 
+def shown_peak(run: FinishedRun, found: Study) -> float:
+    """The right end of the axis of peaks of the random plants."""
+    S_max = run.problem.inner.S_max
+    largest = max((i.peak for i in found.tolerances.judged if i.stable), default=S_max)
+    return float(min(1.02 * max(largest, S_max), SHOWN_PEAK * S_max))
+
+
 def tolerances(run: FinishedRun, found: Study) -> str:
     """Empirical distributions of peak and bandwidth over the random plants."""
     judged = found.tolerances.judged
@@ -102,11 +110,11 @@ def tolerances(run: FinishedRun, found: Study) -> str:
     bandwidth = np.sort([item.bandwidth / HZ for item in judged if item.stable])
     share = (np.arange(peak.size) + 1.0) / max(len(judged), 1)
     S_max = run.problem.inner.S_max
-    kept = peak <= 5.0 * S_max
     limit = (Level(S_max, "S_max", vertical=True), Level(1.0, "all"))
     panels = [
-        Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak[kept], share[kept]),),
-              levels=limit, y_range=(0.0, 1.08)),
+        Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak, share),),
+              levels=limit, x_range=(min(*peak, S_max, 1e9), shown_peak(run, found)),
+              y_range=(0.0, 1.08)),
         Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
               y_range=(0.0, 1.08)),
     ]  # fmt: skip
@@ -145,10 +153,14 @@ def structured_table(bound: StructuredBound) -> Table:
     return Table(("Hz", "μ, complex errors"), rows)
 
 
+def shown_until(found: Move) -> float:
+    """Where the figure of a move ends, s."""
+    return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+
+
 def move(found: Move, key: str) -> str:
     """Setpoint, error and forces over time, the first part of the tail included."""
-    until = found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
-    shown = found.time <= until
+    shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
     t = 1e3 * found.time[pick]
     end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)

@@ -21,6 +21,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
+from ccd_casadi.robust.move import Move
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ, metres
@@ -129,6 +130,7 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
     way = "with mass feedforward" if move.feedforward else "without feedforward"
+    way += f", {'its rigid bodies free' if found.free else 'on its soft suspension'}"
     settled = (
         f"settles {_time(move.settling)} after its end"
         if np.isfinite(move.settling)
@@ -139,6 +141,22 @@ def _moved(found: Study, i: int) -> str:
         f"{settled} (±{metres(move.window)}), RMS error {metres(move.rms_error)}, "
         f"peak {metres(move.peak_error)}, peak force {max(move.peak_force):.4g} N."
     )
+
+
+def _place(omega: float) -> str:
+    if omega in (0.0, np.inf):
+        return "at rest" if omega == 0.0 else "towards infinite frequency"
+    return f"at {number(omega / HZ, 4)} Hz"
+
+
+def _cut(move: Move) -> str:
+    """What the figure does not show of a move that settles after its end."""
+    until = figures.shown_until(move)
+    later = np.abs(move.error[move.time > until])
+    if move.duration + move.settling <= until or not later.size:
+        return ""
+    most = metres(float(later.max()))
+    return f" The figure ends before, at {_time(until)}: after that the error is up to {most}."
 
 
 def _time(seconds: float) -> str:
@@ -183,7 +201,7 @@ def _margins(found: Study) -> Section:
         rows.append((f"all {name} at once", *([nothing] * 4), *disk(margin)))
     words = (
         "Gains are factors: the nearest above and below 1 at which stability is lost. A disk "
-        "margin covers gain and phase errors at once; it is taken on a grid of frequencies."
+        "margin covers gain and phase errors at once."
     )
     return Section("Margins", table_html(Table(head, tuple(rows))) + paragraph(words))
 
@@ -191,12 +209,10 @@ def _margins(found: Study) -> Section:
 def _gains(run: FinishedRun, found: Study) -> Section:
     names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
     tops = [
-        (
-            name,
-            number(factor * float(row.max())),
-            f"at {number(float(found.hz[row.argmax()]), 4)} Hz",
+        (name, number(factor * peak), _place(omega))
+        for name, (peak, omega), factor in zip(
+            names, found.peaks, (1.0, 1.0, 1e6, 1.0), strict=True
         )
-        for name, row, factor in zip(names, found.gains, (1.0, 1.0, 1e6, 1.0), strict=True)
     ]
     n, d = found.noise, found.demands
     # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
@@ -231,7 +247,8 @@ def _gains(run: FinishedRun, found: Study) -> Section:
 def _perturbed(run: FinishedRun, found: Study) -> Section:
     caption = (
         "Above: all flexible frequencies shifted together, mode shapes kept. Below: all damping "
-        "multiplied. The controller stays. A gap in a curve is an unstable loop."
+        "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
+        f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
     drawn = figure_html(
         figures.perturbed(run, found), caption,
@@ -247,11 +264,19 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
 
 
 def _tolerances(run: FinishedRun, found: Study) -> Section:
-    hard = found.tolerances
+    hard, shown = found.tolerances, figures.shown_peak(run, found)
+    count = len(hard.judged)
+    lost = sum(not item.stable for item in hard.judged)
+    beyond = sum(item.stable and item.peak > shown for item in hard.judged)
     caption = (
-        f"{len(hard.judged)} plants with every hardware parameter uniformly within "
+        f"{count} plants with every hardware parameter uniformly within "
         f"±{100 * hard.tolerance:g} % of its value: the share of them below a peak of S, and below "
-        "a bandwidth. A curve that ends below 1 leaves out what is unstable."
+        f"a bandwidth. {lost} are unstable: both curves end at {number(1.0 - lost / count, 3)}."
+        + (
+            f" {beyond} more are stable and lie right of the axis, above a peak of {shown:.4g}."
+            if beyond
+            else ""
+        )
     )
     theta = theta_words({
         "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
@@ -288,7 +313,11 @@ def _move(found: Study) -> Section:
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [
-        figure_html(figures.move(move, f"move{i}"), _moved(found, i), figures.move_table(move))
+        figure_html(
+            figures.move(move, f"move{i}"),
+            f"{_moved(found, i)}{_cut(move)}",
+            figures.move_table(move),
+        )
         for i, move in enumerate(found.moves)
     ]
     words = (

@@ -15,28 +15,29 @@ from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.reporting.bode import phase_deg
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.loops import forbidden
+from ccd_casadi.reporting.loops import Areas, above, forbidden, section_bounds
 from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import CYCLE, GREY
+from ccd_casadi.reporting.svg import CYCLE, GREY, ORANGE
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
-    from ccd_casadi.analysis.loop_figures import force_step
-from ccd_casadi.codesign.sections_run import VerifiedSections
+    from ccd_casadi.codesign.sections_run import VerifiedSections
 
 POINTS = 700
 ROWS = 40  # of the tables
+BOUNDS = {"S": "its shape", "KS": "weighted_level/|W_KS|", "T": "weighted_level/|W_T|"}
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
 
 
 @dataclass(frozen=True)
 class Loops:
-    """S, KS (N/m), T and L of every plant (rows) over Hz.
+    """S, KS (N/m), T, L and GS (m/N) of every plant (rows) over Hz; `bounds` of S, KS, T (3, k).
 
-    Of several channels the largest singular values, and no L.
+    Of several channels the largest singular values, and no L; GS only where the case bounds it.
     """
 
     hz: Array
@@ -44,6 +45,8 @@ class Loops:
     KS: np.ndarray
     T: np.ndarray
     L: np.ndarray
+    GS: np.ndarray
+    bounds: Array
 
 
 def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Loops:
@@ -69,15 +72,20 @@ def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDes
     omega = np.unique(omega[(omega >= low) & (omega <= high)])
     v = P.variable(omega / P.omega_0)
     kappa = in_problem_units(inside, made.kappa)
+    bounds = section_bounds(problem, omega / HZ, made.bandwidth / HZ)
+    nothing = np.zeros((0, len(v)))
     if isinstance(inside, CompositeProblem):
         S, KS, T = largest_gains(inside, kappa, v)
-        return Loops(omega / HZ, S, KS * P.force, T, np.zeros((0, len(v))))
+        return Loops(omega / HZ, S, KS * P.force, T, nothing, nothing, bounds)
     assert isinstance(inside, Problem)
     which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     K = response(inside.structure, kappa, 1j * v)
     L = P.values(which, grid) * K
     S = 1.0 / (1.0 + L)
-    return Loops(omega / HZ, S, K * P.force * S, 1.0 - S, L)
+    GS = nothing
+    if inside.bounds.compliance_max is not None:
+        GS = np.abs(P.values(which, grid, free=True) * S) / P.force
+    return Loops(omega / HZ, S, K * P.force * S, 1.0 - S, L, GS, bounds)
 
 
 def compared_html(
@@ -108,29 +116,69 @@ def compared_html(
 def gain_panels(
     problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops
 ) -> tuple[Panel, Panel, Panel]:
-    """S with what is forbidden to it, KS and T, each as the model's and a band of all plants."""
+    """S, KS and T with what is forbidden to them, each as the model's and a band of all plants."""
     inner, bandwidth = problem.inner, verified.design.bandwidth / HZ
     x = (float(loops.hz[0]), float(loops.hz[-1]))
 
-    def panel(label: str, gains: np.ndarray, levels: Sequence[Level]) -> Panel:
-        size = np.abs(gains)
-        band = Band(loops.hz, size.min(axis=0), size.max(axis=0), "all plants")
-        curve = Curve(loops.hz, size[0], "the model")
-        return Panel("frequency (Hz)", label, (curve,), (band,), levels=tuple(levels), log_x=True,
-                     log_y=True, x_range=x, legend="lower right")  # fmt: skip
+    def panel(i: int, label: str, gains: np.ndarray, levels: Sequence[Level]) -> Panel:
+        made = loop_panel(loops, label, np.abs(gains), levels)
+        bound, size = loops.bounds[i], np.abs(gains)
+        if not np.isfinite(bound).any():
+            return made
+        top = 4.0 * float(size.max())
+        curves = (
+            *made.curves,
+            Curve(loops.hz, bound, list(BOUNDS.values())[i], ORANGE, "--", width=0.9),
+        )
+        low = max(float(size.min()) / 1.5, 1e-6 * top)
+        return replace(made, curves=curves, y_range=(low, top),
+                       forbidden=above(loops.hz, bound, top))  # fmt: skip
 
     def gain(of: str) -> str:  # of several channels the largest singular value
         return f"|{of}|" if len(loops.L) else f"σ_max({of})"
 
     at = Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz", True)
+    unnamed = replace(at, text="")
     asked = Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY)
-    S = panel(f"{gain('S')} (–)", loops.S, (asked, Level(2**-0.5, "-3 dB", colour=GREY), at))
-    KS = panel(f"{gain('KS')} (N/m)", loops.KS, (at,))
-    T = panel(f"{gain('T')} (–)", loops.T, (at,))
+    S = panel(0, f"{gain('S')} (–)", loops.S, (asked, Level(2**-0.5, "-3 dB", colour=GREY), at))
+    KS = panel(1, f"{gain('KS')} (N/m)", loops.KS, (unnamed,))
+    T = panel(2, f"{gain('T')} (–)", loops.T, (unnamed,))
     top = 2.5 * max(inner.S_max, float(np.abs(loops.S).max()))
-    S = replace(S, forbidden=forbidden(inner, x[0], x[1], top),
+    areas: Areas = (*forbidden(inner, x[0], x[1], top), *S.forbidden)
+    S = replace(S, forbidden=areas,
                 y_range=(0.5 * float(np.abs(loops.S[0]).min()), top))  # fmt: skip
     return S, KS, T
+
+
+def loop_panel(
+    loops: Loops, label: str, values: np.ndarray, levels: Sequence[Level] = (), *, log: bool = True
+) -> Panel:
+    """Values of every plant over frequency: the model's in a band of all."""
+    band = Band(loops.hz, values.min(axis=0), values.max(axis=0), "all plants")
+    curve = Curve(loops.hz, values[0], "the model")
+    ends = (float(loops.hz[0]), float(loops.hz[-1]))
+    return Panel("frequency (Hz)", label, (curve,), (band,), levels=tuple(levels), log_x=True,
+                 log_y=log, x_range=ends, legend="lower right",
+                 y_step=None if log else 90.0)  # fmt: skip
+
+
+def _open_loop(problem: CoDesignProblem, verified: "VerifiedSections", loops: Loops) -> list:
+    """L of one channel as a Bode plot, and |GS| where it is bounded."""
+    rows: list[list[Panel]] = []
+    if len(loops.L):
+        hz = verified.design.bandwidth / HZ
+        at = Level(hz, "", True)  # as above
+        phase = phase_deg(loops.L.T).T
+        rows.append([
+            loop_panel(loops, "|L| (–)", np.abs(loops.L), (Level(1.0, "1", colour=GREY), at)),
+            loop_panel(loops, "phase of L (deg)", phase, (Level(-180.0, "", colour=GREY), at),
+                       log=False),
+        ])  # fmt: skip
+    most = sections_of_problem(problem).compliance_max
+    if len(loops.GS) and most is not None:
+        level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
+        rows.append([loop_panel(loops, "|GS| (µm/N)", 1e6 * loops.GS, (level,))])
+    return rows
 
 
 def gains_html(
@@ -140,15 +188,16 @@ def gains_html(
     *,
     key: str = "sections-loop",
 ) -> str:
-    """S, KS and T of the model in a band of all plants; `key` is unique in the page."""
+    """S, KS, T, L and GS of the model in a band of all plants; `key` is unique in the page."""
     S, KS, T = gain_panels(problem, verified, loops)
     x = (float(loops.hz[0]), float(loops.hz[-1]))
 
     def gain(of: str) -> str:
         return f"|{of}|" if len(loops.L) else f"σ_max({of})"
 
-    svg = figure_lines([[S], [KS, T]], key=key, heights=(3.4, 2.6),
-                       title="S, KS and T of every plant of the set over frequency")  # fmt: skip
+    more = _open_loop(problem, verified, loops)
+    svg = figure_lines([[S], [KS, T], *more], key=key, heights=(3.4, *[2.6] * (1 + len(more))),
+                       title="The loop of every plant of the set over frequency")  # fmt: skip
     rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
     table = Table(
         ("Hz", f"{gain('S')} model", f"{gain('S')} least", f"{gain('S')} largest",
@@ -160,7 +209,23 @@ def gains_html(
             for i in sorted(set(rows))
         ),
     )  # fmt: skip
-    return figure_html(svg, f"The band spans {counted(len(loops.S), 'plant')} of the set.", table)
+    one = "The set holds one plant, the model." if len(loops.S) == 1 else (
+        f"The band spans {counted(len(loops.S), 'plant')} of the set."
+    )  # fmt: skip
+    words = f"{one} {' '.join(_closest(loops))} Shaded: beyond a bound of the case."
+    return figure_html(svg, words, table)
+
+
+def _closest(loops: Loops) -> list[str]:
+    """How near S, KS and T come to their bounds on any plant."""
+    found = []
+    for name, gains, bound in zip(BOUNDS, (loops.S, loops.KS, loops.T), loops.bounds, strict=True):
+        share = np.abs(gains).max(axis=0) / bound
+        if np.isfinite(share).any():
+            i = int(np.nanargmax(share))
+            told = f"{100.0 * share[i]:.4g} % of {BOUNDS[name]} at {number(float(loops.hz[i]), 3)}"
+            found.append(f"|{name}| comes to {told} Hz.")
+    return found
 
 
 def force_step_html(verified: "VerifiedSections") -> str:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import (
@@ -28,8 +28,11 @@ from ccd_casadi.reporting.page import (
 from ccd_casadi.reporting.sections_loops import force_step_html, gains_html, loops_of
 from ccd_casadi.reporting.sections_move import move_html, move_panels
 from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 if TYPE_CHECKING:
+    from ccd_casadi.codesign.sections_run import VerifiedSections
     from ccd_casadi.codesign.solution import Solution
 
 
@@ -64,12 +67,36 @@ def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Se
         _design(problem, solution.result),
         Section("The controller", controller_html(solution.result)),
         Section("Full order beside it", _beside(problem, solution.result)),
-        Section("Closed loop on every plant", gains_html(problem, verified, loops)),
+        Section(
+            "Closed loop on every plant",
+            _bandwidths(verified) + gains_html(problem, verified, loops),
+        ),
     ]
     if moves is not None:
         found.append(Section("A move", move_html(*moves)))
         found.append(Section("A step of force", force_step_html(verified)))
     return [*found, *budget_section(verified.problem, verified.theta, verified.design.controller)]
+
+
+def _bandwidths(verified: "VerifiedSections") -> str:
+    """Every ω_b of the one controller: which plant, and whether sampled."""
+    design, problem = verified.design, verified.problem
+    assert design.certificate is not None
+    assert design.controller is not None
+    sampling, plants = sections_of_problem(problem).sampling, design.certificate.plants
+    as_run = "continuous" if sampling is None else f"as sampled at {number(sampling.rate_hz)} Hz"
+    least = f"the least of {counted(len(plants), 'plant')} of the set, which J counts"
+    rows = [(least, as_run, design.certificate.bandwidth), ("the model", as_run,
+                                                            plants[0].crossing)]  # fmt: skip
+    if sampling is not None:
+        found = measure(
+            scaled_plant(problem, verified.theta), design.controller, problem.weights,
+            gamma=UNBOUNDED, omega_low=problem.inner.omega_low,
+        )  # fmt: skip
+        rows.append(("the model", "continuous", found.bandwidth))
+    head = ("-3 dB of S with this controller, on", "loop", "Hz")
+    table = Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
+    return table_html(table)
 
 
 def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:

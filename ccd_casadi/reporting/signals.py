@@ -40,6 +40,12 @@ class Moved:
     feedforward: bool
     free: bool
 
+    @property
+    def words(self) -> str:
+        """What takes part in it."""
+        ahead = "with mass feedforward" if self.feedforward else "without feedforward"
+        return f"{ahead}, {'its rigid bodies free' if self.free else 'on its soft suspension'}"
+
 
 AT_REST = Moved(np.zeros(0), np.zeros(0), 0.0, False, False)
 

@@ -10,7 +10,6 @@ import numpy as np
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
-from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.rib_stage.plant import stage_of
@@ -41,7 +40,6 @@ from ccd_casadi.reporting.page import (
     escape,
     facts_html,
     figure_html,
-    header,
     page,
     paragraph,
     preformatted,
@@ -59,7 +57,7 @@ from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.turntable import with_turntables
-from ccd_casadi.reporting.verdict import head_words, verdict_html, worst
+from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Ahead, WorkerLost
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -70,11 +68,6 @@ if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.verify import VerifiedDesign
 
 ELSEWHERE = ("theta", "trust")  # neither asks the plant: a process of its own solves none anew
-STATUS = {
-    "verified": "verified",
-    "not_verified": "not verified",
-    "infeasible": "no feasible design",
-}
 
 
 def write_report(
@@ -104,20 +97,15 @@ def report_html(
 ) -> str:
     """The report's text; the bar counts its sections. A `helper` draws about half of them."""
     result = solution.result
-    status = result["status"]
     # what `ccd new` makes is named by its folder
     named = case.path.absolute().parent.name if case.path.stem == "case" else case.path.stem
     title = f"Co-design of {named}"
     now = datetime.now().strftime("%Y-%m-%d %H:%M")
-    head = header(
+    head = run_header(
         title,
-        status == "verified",
-        STATUS[status],
-        _reason(solution),
+        result,
         f"{case.path.name} · {result['formulation']} formulation · {now}",
         sections_conclusion(result) if solution.sections is not None else conclusion(result),
-        warned=worst(result) is State.WARNED,
-        verdict=verdict_html(result),
     )
     work = (folder, case, problem, solution)
     parts = _parts(*work)
@@ -176,12 +164,6 @@ def _parts(
     }
 
 
-def _reason(solution: "Solution") -> str:
-    if solution.result["status"] == "verified":
-        return head_words(solution.result)
-    return solution.result["reason"]
-
-
 def _design(problem: CoDesignProblem, solution: "Solution") -> Section:
     binds = binding(problem, solution.result)
     items = "".join(f"<li>{escape(words)}</li>" for words in binds)
@@ -201,7 +183,8 @@ def _theta(
     outcome = solution.outcome
     processes, iterates = outcome.surrogates, outcome.iterates
     best = float(solution.result["bandwidth_hz"])
-    extra = caption_disagreement(problem, processes, truths)
+    missed = solution.quality[0].missed if solution.quality else None
+    extra = caption_disagreement(problem, processes, truths, verified.theta, missed)
     if len(problem.names) == 2:
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, processes, truths, radius, verified.theta)

@@ -86,7 +86,7 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
             (
                 WORDS[q.name], len(q.true), *(f"{number(e, 3)} {q.unit}" for e in _errors(q)),
                 number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look,
-                q.unsupported or "supported",
+                q.at_design,
             )
             for q in qualities
         ),

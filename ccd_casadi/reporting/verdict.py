@@ -1,15 +1,23 @@
 """The verdict of a run as every command and page shows it: five lines, each with sign and words."""
 
+import re
 import textwrap
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.reporting.page import escape, typeset
+from ccd_casadi.reporting.page import escape, header, typeset
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}
 BADGES = {State.PASSED: "good", State.WARNED: "warn", State.FAILED: "bad", State.UNKNOWN: "open"}
+STATUS = {
+    "verified": "verified",
+    "not_verified": "not verified",
+    "infeasible": "no feasible design",
+}
+BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
+TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
 WIDTH = 100  # of a terminal line
 
 
@@ -60,9 +68,56 @@ def short(result: Mapping[str, Any]) -> str:
     )
 
 
+def run_header(title: str, result: Mapping[str, Any], meta: str, lead: str) -> str:
+    """The head of a page that is about the run itself: badge and verdict are the run's."""
+    good = result["status"] == "verified"
+    reason = head_words(result) if good else str(result.get("reason") or "")
+    reason = f"{reason.rstrip('.')}. {advice(result)}".strip()
+    return header(
+        title, good, STATUS.get(result["status"], "not verified"), reason, meta, lead,
+        warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
+    )  # fmt: skip
+
+
+def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
+    """A page with the verdict as it is now; of the run's own page (`whole`) the badge too."""
+    places = [(TABLE, verdict_html(result))]
+    if whole:
+        places.append((BADGE, run_header("", result, "", "")))
+    for place, source in places:
+        old, new = place.search(text), place.search(source)
+        if old is not None and new is not None:
+            text = text[: old.start()] + new[0] + text[old.end() :]
+    return text
+
+
+def advice(result: Mapping[str, Any]) -> str:
+    """What to do with the design, in a sentence; nothing of a run without a verdict."""
+    states = {line.name: line.state for line in lines_of(result)}
+    failed = [name for name, state in states.items() if state is State.FAILED]
+    if not states:
+        return ""
+    if failed or result.get("status") != "verified":
+        return f"Do not build this: {', '.join(failed) or 'it is not verified'}."
+    if states.get("survives") is State.WARNED:
+        return (
+            "Do not build this loop as it is: a plant a little off its model is not survived. "
+            "Next: a [robust] set in the case."
+        )
+    warned = [name for name, state in states.items() if state is State.WARNED]
+    if warned:
+        return f"Look at {', '.join(warned)} before it is built."
+    return "Next: deploy." if states.get("deployable") is State.UNKNOWN else ""
+
+
 def head_words(result: Mapping[str, Any]) -> str:
     """What stands beside the badge of a verified run: never more than its lines say."""
-    warned = [line.name for line in lines_of(result) if line.state is State.WARNED]
+    warned, failed = (
+        [line.name for line in lines_of(result) if line.state is state]
+        for state in (State.WARNED, State.FAILED)
+    )
+    if failed:
+        return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
         checks = ", ".join(result.get("checks", {})).replace("_", " ")
         return f"all checks passed: {checks}"

@@ -10,18 +10,17 @@ from above (`mu_bound`), so that α is a lower bound. (Seiler, Packard and Gahin
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import classical_margins
-from ccd_casadi.synthesis.closed_loop import responses
+from ccd_casadi.synthesis.classical_margins import Responses, classical_margins, loop_alone
 
-FINE = 60  # points between the neighbours of the least disk margin found
+FINE = 61  # points between the neighbours of the least disk margin found
 
 
 @dataclass(frozen=True)
@@ -68,63 +67,49 @@ class Margins:
     inputs: DiskMargin
 
 
-def margins(
-    plant: ScaledPlant, controller: StateSpace, hz: Array, G: NDArray, K: NDArray
-) -> Margins:
-    """Margins from G (k, p, m) and K (k, m, p) in SI, on a grid in Hz that resolves resonances."""
-    loops = []
-    for name, L in (("output", G @ K), ("input", K @ G)):
-        S = np.linalg.inv(np.eye(L.shape[1]) + L)
-        for i in range(L.shape[1]):
-            loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
+def margins(respond: Responses, hz: Array) -> Margins:
+    """Margins of a loop from its responses in SI, on a grid in Hz that resolves resonances.
 
-    def both(omega: Array) -> tuple[NDArray, NDArray]:
-        g, k, _ = responses(plant, controller, omega)
-        return g, k
-
-    outputs = _together(lambda omega: np.matmul(*both(omega)), G @ K, hz)
-    inputs = _together(lambda omega: np.matmul(*both(omega)[::-1]), K @ G, hz)
-    return Margins(tuple(loops), outputs, inputs)
-
-
-def sampled_margins(hz: Array, G: NDArray, K: NDArray) -> Margins:
-    """The same from responses alone, of a sampled loop up to half its rate."""
+    The grid only brackets: crossings are bisected on the response itself, and the least disk margin
+    is looked for again between its neighbours. Of a sampled loop the grid ends at half its rate.
+    """
     loops, together = [], []
-    for name, L in (("output", G @ K), ("input", K @ G)):
-        S = np.linalg.inv(np.eye(L.shape[1]) + L)
-        for i in range(L.shape[1]):
-            loops.append(_loop(f"{name} {i + 1}", hz, 1.0 / S[:, i, i] - 1.0))
-        alpha = 1.0 / mu_bound(S - 0.5 * np.eye(S.shape[1]))
-        worst = int(alpha.argmin())
-        together.append(DiskMargin(float(alpha[worst]), float(hz[worst])))
-    return Margins(tuple(loops), together[0], together[1])
+    for name in ("output", "input"):
+        L = partial(_broken, respond, name)
+        for i in range(L(HZ * hz[:1]).shape[1]):
+            loops.append(_loop(f"{name} {i + 1}", partial(_alone, L, i), hz))
+        together.append(_least(L, hz))
+    return Margins(tuple(loops), *together)
 
 
-def _loop(name: str, hz: Array, L: NDArray) -> LoopMargins:
-    from scipy.interpolate import CubicSpline  # slow to import
+def _broken(respond: Responses, name: str, omega: Array) -> NDArray:
+    G, K = respond(omega)
+    return np.asarray(G @ K if name == "output" else K @ G)
 
-    found = classical_margins(CubicSpline(HZ * hz, L), HZ * hz)
-    distance = np.abs(1.0 / (1.0 + L) - 0.5)
-    worst = int(distance.argmax())
+
+def _alone(L: Callable[[Array], NDArray], i: int, omega: Array) -> NDArray:
+    return loop_alone(L(omega), i)
+
+
+def _loop(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:
+    found = classical_margins(L, HZ * hz)
     return LoopMargins(
         name=name,
         gain_up=found.gain_up,
         gain_down=found.gain_down,
         phase_deg=found.phase_deg,
         crossover_hz=found.crossover / HZ,
-        disk=DiskMargin(float(1.0 / distance[worst]), float(hz[worst])),
+        disk=_least(lambda omega: L(omega)[:, None, None], hz),
     )
 
 
-def _together(loop: Callable[[Array], NDArray], L: NDArray, hz: Array) -> DiskMargin:
-    """The least disk margin on the grid, then on a finer one around it."""
+def _least(L: Callable[[Array], NDArray], hz: Array) -> DiskMargin:
+    """The least disk margin of all channels at once on the grid, then on a finer one around it."""
     for last in (False, True):
-        eye = np.eye(L.shape[1])
-        alpha = 1.0 / mu_bound(np.linalg.inv(eye + L) - 0.5 * eye)
+        eye = np.eye((response := L(HZ * hz)).shape[1])
+        alpha = 1.0 / mu_bound(np.linalg.inv(eye + response) - 0.5 * eye)
         worst = int(alpha.argmin())
         found = DiskMargin(float(alpha[worst]), float(hz[worst]))
         if not last:
-            ends = hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)]
-            hz = np.geomspace(*ends, FINE)
-            L = loop(HZ * hz)
+            hz = np.geomspace(hz[max(worst - 1, 0)], hz[min(worst + 1, hz.size - 1)], FINE)
     return found

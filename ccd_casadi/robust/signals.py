@@ -5,14 +5,19 @@
 White noise of one-sided density s (unit/√Hz) through H has the variance s² ‖H‖₂²/2.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov
+from scipy.optimize import minimize_scalar
 
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.norms import hinf_norm
+
+REST = 1e-3  # of the lowest frequency of a grid: what counts as constant
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,37 @@ def gains(G: NDArray, K: NDArray) -> Array:
     S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
     parts = (S, G @ K @ S, S @ G, K @ S)
     return np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in parts])
+
+
+def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
+    """‖·‖∞ of S, T, GS and KS, each with its frequency in rad/s (0: at rest), without a grid."""
+    p, m = len(loop.C_y), loop.B_d.shape[1]
+    nothing = np.zeros((p, p))
+    parts = (
+        StateSpace(loop.A, loop.B_r, -loop.C_y, np.eye(p)),
+        StateSpace(loop.A, loop.B_r, loop.C_y, nothing),
+        StateSpace(loop.A, loop.B_d, loop.C_y, np.zeros((p, m))),
+        StateSpace(loop.A, loop.B_r, loop.C_u, loop.D_u),
+    )
+    return tuple(hinf_norm(part) for part in parts)
+
+
+def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, float], ...]:
+    """The largest value of each row of gains (r, k), climbed from a grid in rad/s, and its ω.
+
+    Of a loop in discrete time, from far below the grid (a constant signal) to its end.
+    """
+    omega = np.concatenate([REST * omega[:1], omega])
+    values, found = gain(omega), []
+    for row, i in enumerate(values.argmax(axis=1)):
+        ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
+        top = minimize_scalar(
+            lambda x, row=row: -float(gain(np.exp([x]))[row, 0]), bounds=np.log(ends),
+            method="bounded", options={"xatol": 1e-10},
+        )  # fmt: skip
+        tops = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
+        found.append(max(tops, (-float(top.fun), float(np.exp(top.x)))) if i else tops)
+    return tuple(found)
 
 
 def noise(loop: ClosedLoop, sensor: float, disturbance: float) -> Noise:

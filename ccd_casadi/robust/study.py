@@ -1,17 +1,21 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.later_lines import at_solve
+from ccd_casadi.codesign.verdict import Line as VerdictLine
+from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
-from ccd_casadi.robust.margins import DiskMargin, Margins, margins, sampled_margins
+from ccd_casadi.robust.margins import DiskMargin, Margins, margins
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.perturbed import (
     Judged,
@@ -23,20 +27,22 @@ from ccd_casadi.robust.perturbed import (
     worst_in_box,
 )
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import Noise, closed_loop, gains, noise
+from ccd_casadi.robust.signals import Noise, closed_loop, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import loop_data
 from ccd_casadi.synthesis.statics import Statics, statics
 
 
 @dataclass(frozen=True)
 class Study:
-    """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `free` whether the moves are those
-    of the plant without its suspension, `moves` the move without and with feedforward.
+    """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `peaks` their largest values with
+    the frequencies in rad/s (0: at rest), which the grid does not decide; `free` whether the moves
+    are those of the plant without its suspension, `moves` the move without and with feedforward.
 
     `structured` is None where no flexible mode is in the loop, and where the bound was not computed
     within the `overrun` seconds that it was given. Of a controller in discrete time there is no
@@ -46,6 +52,7 @@ class Study:
     demands: Demands
     hz: Array
     gains: Array
+    peaks: tuple[tuple[float, float], ...]
     margins: Margins
     noise: Noise | None
     statics: Statics
@@ -119,7 +126,8 @@ def tried(
         demands=d,
         hz=loop.hz,
         gains=gains(loop.plant, loop.controller),
-        margins=margins(run.plant, run.controller, loop.hz, loop.plant, loop.controller),
+        peaks=norms(closed),
+        margins=margins(lambda omega: responses(run.plant, run.controller, omega)[:2], loop.hz),
         noise=noise(closed, d.sensor, d.disturbance),
         statics=_statics(run),
         shift=shift_line(run, system, d.shift, quiet=quiet),
@@ -142,14 +150,15 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
     around = run.plant.grid * run.plant.omega_0 / HZ
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
-    G, K = run.sampled.responses(run.plant, HZ * hz)
+    respond = partial(run.sampled.responses, run.plant)
     profile = setpoint(d.limits)
     free, moves = _moves(run, profile, d)
     return Study(
         demands=d,
         hz=hz,
-        gains=gains(G, K),
-        margins=sampled_margins(hz, G, K),
+        gains=gains(*respond(HZ * hz)),
+        peaks=highest(lambda omega: gains(*respond(omega)), HZ * hz),
+        margins=margins(respond, hz),
         noise=None,
         statics=_statics(run),
         shift=shift_line(run, system, d.shift, quiet=quiet),
@@ -222,8 +231,8 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "all_inputs": _disk(found.margins.inputs),
         },
         "gains": {
-            name: {"peak": float(row.max()), "peak_hz": float(found.hz[row.argmax()])}
-            for name, row in zip(("S", "T", "GS", "KS"), found.gains, strict=True)
+            name: {"peak": peak, "peak_hz": omega / HZ}
+            for name, (peak, omega) in zip(("S", "T", "GS", "KS"), found.peaks, strict=True)
         },
         "static_stiffness": found.statics.stiffness,
         "static_compliance": found.statics.compliance,
@@ -278,6 +287,43 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "runs": [_move(move) for move in found.moves],
         },
     }
+
+
+def survival_line(run: FinishedRun, found: Study) -> VerdictLine:
+    """`survives` of the run's verdict: what the solve said, and what the study adds to it."""
+    before, hard, d = at_solve(run.result, "survives"), found.tolerances, found.demands
+    lost = sum(not item.stable for item in hard.judged)
+    said = []
+    low, high = found.shift.stable
+    ends = [f"below {100.0 * low:+.2g} %"] * (low > -d.shift)
+    ends += [f"above {100.0 * high:+.2g} %"] * (high < d.shift)
+    if ends:
+        said.append(f"unstable for resonance shifts {' and '.join(ends)}")
+    if lost or not hard.worst.stable:
+        of = f"{lost} of {len(hard.judged)} plants with hardware within +-{100 * d.tolerance:g} %"
+        said.append(f"{of} unstable{'' if lost else ', the worst that was searched is'}")
+    tried = (
+        f"shifts of +-{100 * d.shift:g} %, damping times {d.damping[0]:g} to {d.damping[1]:g}, "
+        f"hardware within +-{100 * d.tolerance:g} %"
+    )
+    words = f"robustness: stable on all plants tried ({tried})"
+    if not found.survives:
+        words = f"robustness: {'; '.join(said) or f'not stable on all plants tried ({tried})'}"
+    state = State(before.get("state", State.UNKNOWN))
+    if not found.survives and state is not State.FAILED:
+        state = State.WARNED
+    elif state is State.UNKNOWN:
+        state = State.PASSED
+    figures = {key: value for key, value in before.items() if key not in ("state", "words")}
+    figures["robustness"] = {
+        "stable_on_all": found.survives,
+        "stable_between": list(found.shift.stable),
+        "hardware": {
+            "tolerance": hard.tolerance, "plants": len(hard.judged), "unstable": lost,
+            "worst_stable": hard.worst.stable,
+        },
+    }  # fmt: skip
+    return VerdictLine(state, "; ".join(filter(None, (words, before.get("words")))), figures)
 
 
 def _disk(margin: DiskMargin) -> dict[str, float]:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from ccd_casadi.support.arrays import Array
 
+Responses = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
+
 HALVINGS = 48  # of a bracket between two points of the grid: to rounding
 
 
@@ -55,6 +57,33 @@ def classical_margins(
         phase_deg=float(np.degrees(np.minimum(lags, 2.0 * np.pi - lags)).min(initial=np.inf)),
         delay=float((lags / crossover).min(initial=np.inf)),
         crossover=float(crossover.min(initial=np.inf)),
+    )
+
+
+def loop_alone(L: NDArray[np.complex128], i: int) -> NDArray[np.complex128]:
+    """1/S_ii - 1 of S = (I + L)⁻¹, L (k, p, p): what channel i sees while the others are closed."""
+    S = np.linalg.inv(np.eye(L.shape[1]) + L)
+    return np.asarray(1.0 / S[:, i, i] - 1.0)
+
+
+def least_margins(respond: Responses, omega: Array) -> ClassicalMargins:
+    """The least of all loops broken one at a time at the plant's inputs."""
+
+    def broken(i: int) -> Callable[[Array], NDArray[np.complex128]]:
+        def L(at: Array) -> NDArray[np.complex128]:
+            G, K = respond(at)
+            return loop_alone(K @ G, i)
+
+        return L
+
+    inputs = respond(omega[:1])[0].shape[2]
+    each = [classical_margins(broken(i), omega) for i in range(inputs)]
+    return ClassicalMargins(
+        gain_down=max(m.gain_down for m in each),
+        gain_up=min(m.gain_up for m in each),
+        phase_deg=min(m.phase_deg for m in each),
+        delay=min(m.delay for m in each),
+        crossover=min(m.crossover for m in each),
     )
 
 
