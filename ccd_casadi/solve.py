@@ -193,6 +193,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
+    from ccd_casadi.support.units import counted
 
     case = load_case(options.case)
     problem = problem_of(case)
@@ -215,6 +216,9 @@ def command(options: argparse.Namespace) -> ExitCode:
             pool(options.scheduler, options.workers, PATIENCE) as workers,
             SampleStore(store) as samples,
         ):
+            if options.resume and not options.quiet:
+                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+                print(f"resuming      {store} holds {held}", file=sys.stderr)
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             formulation = formulation_of(case, options.formulation)
             solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
@@ -242,7 +246,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the samples in the run folder (every run does; kept for scripts)",
+        help="say what the run folder holds already; every run goes on from that",
     )
     arguments.add_argument(
         "--surrogate",
