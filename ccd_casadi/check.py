@@ -19,6 +19,7 @@ def text(found: dict[str, Any]) -> str:
         *(f"note          {words}" for words in found["notes"]),
         f"looked at     {found['points']} points: start, middle and corners of the bounds",
         f"start         {theta}",
+        f"in SI         {found['size']}",
         "",
         "  mode          Hz  damping   driven  measured   over the bounds",
     ]

@@ -146,6 +146,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.diagnosis import diagnose, first_seen
     from ccd_casadi.cases.findings import Severity, Topic
+    from ccd_casadi.cases.plant_report import size_words
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import SHIPPED
@@ -154,8 +155,9 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         for words in peak_words(problem.inner.S_max):
             print(f"warning: {words}", file=sys.stderr)
         return
-    found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
-    for item in found:
+    facts, findings = diagnose(problem, case.suspension.rigid_modes)
+    print(f"note: in SI, at the start: {size_words(facts[0])}", file=sys.stderr)
+    for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
             subject = "" if item.topic is Topic.UNITS else "plant: "
             print(f"{item.severity.value}: {subject}{item.words}", file=sys.stderr)

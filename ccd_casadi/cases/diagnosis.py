@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from ccd_casadi.cases.findings import Finding, Severity, Topic
-from ccd_casadi.cases.unit_findings import unit_findings
+from ccd_casadi.cases.unit_findings import entry_findings, unit_findings
 from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
@@ -102,6 +102,7 @@ def _diagnosed(
         findings += zero_findings(found, problem.inner.S_max, index, place)
         if index == 0:
             findings += unit_findings(problem, found, scaled)
+            findings += entry_findings(problem, system)
         facts.append(found)
     findings = most_limiting(findings)
     progress.advance()
