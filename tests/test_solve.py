@@ -182,7 +182,8 @@ def test_a_second_run_reuses_every_sample(
 
     monkeypatch.setattr(sampling, "inner_unit", untouchable)
     monkeypatch.setattr(sampling, "design_unit", untouchable)
-    assert run(folder, "--resume", "--no-report") == 0
+    words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--resume", "--no-report"]
+    assert main(words) == 0
     assert f"resuming      {folder / 'samples.sqlite'} holds " in capsys.readouterr().err
     after = read(folder)
     assert after.pop("seconds") < before.pop("seconds")
