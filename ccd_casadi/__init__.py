@@ -1,7 +1,7 @@
 """Control co-design of precision motion stages: a machine and its H∞ controller, certified.
 
 >>> import ccd_casadi as ccd
->>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+>>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
 >>> round(ccd.true_inner(problem, (60.0, 60.0)).bandwidth / ccd.HZ, 1)
 58.2
 
@@ -33,6 +33,7 @@ _PUBLIC = {
     "Sampling": "fixed_structure.hold_and_delay",
     "SectionsDesign": "fixed_structure.sections_design",
     "Solution": "codesign.solution",
+    "TWO_MASS": "cases.case",
     "StateSpace": "plants.scaling",
     "Structure": "fixed_structure.structure",
     "TrueQuantities": "inner_problem.true_function",

@@ -1,4 +1,5 @@
 # What ccd_casadi/__init__.py imports when it is first used, for editors and type checkers.
+from ccd_casadi.cases.case import TWO_MASS as TWO_MASS
 from ccd_casadi.cases.case import load_case as load_case
 from ccd_casadi.cases.case import parse_case as parse_case
 from ccd_casadi.cases.case_problem import problem_of as problem_of

@@ -24,7 +24,9 @@ COMMANDS = {
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
+    "imported": ("ccd_casadi.imported", "a modal table from result files; also: ccd import"),
 }
+ALIASES = {"import": "imported"}
 TEMPLATE = ("plant.py", "case.toml")
 SCHEMA = "case.schema.json"
 OWN = {
@@ -37,8 +39,9 @@ OWN = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word names; without one, say what there is to do here."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if words and words[0] in COMMANDS:
-        return int(import_module(COMMANDS[words[0]][0]).main(words[1:]))
+    named = ALIASES.get(words[0], words[0]) if words else ""
+    if named in COMMANDS:
+        return int(import_module(COMMANDS[named][0]).main(words[1:]))
     begun()
     if not words or words in (["--help"], ["-h"], ["help"]):
         print(overview(Path()))

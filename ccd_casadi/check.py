@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from ccd_casadi.support.command_line import ExitCode, parser, run
+from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 
 
 def text(found: dict[str, Any]) -> str:
@@ -19,6 +19,7 @@ def text(found: dict[str, Any]) -> str:
         *(f"note          {words}" for words in found["notes"]),
         f"looked at     {found['points']} points: start, middle and corners of the bounds",
         f"start         {theta}",
+        f"in SI         {found['size']}",
         "",
         "  mode          Hz  damping   driven  measured   over the bounds",
     ]
@@ -62,17 +63,21 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.diagnosis import diagnose
     from ccd_casadi.cases.findings import Severity
     from ccd_casadi.cases.plant_report import plant_report
-    from ccd_casadi.support.json_files import clean
+    from ccd_casadi.support.json_files import clean, write_json
 
     case = load_case(options.case)
     problem = problem_of(case)
-    facts, findings = diagnose(problem, case.suspension.rigid_modes, options.quiet)
+    facts, findings = diagnose(
+        problem, case.suspension.rigid_modes, options.quiet, options.seed
+    )
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
         print(f"{options.case}: plant: {item.words}", file=sys.stderr)
     if errors:
         return ExitCode.BAD_INPUT
     found = clean(plant_report(case, problem, facts, findings))
+    if options.out is not None:
+        write_json(run_folder(options.case, options.out) / "check.json", found)
     print(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
     return ExitCode.DONE
 

@@ -154,6 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser(
         "ccd_casadi.cross_check",
         "One synthesis by every back end; CASE.toml may also be the folder of a finished solve.",
+        without_effect=["--seed"],
     )
     arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
     for name in ("S", "T"):

@@ -26,9 +26,14 @@ def command(options: argparse.Namespace) -> ExitCode:
     beside = place.with_name(f"{place.stem}_explored.toml")
     folder = run_folder(beside, place if finished is not None and not options.out else options.out)
     session = Session(case, folder, finished)
-    explorer = Explorer(session, workers=options.workers, user_code=not options.no_user_code)
-    print(f"explorer      {explorer.url}", flush=True)
-    print(f"folder        {folder} (samples.sqlite, saved cases); Ctrl-C ends it", flush=True)
+    explorer = Explorer(
+        session, workers=options.workers, seed=options.seed, user_code=not options.no_user_code
+    )
+    if options.quiet:
+        print(explorer.url, flush=True)
+    else:
+        print(f"explorer      {explorer.url}", flush=True)
+        print(f"folder        {folder} (samples.sqlite, saved cases); Ctrl-C ends it", flush=True)
     try:
         explorer.run(show=not options.no_open)
     except KeyboardInterrupt:

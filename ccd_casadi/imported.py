@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, run, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
+from surrogates.options import whole
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.plants.imported.modal_table import ModalTable
@@ -55,8 +56,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "A modal table from result files or matrices; see docs/own_finite_elements.md.",
         metavar="FOLDER",
         about="the folder with index.csv and dofs.csv",
+        without_effect=["--workers", "--seed", "--no-user-code"],
     )
-    arguments.add_argument("--modes", type=int, default=10, metavar="N", help="of matrices: 10")
+    arguments.add_argument(
+        "--modes", type=whole(1), default=10, metavar="N", help="of matrices: 10"
+    )
     arguments.add_argument(
         "--static-correction", action="store_true", help="of matrices: exact static compliance"
     )

@@ -152,6 +152,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.diagnosis import diagnose, first_seen
     from ccd_casadi.cases.findings import Severity, Topic
+    from ccd_casadi.cases.plant_report import size_words
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import SHIPPED
@@ -160,8 +161,9 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
         for words in peak_words(problem.inner.S_max):
             print(f"warning: {words}", file=sys.stderr)
         return
-    found = first_seen(diagnose(problem, case.suspension.rigid_modes)[1])
-    for item in found:
+    facts, findings = diagnose(problem, case.suspension.rigid_modes)
+    print(f"note: in SI, at the start: {size_words(facts[0])}", file=sys.stderr)
+    for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
             subject = "" if item.topic is Topic.UNITS else "plant: "
             print(f"{item.severity.value}: {subject}{item.words}", file=sys.stderr)
@@ -199,6 +201,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
+    from ccd_casadi.support.units import counted
 
     case = load_case(options.case)
     problem = problem_of(case)
@@ -226,6 +229,9 @@ def command(options: argparse.Namespace) -> ExitCode:
             pool(options.scheduler, options.workers, PATIENCE) as workers,
             SampleStore(store) as samples,
         ):
+            if options.resume and not options.quiet:
+                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+                print(f"resuming      {store} holds {held}", file=sys.stderr)
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
             write_run(folder, case, solution)
@@ -254,7 +260,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the samples in the run folder (every run does; kept for scripts)",
+        help="say what the run folder holds already; every run goes on from that",
     )
     arguments.add_argument(
         "--surrogate",

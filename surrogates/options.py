@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 from collections.abc import Callable
 from enum import IntEnum
 from typing import NoReturn
@@ -25,6 +26,11 @@ def one_line(value: object) -> str:
     if len(words) > LONGEST:
         words = f"{words[: LONGEST - 200]} ... {words[-150:]}"
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in words)
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Parser(argparse.ArgumentParser):

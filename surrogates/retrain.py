@@ -1,7 +1,6 @@
 """`python -m surrogates.retrain RUN_DIR`: new truth where it helps the optimum most, then refit."""
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 from surrogates.files import copy_run
 from surrogates.interface import SurrogateFitError
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
-from surrogates.options import ExitCode, Parser, number, one_line, whole
+from surrogates.options import ExitCode, Parser, number, one_line, usable_cores, whole
 from surrogates.retraining import Settings, retrain
 from surrogates.serialise import SurrogateFileError
 from surrogates.truth import TruthError, TruthInterrupted, opener_of
@@ -25,7 +24,7 @@ CODES = {
 def parser() -> argparse.ArgumentParser:
     """The command's options."""
     result = Parser(prog="python -m surrogates.retrain", description=__doc__)
-    default, cores = Settings(), len(os.sched_getaffinity(0))
+    default = Settings()
     add = result.add_argument
     add("run", metavar="RUN_DIR", type=Path, help="the run folder")
     add("--out", metavar="DIR", type=Path,
@@ -38,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
         help="points a round (default: %(default)s)")  # fmt: skip
     add("--explore", metavar="SHARE", type=number(0.0, 1.0), default=default.explore,
         help="share of a batch at the largest deviation (default: %(default)s)")  # fmt: skip
-    add("--workers", metavar="N", type=whole(1), default=cores,
+    add("--workers", metavar="N", type=whole(1), default=usable_cores(),
         help="worker processes (default: all cores)")  # fmt: skip
     add("--scheduler", metavar="ADDRESS",
         help="evaluate on the cluster at tcp://host:port, if the truth knows clusters; --workers "

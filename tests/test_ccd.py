@@ -1,18 +1,23 @@
 """`ccd`: one name for every command, and a stage to begin with."""
 
+import argparse
 import json
+import re
 import tomllib
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import jsonschema
 import pytest
 
-from ccd_casadi.__main__ import COMMANDS, OWN, main, overview
+from ccd_casadi.__main__ import ALIASES, COMMANDS, OWN, main, overview
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.robust import demands
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -20,9 +25,43 @@ ROOT = Path(__file__).resolve().parent.parent
 def test_every_word_has_a_command_and_the_entry_point_is_there() -> None:
     for module, _ in COMMANDS.values():
         assert callable(import_module(module).main)
+    every = [*(ROOT / "ccd_casadi").glob("*.py"), *(ROOT / "surrogates").glob("*.py")]
+    commands = {f"{p.parent.name}.{p.stem}" for p in every if "def main(" in p.read_text()}
+    assert commands - {"ccd_casadi.__main__"} == {module for module, _ in COMMANDS.values()}
+    assert set(ALIASES.values()) <= set(COMMANDS)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     module, _, name = project["scripts"]["ccd"].partition(":")
     assert getattr(import_module(module), name) is main
+
+
+def options_read(module: ModuleType) -> set[str]:
+    """The options that a command's module reads, and those that `run` and its helpers read."""
+    text = Path(str(module.__file__)).read_text()
+    shared = ROOT / "ccd_casadi" / "support" / "command_line.py"
+    found = set(re.findall(r"\boptions\.(\w+)", text + shared.read_text()))
+    if "move_limits(options)" in text:
+        found |= {name for name, _, _ in demands._MOVE}
+    return found
+
+
+@pytest.mark.parametrize("word", COMMANDS)
+def test_an_option_in_the_help_is_read(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = import_module(COMMANDS[word][0])
+    asked: list[argparse.ArgumentParser] = []
+    if word == "retrain":  # of another package, with a parser of its own
+        asked.append(module.parser())
+    else:
+
+        def note(command: object, arguments: Any, *_: object, **__: object) -> int:
+            asked.append(arguments)
+            return 0
+
+        monkeypatch.setattr(module, "run", note)
+        module.main([])
+    told = {
+        action.dest for action in asked[0]._actions if action.help != argparse.SUPPRESS
+    } - {"help", "workers", "no_user_code"}
+    assert told - options_read(module) == set()
 
 
 def test_a_new_stage_is_a_case_that_can_be_solved(
@@ -55,6 +94,21 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
 def test_a_wrong_word_is_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("word", ["imported", "import"])
+@pytest.mark.parametrize("modes", ["0", "-3", "1.5"])
+def test_the_modes_of_an_import_are_counted(
+    word: str, modes: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([word, "fe", f"--modes={modes}"]) == 2
+    assert "argument --modes: " in capsys.readouterr().err
+
+
+def test_check_writes_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    case = str(ROOT / "runs/two_mass.toml")
+    assert main(["check", case, "--json", "--quiet", "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "check.json").read_text()) == json.loads(capsys.readouterr().out)
 
 
 def test_alone_it_says_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:

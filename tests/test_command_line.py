@@ -11,7 +11,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.process_pool import usable_cores
+from surrogates.options import usable_cores
 
 COMMAND = """
 import sys
@@ -128,12 +128,6 @@ def test_help_is_no_failure(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     for word in ("python -m a.command", "what it does", "--out", "--workers", "--seed", "--quiet"):
         assert word in text
-
-
-def test_a_required_case_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = parser("a.command", "what it does", case_required=True)
-    assert run(never, arguments, []) == ExitCode.BAD_INPUT
-    assert "CASE.toml" in capsys.readouterr().err
 
 
 def test_a_users_mistake_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,6 +15,7 @@ from ccd_casadi.check import main as check
 from ccd_casadi.plants.facts import Zero
 from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
 from ccd_casadi.solve import main as solve
+from ccd_casadi.solve import show_findings
 
 ROOT = Path(__file__).parent.parent
 GOOD = (
@@ -219,6 +220,44 @@ def test_a_stiffness_in_newton_per_micrometre_is_told(
     path = case_file(tmp_path, GOOD.replace("2e8 * chain", "200.0 * chain"))
     assert check([str(path)]) == 0
     assert "is the stiffness in another unit?" in capsys.readouterr().out
+
+
+GRAMS = GOOD.replace("vertcat(m1, m2)", "vertcat(1e3 * m1, 1e3 * m2)")
+
+
+@pytest.mark.parametrize(
+    ("result", "unit", "words"),
+    [
+        (GOOD, "kg", ""),
+        (GOOD.replace("vertcat(m1, m2)", "vertcat(2.5 * m1, m2)"), "kg", ""),  # an idler
+        (GOOD.replace("vertcat(m1, m2)", "vertcat(1e-3 * m1, 1e-3 * m2)"), "g", ""),
+        (GOOD, "mm", ""),
+        (GRAMS, "kg", "theta.m1 is in kg, and mass grows by 1000 with each, where 1 is meant"),
+        (GOOD, "g", "theta.m1 is in g, and mass grows by 1 with each, where 0.001 is meant"),
+        (GOOD.replace("2e8", "1e3 * m1"), "N/mm", ""),
+        (GOOD.replace("2e8", "m1"), "N/mm", "and stiffness grows by 1 with each, where 1000 is"),
+    ],
+)
+def test_a_matrix_in_the_unit_of_its_parameter_is_told(
+    tmp_path: Path, result: str, unit: str, words: str
+) -> None:
+    path = case_file(tmp_path, result)
+    path.write_text(path.read_text().replace('unit = "kg"', f'unit = "{unit}"'))
+    found = [f.words for f in diagnose(problem_of(load_case(path)))[1] if "theta." in f.words]
+    assert bool(found) == bool(words)
+    assert words in "".join(found)
+
+
+def test_every_solve_of_an_own_plant_says_how_large_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = load_case(case_file(tmp_path, GOOD))
+    show_findings(case, problem_of(case))
+    line = capsys.readouterr().err.splitlines()[0].removeprefix("note: in SI, at the start: ")
+    moved, *words = line.split(", ")
+    assert moved == "an actuator moves 135 kg (kg m2 by a torque)"
+    assert words[0].startswith("the first resonance is at ")
+    assert words[1].startswith("M_K suits a bandwidth of ")
 
 
 def test_constraints_are_shown_with_what_their_sign_means(

@@ -294,7 +294,7 @@ def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
         codes.append(code)
         over.set()
 
-    solve = Solve(tmp_path / "none.toml", tmp_path / "out", 1, said.append, ended)
+    solve = Solve(tmp_path / "none.toml", tmp_path / "out", ["--workers", "1"], said.append, ended)
     assert over.wait(300.0)
     assert codes == [2]
     assert "none.toml: there is no such file" in said[0]

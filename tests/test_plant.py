@@ -310,7 +310,9 @@ def model_of(changes: dict, drop: tuple[str, ...] = ()):
         ({"stiffness": np.eye(3)}, (), "stiffness is (3, 3), the mass matrix (2, 2)"),
         ({"mass": np.ones((2, 3))}, (), "mass is (2, 3)"),
         ({"input": np.ones((3, 1))}, (), "input is (3, 1)"),
-        ({"output": np.ones((1, 3))}, (), "output (1, 3)"),
+        ({"output": np.ones((1, 3))}, (), "output is (1, 3); expected (p, 2), a row a sensor"),
+        ({"output": np.ones((2, 1))}, (), "as mass is (2, 2): transpose it"),
+        ({"input": np.ones((1, 2))}, (), "input is (1, 2); expected (2, m), a column a force"),
         ({"damping_ratio": 1.5}, (), "damping_ratio is 1.5; give a number between 0 and 1"),
         ({"damping_ratio": -0.1}, (), "damping_ratio is -0.1"),
     ],
@@ -335,6 +337,9 @@ def test_unknown_option_and_missing_theta_are_named() -> None:
         ({}, -1.0, "mass is not positive definite at theta = t=-1"),
         ({}, np.inf, "not finite at theta = t=inf"),
         ({"stiffness": np.full((2, 2), np.nan)}, 2.0, "not finite at theta = t=2"),
+        ({"stiffness": np.diag([1.0, np.nan])}, 2.0, r"stiffness is nan in row 2, column 2; keep"),
+        ({"input": np.array([[0.0], [np.inf]])}, 2.0, "input is inf in row 2, column 1; keep"),
+        ({"output": np.array([[0.0, 1e300]])}, 2.0, "output is 1e.300 in row 1, column 2; choose"),
         ({"stiffness": np.diag([1.0, -0.1])}, 1.0, "negative eigenvalue"),
         ({"input": np.zeros((2, 1))}, 1.0, "input or output is zero"),
         ({"output": np.zeros((1, 2))}, 1.0, "input or output is zero"),
@@ -344,6 +349,17 @@ def test_wrong_matrices_are_named_at_theta(changes, theta: float, words: str) ->
     plant = build_plant(model_of(changes), ["t"], {})
     with pytest.raises(PlantError, match=words):
         scale_plant(modal_plant(mechanics(plant, [theta]), Suspension()), 1e3)
+
+
+def test_a_slope_that_is_not_finite_is_named() -> None:
+    def model(theta: dict) -> dict:
+        K = ca.diag(ca.vertcat(1.0, ca.sqrt(theta["t"] - 1.0)))
+        return model_of({})(theta) | {"stiffness": K}
+
+    plant = build_plant(model, ["t"], {})
+    words = "derivative of stiffness to t is inf in row 2, column 2; its value is finite"
+    with pytest.raises(PlantError, match=words):
+        mechanics(plant, [1.0])
 
 
 def test_good_plant_of_the_bad_ones_is_accepted() -> None:

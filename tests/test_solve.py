@@ -171,7 +171,10 @@ def test_a_run_without_a_report_has_everything_else(
 
 
 def test_a_second_run_reuses_every_sample(
-    solved: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    solved: Callable[[str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = Path(shutil.copytree(solved("nested"), tmp_path / "run"))
     before = read(folder)
@@ -181,7 +184,9 @@ def test_a_second_run_reuses_every_sample(
 
     monkeypatch.setattr(sampling, "inner_unit", untouchable)
     monkeypatch.setattr(sampling, "design_unit", untouchable)
-    assert run(folder, "--resume", "--no-report") == 0
+    words = [str(TWO_MASS), "--out", str(folder), "--workers", "1", "--resume", "--no-report"]
+    assert main(words) == 0
+    assert f"resuming      {folder / 'samples.sqlite'} holds " in capsys.readouterr().err
     after = read(folder)
     assert after.pop("seconds") < before.pop("seconds")
     assert after == before

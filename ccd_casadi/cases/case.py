@@ -18,6 +18,7 @@ from ccd_casadi.cases.sections import SECTIONS, Case
 from ccd_casadi.support.errors import UserError
 from surrogates.options import one_line
 
+TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named
 EXAMPLE = "python -m ccd_casadi.solve my_case.toml (docs/tutorial.md writes one)"
 
@@ -46,7 +47,7 @@ _PER_CHANNEL = (
 def load_case(path: str | Path) -> Case:
     """Read and check a case file. Raises CaseError on the first mistake.
 
-    >>> load_case("runs/two_mass.toml").theta[0].table
+    >>> load_case(TWO_MASS).theta[0].table
     {'lower': 55.0, 'upper': 70.0, 'start': 67.56, 'unit': 'kg'}
     """
     path = Path(path)

@@ -26,8 +26,8 @@ def problem_of(case: Case) -> CoDesignProblem:
     The plant is made once here, and one of the user's own is looked at over its box. Raises
     CaseError where it is none.
 
-    >>> from ccd_casadi.cases.case import load_case
-    >>> problem = problem_of(load_case("runs/two_mass.toml"))
+    >>> from ccd_casadi.cases.case import TWO_MASS, load_case
+    >>> problem = problem_of(load_case(TWO_MASS))
     >>> problem.names, problem.w2, round(problem.inner.omega_low, 3)
     (('m1', 'm2'), -0.995, 6.283)
     """

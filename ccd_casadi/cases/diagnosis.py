@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 
 from ccd_casadi.cases.findings import Finding, Severity, Topic
-from ccd_casadi.cases.unit_findings import unit_findings
+from ccd_casadi.cases.unit_findings import entry_findings, unit_findings
 from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
@@ -28,21 +28,24 @@ HIDDEN = 1e-6  # a mode whose gain is below this share of the largest is not dri
 COUPLED = 1e-9  # a share of the modes' own damping above which a damper connects modes
 
 
-def points_to_check(problem: CoDesignProblem) -> list[tuple[float, ...]]:
-    """Start, middle, and the corners of the box, of which at most 16 (drawn with a fixed seed)."""
+def points_to_check(problem: CoDesignProblem, seed: int = 0) -> list[tuple[float, ...]]:
+    """Start, middle, and the corners of the box, of which at most 16 (of more they are drawn)."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     n = len(lower)
     if n <= np.log2(MAX_CORNERS):
         sides = np.array(list(product((0.0, 1.0), repeat=n)))
     else:
-        sides = np.random.default_rng(0).integers(0, 2, (MAX_CORNERS, n)).astype(float)
+        sides = np.random.default_rng(seed).integers(0, 2, (MAX_CORNERS, n)).astype(float)
     corners = lower + (upper - lower) * sides
     rows = [problem.start, 0.5 * (lower + upper), *corners]
     return list(dict.fromkeys(tuple(float(value) for value in row) for row in rows))
 
 
 def diagnose(
-    problem: CoDesignProblem, rigid_modes: int | None = None, quiet: bool = True
+    problem: CoDesignProblem,
+    rigid_modes: int | None = None,
+    quiet: bool = True,
+    seed: int = 0,
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
 
@@ -50,7 +53,7 @@ def diagnose(
     `points_to_check`; asked again, they are not computed again. Raises PlantError where the
     model's function fails.
     """
-    return _diagnosed(problem, rigid_modes, _Quiet(quiet))
+    return _diagnosed(problem, rigid_modes, _Quiet(quiet), seed)
 
 
 class _Quiet:
@@ -68,14 +71,14 @@ class _Quiet:
 
 @lru_cache(maxsize=4)
 def _diagnosed(
-    problem: CoDesignProblem, rigid_modes: int | None, quiet: _Quiet
+    problem: CoDesignProblem, rigid_modes: int | None, quiet: _Quiet, seed: int
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     plant = plant_of(problem)
     facts: list[PlantFacts] = []
     findings = list(_outside(problem, plant))
     if findings:
         return (), tuple(findings)
-    points = points_to_check(problem)
+    points = points_to_check(problem, seed)
     progress = Progress(len(points), "looking at the plant", quiet=quiet.yes)
     for index, theta in enumerate(points):
         progress.advance(int(index > 0))
@@ -99,6 +102,7 @@ def _diagnosed(
         findings += zero_findings(found, problem.inner.S_max, index, place)
         if index == 0:
             findings += unit_findings(problem, found, scaled)
+            findings += entry_findings(problem, system)
         facts.append(found)
     findings = most_limiting(findings)
     progress.advance()

@@ -34,6 +34,8 @@ def plant_report(
         "notes": list(plant.notes(problem.start)),
         "theta": dict(zip(problem.names, problem.start, strict=True)),
         "points": len(facts),
+        "size": size_words(start),
+        "inertia": start.inertia,
         "rigid_modes": sum(mode.rigid for mode in start.modes),
         "modes": [asdict(mode) for mode in start.modes],
         "frequency_ranges_hz": ranges,
@@ -54,6 +56,19 @@ def plant_report(
             for f in first_seen(findings)
         ],
     }
+
+
+def size_words(facts: PlantFacts) -> str:
+    """How large the plant is: what shows at a glance that numbers are not in SI."""
+    parts = []
+    if math.isfinite(facts.inertia):
+        parts.append(f"an actuator moves {facts.inertia:.3g} kg (kg m2 by a torque)")
+    flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
+    parts += [f"the first resonance is at {flexible[0]:.3g} Hz"] if flexible else []
+    if math.isfinite(facts.effort_hz):
+        low, high = (share * facts.effort_hz for share in WINDOW)
+        parts.append(f"M_K suits a bandwidth of {low:.2g} to {high:.2g} Hz")
+    return ", ".join(parts)
 
 
 def _sources(problem: CoDesignProblem) -> list[dict[str, Any]]:

@@ -9,11 +9,16 @@ import numpy as np
 from ccd_casadi.cases.findings import Finding, Severity, Topic
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.facts import PlantFacts
+from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 
 FAR = 3.0  # how far outside the frequencies that [inner] searches effort may end
 DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
+# in SI, by how a person writes them
+MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
+STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, "N/mm": 1e3,
+             "N/m": 1.0}  # fmt: skip
 SI = "all values are taken in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
 
 
@@ -25,6 +30,32 @@ def unit_findings(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlan
         *peak_words(problem.inner.S_max),
     ]
     return [Finding(Severity.WARNING, Topic.UNITS, item, 0) for item in words]
+
+
+def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:
+    """Warnings of a θ in a unit of mass or stiffness that stands in the matrix in that unit.
+
+    The entries' slopes tell: of a mass in g that is told in kg they are 0.001.
+    """
+    found = []
+    for key, units, slopes in (
+        ("mass", MASS, system.derivatives[0]),
+        ("stiffness", STIFFNESS, system.derivatives[2]),
+    ):
+        for name, unit, slope in zip(problem.names, problem.units, slopes, strict=True):
+            entries = np.abs(slope[np.abs(slope) > 1e-6 * np.abs(slope).max(initial=0.0)])
+            if unit not in units or not entries.size:
+                continue
+            powers = np.log10(entries / units[unit]) / 3.0
+            times = round(float(powers[0]))
+            if times == 0 or not np.allclose(powers, times, atol=1e-4):
+                continue
+            words = (
+                f"theta.{name} is in {unit}, and {key} grows by {entries[0]:.4g} with each, where "
+                f"{units[unit]:g} is meant: is the matrix in another unit? {SI}"
+            )
+            found.append(Finding(Severity.WARNING, Topic.UNITS, words, 0))
+    return found
 
 
 def _searched(problem: CoDesignProblem) -> tuple[float, float]:

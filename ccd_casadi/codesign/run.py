@@ -57,7 +57,7 @@ def solve(
     Solution with `verified` None.
 
     >>> import ccd_casadi as ccd
-    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> solution = ccd.solve(problem, ccd.Lifted(points=24, box_points=4))
     >>> solution.result["status"], [round(v, 3) for v in solution.verified.theta]
     ('verified', [55.0, 55.0])

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -148,13 +148,13 @@ class Solve:
     """`python -m ccd_casadi.solve` of a case, in a process of its own, into a folder."""
 
     def __init__(
-        self, case: Path, folder: Path, workers: int, tell: Callable[[str], None],
+        self, case: Path, folder: Path, options: Sequence[str], tell: Callable[[str], None],
         ended: Callable[[int], None],
     ) -> None:  # fmt: skip
         """`tell` is given every line, `ended` the exit code, both in another thread."""
         command = [sys.executable, "-m", "ccd_casadi.solve", str(case), "--out", str(folder)]
         self._process = subprocess.Popen(
-            [*command, "--workers", str(workers)],
+            [*command, *options],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
             text=True, encoding="utf-8", errors="replace",
         )  # fmt: skip

@@ -9,6 +9,7 @@ from bokeh.models.widgets.sliders import RangeSlider, Slider
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.reporting.units import shown_unit
 
 STEPS = 1000  # of a slider of θ
 WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case
@@ -16,24 +17,15 @@ DARK = ".bk-input { background-color: #2b3238; color: #e0e0e0; }"  # the theme i
 STRUCTURES: tuple[Any, ...] = ("h_infinity", "h_infinity_disturbance", "sections")
 
 
-def shown_unit(unit: str) -> tuple[float, str]:
-    """Factor and name of the unit that a parameter of this unit is shown in.
-
-    >>> shown_unit("m"), shown_unit("kg")
-    ((1000.0, 'mm'), (1.0, 'kg'))
-    """
-    return (1e3, "mm") if unit == "m" else (1.0, unit)
-
-
 class Controls:
     """Widgets for all that `Knobs` says; `changed` is called with True when one is let go."""
 
     def __init__(self, case: Case, start: Knobs, changed: Any, dark: bool) -> None:
-        self._scale = [shown_unit(p.unit)[0] for p in case.theta]
+        units = [shown_unit(p.unit, p.upper) for p in case.theta]
+        self._scale = [factor for _, factor in units]
         self._start, self._theta = start, []
         self.quiet = False  # while they are set from here
-        for p, k, value in zip(case.theta, self._scale, start.theta, strict=True):
-            unit = shown_unit(p.unit)[1]
+        for p, (unit, k), value in zip(case.theta, units, start.theta, strict=True):
             self._theta.append(Slider(
                 name=f"theta_{p.name}", title=f"{p.name} ({unit})" if unit else p.name,
                 start=k * p.lower, end=k * p.upper, step=k * (p.upper - p.lower) / STEPS,

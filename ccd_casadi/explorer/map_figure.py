@@ -11,11 +11,12 @@ from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
 from ccd_casadi.cases.sections import Parameter
-from ccd_casadi.explorer.controls import DARK, shown_unit
+from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import GREY, ORANGE
+from ccd_casadi.reporting.units import shown_unit
 
 HEIGHT = 280
 MARGIN = 0.03  # of the box
@@ -28,7 +29,7 @@ class MapFigure:
         self, parameters: Sequence[Parameter], asked: Callable[[], None], dark: bool
     ) -> None:
         self.names: list[Any] = [parameter.name for parameter in parameters]
-        self._units = [shown_unit(parameter.unit) for parameter in parameters]
+        self._units = [shown_unit(item.unit, item.upper) for item in parameters]
         self._selects = [
             Select(name=f"axis_{i}", title=title, options=self.names, width=120,
                    stylesheets=[DARK] if dark else [],
@@ -73,7 +74,7 @@ class MapFigure:
 
     def _scales(self) -> tuple[float, float]:
         i, j = self.axes
-        return self._units[i][0], self._units[j][0]
+        return self._units[i][1], self._units[j][1]
 
     def show(self, found: Field) -> None:
         """The landscape over the parameters chosen."""
@@ -93,6 +94,6 @@ class MapFigure:
         for axis, low, high in ((self._x, x0, x1), (self._y, y0, y1)):
             margin = MARGIN * (high - low)
             axis.update(start=low - margin, end=high + margin)
-        labels = [f"{self.names[i]} ({self._units[i][1]})".replace(" ()", "") for i in self.axes]
+        labels = [f"{self.names[i]} ({self._units[i][0]})".replace(" ()", "") for i in self.axes]
         self._figure.xaxis.axis_label, self._figure.yaxis.axis_label = labels
         self._words.text = f"<p>{escape(found.words)}</p>"

@@ -1,7 +1,7 @@
 """One browser page: sliders, figures and buttons over a session; an answer to every drag."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from bokeh.document import Document
@@ -39,10 +39,11 @@ class Page:
     """The widgets of one document, and what happens when one is moved."""
 
     def __init__(
-        self, document: Document, session: Session, background: Background, workers: int, dark: bool
-    ) -> None:
+        self, document: Document, session: Session, background: Background,
+        of_solves: Sequence[str], dark: bool,
+    ) -> None:  # fmt: skip
         self.document, self.session, self.background = document, session, background
-        self.workers = workers
+        self._of_solves = of_solves  # their options
         parameters = session.case.theta
         self.figures = Figures(dark)
         self.controls = Controls(session.case, session.start, self.moved, dark)
@@ -287,7 +288,7 @@ class Page:
         self._output, self._solved = [f"solving into {folder}"], folder
         self.solve_button.disabled, self.stop.disabled = True, False
         said, ended = self._then(self._said), self._then(self._ended)
-        self.solve = Solve(case, folder, self.workers, said, ended)
+        self.solve = Solve(case, folder, self._of_solves, said, ended)
         self._said("")
 
     def stop_solve(self) -> None:

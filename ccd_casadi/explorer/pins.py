@@ -7,9 +7,9 @@ from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.tables import DataTable, NumberFormatter, TableColumn
 
 from ccd_casadi.cases.sections import Parameter
-from ccd_casadi.explorer.controls import shown_unit
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.words import pin_columns
+from ccd_casadi.reporting.units import shown_unit
 
 HEIGHT = 150
 
@@ -19,14 +19,14 @@ class Pins:
 
     def __init__(self, parameters: Sequence[Parameter], figures: Figures) -> None:
         self.names, self.figures = [p.name for p in parameters], figures
-        units = [shown_unit(p.unit) for p in parameters]
-        self._scales = [scale for scale, _ in units]
+        units = [shown_unit(p.unit, p.upper) for p in parameters]
+        self._scales = [scale for _, scale in units]
         self.pinned: list[tuple[str, Drawn]] = []
         self.count = 0
         self.source = ColumnDataSource(pin_columns(self.names, self._scales, []))
         thetas = [
             (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000")
-            for name, (_, unit) in zip(self.names, units, strict=True)
+            for name, (unit, _) in zip(self.names, units, strict=True)
         ]
         heads = [("design", "design", ""), *thetas,
                  ("S_max", "S_max", "0.000"), ("bandwidth", "ω_b (Hz)", "0.0000"),

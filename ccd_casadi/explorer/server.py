@@ -34,11 +34,13 @@ def _require_event_loop() -> None:
 class Explorer:
     """Serves a session until `stop`; `url` has the token, without which every path is refused."""
 
-    def __init__(self, session: Session, *, workers: int, user_code: bool = True) -> None:
+    def __init__(
+        self, session: Session, *, workers: int, seed: int = 0, user_code: bool = True
+    ) -> None:
         self.session = session
         self.background = Background(workers, user_code)
         self._pages: list[Page] = []
-        self._workers = workers
+        self._of_solves = ("--workers", str(workers), "--seed", str(seed))
         _require_event_loop()
         token = secrets.token_urlsafe(16)
         # a page from here may not link to a file of the disk
@@ -72,7 +74,7 @@ class Explorer:
         document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
         document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
         document.theme = "dark_minimal" if dark else "light_minimal"
-        page = Page(document, self.session, self.background, self._workers, dark)
+        page = Page(document, self.session, self.background, self._of_solves, dark)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._gone(page))
 

@@ -35,7 +35,7 @@ class CoDesignProblem(Shown):
 
     >>> import ccd_casadi as ccd
     >>> from dataclasses import replace
-    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> heavier = replace(problem, lower=(60.0, 60.0), start=(65.0, 65.0))
     """
 
@@ -116,7 +116,7 @@ def scaled_plant(problem: CoDesignProblem, theta: Sequence[float]) -> ScaledPlan
     Raises PlantError where the model is no plant at θ.
 
     >>> import ccd_casadi as ccd
-    >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> plant = ccd.scaled_plant(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)), (60.0, 60.0))
     >>> round(float(plant.natural[-1]) / ccd.HZ, 1), plant.A.shape
     (209.2, (4, 4))
     """
@@ -161,7 +161,7 @@ def true_inner(problem: CoDesignProblem, theta: Sequence[float]) -> InnerResult:
     is a result without `optimum` that says what falls short.
 
     >>> import ccd_casadi as ccd
-    >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case("runs/two_mass.toml")), (60.0, 60.0))
+    >>> best = ccd.true_inner(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)), (60.0, 60.0))
     >>> round(best.bandwidth / ccd.HZ, 2), best.active
     (58.23, ('S_max', 'omega_T lower'))
     """
@@ -194,7 +194,7 @@ def true_design(
     Raises ValueError where the problem leaves open what plant the controller is made on.
 
     >>> import ccd_casadi as ccd
-    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> made = ccd.true_design(problem, (60.0, 60.0), 800.0 * ccd.HZ, 40.0 * ccd.HZ)
     >>> made.figures.certified, (made.to_theta[0] / ccd.HZ).round(3).tolist()  # dω_b/dm, Hz/kg
     (True, [-0.21, -0.138])

@@ -27,7 +27,7 @@ class TrueQuantities(VectorCallback):
 
     >>> import ccd_casadi as ccd
     >>> import numpy as np
-    >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case("runs/two_mass.toml")))
+    >>> quantities = ccd.TrueQuantities(ccd.problem_of(ccd.load_case(ccd.TWO_MASS)))
     >>> x = [60.0, 60.0, *np.log([800.0 * ccd.HZ, 40.0 * ccd.HZ])]
     >>> round(float(quantities(x)[0]) / ccd.HZ, 2)
     55.66

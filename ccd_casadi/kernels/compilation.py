@@ -26,6 +26,7 @@ from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
 from ccd_casadi.support.progress import Progress
+from surrogates.options import usable_cores
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate")
@@ -99,7 +100,7 @@ def ensure_compiled() -> None:
     with _alone(folder / "compiled.lock"):
         if _read(stamp) == _state():  # another process has done it
             return
-        count = min(len(PARTS), _cores())
+        count = min(len(PARTS), usable_cores())
         _say(
             "ccd_casadi: compiling its numerical kernels, once for this installation and processor:"
             f" about {SECONDS / count:.0f} s on {count} core{'s' if count > 1 else ''}"
@@ -201,13 +202,6 @@ def _read(file: Path) -> str:
         return file.read_text()
     except OSError:
         return ""
-
-
-def _cores() -> int:
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on this system
-        return os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ the Woodbury identity, so the same code solves one symmetry or the direct sum of
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import sparse
@@ -15,6 +16,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.threads import OwnThreads
 
 
 class StageError(UserError):
@@ -44,18 +46,16 @@ def build_pencil(
     points diag(added) pointsᵀ.
     """
     # A is symmetric positive definite: pivots from the diagonal, and its transpose is itself in CSC
+    how = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0}
     factors = [
-        splu(
-            A.T, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        for A in shifted
+        OwnThreads(partial(splu, A.T, **how, options={"SymmetricMode": True})) for A in shifted
     ]
     cuts = np.cumsum([A.shape[0] for A in shifted])
     M_body = sparse.block_diag(masses, format="csr") if len(masses) > 1 else masses[0]
 
     def bodies(x: Array) -> Array:
         parts = np.split(np.ascontiguousarray(x), cuts[:-1])
-        return np.concatenate([f.solve(p) for f, p in zip(factors, parts, strict=True)])
+        return np.concatenate([f.value.solve(p) for f, p in zip(factors, parts, strict=True)])
 
     live = added > 0.0
     G, m = points[:, live], added[live]

@@ -42,6 +42,9 @@ class Zero:
 class PlantFacts:
     """A plant at one θ. `effort_hz`: where M_K σ_r(G) first falls below 1; nan if nowhere.
 
+    `inertia`: the least that an actuator moves where the plant is rigid (kg, of a torque kg m²);
+    infinite where it moves nothing freely.
+
     σ_r is the r-th singular value, r the number of rigid-body modes where there are fewer of them
     than inputs and outputs: what is held by a spring anyway needs no force at low frequency.
     """
@@ -50,6 +53,7 @@ class PlantFacts:
     modes: tuple[Mode, ...]
     zeros: tuple[Zero, ...]
     effort_hz: float
+    inertia: float = float("inf")
 
 
 def facts_of(
@@ -63,7 +67,9 @@ def facts_of(
     `free` is the plant without its suspension: what tells that one's zeros from its own.
     """
     effort = _effort_hz(modal, scaled)
-    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort, free), effort)
+    driven = float((modal.B[modal.rigid] ** 2).sum(axis=0).max(initial=0.0))
+    inertia = 1.0 / driven if driven > 0.0 else float("inf")
+    return PlantFacts(theta, _modes(modal), _zeros(scaled, effort, free), effort, inertia)
 
 
 def _modes(modal: ModalPlant) -> tuple[Mode, ...]:

@@ -151,8 +151,13 @@ def check_shapes(M: Any, D: Any, K: Any, B: Any, C: Any) -> None:
     for key, matrix in {"mass": M, "stiffness": K, "damping": D}.items():
         if matrix.shape != (n, n):
             raise PlantError(f"{key} is {matrix.shape}, the mass matrix {M.shape}; make them agree")
-    if B.shape[0] != n or C.shape[1] != n:
-        raise PlantError(f"input is {B.shape} and output {C.shape}; expected (n, m), (p, n), n={n}")
+    wanted = (("input", B, 0, f"({n}, m), a column a force"),
+              ("output", C, 1, f"(p, {n}), a row a sensor"))  # fmt: skip
+    for key, matrix, side, form in wanted:
+        if matrix.shape[side] != n:
+            remedy = "transpose it" if matrix.shape[1 - side] == n else f"make it {n} on that side"
+            words = f"{key} is {matrix.shape}; expected {form}, as mass is {M.shape}"
+            raise PlantError(f"{words}: {remedy}")
 
 
 def checked_ratio(ratio: Any) -> float | None:
@@ -171,13 +176,7 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
     cheaper = plant.values is not None and not derivatives
     system = plant.values(theta) if cheaper and plant.values else plant.evaluate(theta)
     M, K = system.M, system.K
-    values = (M, system.D, K, system.B, system.C, *system.derivatives)
-    if not all(np.isfinite(value).all() for value in values):
-        raise PlantError(f"the plant is not finite at theta = {theta_words(plant, theta)}")
-    if max(np.abs(value).max(initial=0.0) for value in values) > LARGEST_ENTRY:
-        place = f"at theta = {theta_words(plant, theta)}"
-        words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}; choose other units"
-        raise PlantError(words)
+    _require_finite(plant, system, f"at theta = {theta_words(plant, theta)}")
     for name, matrix in (("mass", M), ("stiffness", K)):
         gap = np.abs(matrix - matrix.T)
         if gap.max() > 1e-9 * np.abs(matrix).max():
@@ -195,6 +194,29 @@ def mechanics(plant: Plant, theta: Sequence[float], *, derivatives: bool = True)
         remedy = "give every coordinate a mass, or narrow the bounds of theta"
         raise PlantError(f"{words}: its least eigenvalue is {least:.3g}; {remedy}") from None
     return system
+
+
+def _require_finite(plant: Plant, system: Mechanics, place: str) -> None:
+    """Raise PlantError that names the first entry, or its slope, that is no number or too large."""
+    keys = ("mass", "damping", "stiffness", "input", "output")
+    matrices = (system.M, system.D, system.K, system.B, system.C)
+    told = [*zip(keys, matrices, strict=True)]
+    for key, slopes in zip(keys, system.derivatives, strict=True):
+        told += [(f"the derivative of {key} to {name}", slope)
+                 for name, slope in zip(plant.names, slopes, strict=False)]  # fmt: skip
+    for what, matrix in told:
+        wrong = ~(np.abs(matrix) <= LARGEST_ENTRY)
+        if not wrong.any():
+            continue
+        i, j = np.argwhere(wrong)[0]
+        entry = f"{what} is {matrix[i, j]:g} in row {i + 1}, column {j + 1}"
+        if np.isfinite(matrix[i, j]):
+            words = f"the plant has an entry beyond {LARGEST_ENTRY:g} {place}: {entry}"
+            raise PlantError(f"{words}; choose other units")
+        remedy = "keep divisions, roots and logarithms in their range over all bounds of theta"
+        if what not in keys:
+            remedy = "its value is finite: a root or power of 0, or abs, has no slope; smooth it"
+        raise PlantError(f"the plant is not finite {place}: {entry}; {remedy}")
 
 
 def _from_casadi(

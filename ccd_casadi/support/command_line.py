@@ -7,17 +7,17 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import usable_cores
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode as ExitCode
-from surrogates.options import Parser, one_line, whole
+from surrogates.options import Parser, one_line, usable_cores, whole
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"
@@ -32,38 +32,40 @@ def program(command: str) -> str:
 
 
 def parser(
-    command: str, description: str, *, case_required: bool = False
+    command: str, description: str, *, without_effect: Sequence[str] = ()
 ) -> argparse.ArgumentParser:
-    """A parser with the positional CASE and --out, --workers, --seed, --quiet."""
+    """A parser with the positional CASE and --out, --workers, --seed, --quiet, --no-user-code.
+
+    What is `without_effect` is accepted, as scripts give every command the same options, and is
+    not in --help.
+    """
     result = Parser(prog=program(command), description=description)
-    if case_required:
-        result.add_argument("case", metavar="CASE.toml", type=Path, help="the case file")
-    else:
-        result.add_argument(
-            "case",
-            metavar="CASE.toml",
-            nargs="?",
-            type=Path,
-            default=Path(DEFAULT_CASE),
-            help=f"the case file (default: {DEFAULT_CASE})",
-        )
-    _shared(result)
+    result.add_argument(
+        "case",
+        metavar="CASE.toml",
+        nargs="?",
+        type=Path,
+        default=Path(DEFAULT_CASE),
+        help=f"the case file (default: {DEFAULT_CASE})",
+    )
+    _shared(result, without_effect)
     return result
 
 
-def _shared(result: argparse.ArgumentParser) -> None:
-    """--out, --workers, --seed, --quiet and --no-user-code, which every command has."""
-    result.add_argument("--out", metavar="DIR", type=_folder, help="the run folder")
-    result.add_argument(
-        "--workers", metavar="N", type=whole(1), default=usable_cores(),
-        help="worker processes (default: all cores)",
+def _shared(result: argparse.ArgumentParser, without_effect: Sequence[str]) -> None:
+    def add(name: str, words: str, **how: Any) -> None:
+        words = argparse.SUPPRESS if name in without_effect else words
+        result.add_argument(name, help=words, **how)
+
+    add("--out", "the folder to write into", metavar="DIR", type=_folder)
+    add(
+        "--workers", "worker processes (default: all cores)", metavar="N", type=whole(1),
+        default=usable_cores(),
     )  # fmt: skip
-    result.add_argument("--seed", metavar="N", type=whole(0), default=0, help="default: 0")
-    result.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    result.add_argument(
-        "--no-user-code", action="store_true",
-        help="refuse a case that names a plant function: it is code of who wrote it",
-    )  # fmt: skip
+    add("--seed", "default: 0", metavar="N", type=whole(0), default=0)
+    add("--quiet", "no progress, no summary", action="store_true")
+    words = "refuse a case that names a plant function: it is code of who wrote it"
+    add("--no-user-code", words, action="store_true")
 
 
 def run_parser(
@@ -72,11 +74,12 @@ def run_parser(
     *,
     metavar: str = "RUN_DIR",
     about: str = "the folder of a finished solve",
+    without_effect: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
-    """A parser with the positional RUN_DIR of a finished run, --out, --workers, --seed, --quiet."""
+    """As `parser`, with the positional RUN_DIR of a finished run."""
     result = Parser(prog=program(command), description=description)
     result.add_argument("run", metavar=metavar, type=Path, help=about)
-    _shared(result)
+    _shared(result, without_effect)
     return result
 
 

@@ -3,7 +3,6 @@
 A task whose worker dies is tried once more, in a new one.
 """
 
-import os
 import pickle
 import time
 from collections import deque
@@ -19,11 +18,6 @@ from surrogates.interrupts import raise_dropped
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 _SHORT = Repr()
 _SHORT.maxother = _SHORT.maxstring = 60
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Pool(Protocol):

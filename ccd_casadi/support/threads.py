@@ -4,14 +4,39 @@ A command permits as many as it may have workers; a worker process has one, as t
 rest of the machine.
 """
 
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+if TYPE_CHECKING:  # no command needs it to start
+    from concurrent.futures import ThreadPoolExecutor
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 _permitted = [1]
+_here = threading.local()
+
+
+class OwnThreads(Generic[T]):
+    """Something that the thread which made it has to free, as SciPy's SuperLU: another leaks it.
+
+    What other threads let go is freed when its thread makes the next one.
+    """
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        if not hasattr(_here, "let_go"):
+            _here.let_go = deque()
+        self._let_go: deque[T] = _here.let_go
+        self._let_go.clear()
+        self.value = make()
+
+    def __del__(self) -> None:
+        if getattr(_here, "let_go", None) is not self._let_go and hasattr(self, "value"):
+            self._let_go.append(self.value)
 
 
 @contextmanager
@@ -24,8 +49,18 @@ def threads_permitted(count: int) -> Iterator[None]:
         _permitted.pop()
 
 
+@cache
+def _threads(count: int) -> "ThreadPoolExecutor":
+    """They last: what a thread made it may have to free."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(count, "side_by_side")
+
+
 def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """[function(item), ...] in the items' order, begun in that order: the longest ones first.
+
+    Not from within `function`: its threads would wait for each other.
 
     >>> with threads_permitted(2):
     ...     side_by_side(abs, [-3, 2, -1])
@@ -35,7 +70,4 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     count = min(_permitted[-1], len(todo))
     if count <= 1:
         return [function(item) for item in todo]
-    from concurrent.futures import ThreadPoolExecutor  # no command needs it to start
-
-    with ThreadPoolExecutor(count) as threads:
-        return list(threads.map(function, todo))
+    return list(_threads(count).map(function, todo))

@@ -111,7 +111,7 @@ def synthesise(
     outcome of its `figures`, no exception. `compliance` asks for ‖GS‖∞ among them.
 
     >>> import ccd_casadi as ccd
-    >>> problem = ccd.problem_of(ccd.load_case("runs/two_mass.toml"))
+    >>> problem = ccd.problem_of(ccd.load_case(ccd.TWO_MASS))
     >>> weights = problem.weights.at(800.0 * ccd.HZ, 40.0 * ccd.HZ)
     >>> made = ccd.synthesise(ccd.scaled_plant(problem, (60.0, 60.0)), weights, omega_low=ccd.HZ)
     >>> made.figures.outcome.value, round(made.figures.bandwidth / ccd.HZ, 2)

@@ -1,0 +1,73 @@
+"""Threads of one process: what they make is freed, whoever lets it go."""
+
+import gc
+import threading
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+
+from ccd_casadi.plants.eigenpairs import Pencil, build_pencil
+from ccd_casadi.support.threads import OwnThreads, side_by_side, threads_permitted
+
+PAGE = 4096  # bytes, at least
+
+
+class Made:
+    """Notes where it was made and freed."""
+
+    threads: list[tuple[int, int]]
+
+    def __init__(self) -> None:
+        self.maker = threading.get_ident()
+
+    def __del__(self) -> None:
+        Made.threads.append((self.maker, threading.get_ident()))
+
+
+def test_what_a_thread_makes_it_frees_itself() -> None:
+    Made.threads = []
+    makers = set()
+    with threads_permitted(2):
+        meet = threading.Barrier(2)
+
+        def make(_: int) -> OwnThreads[Made]:
+            meet.wait(30.0)  # one each
+            return OwnThreads(Made)
+
+        for _ in range(5):
+            found = side_by_side(make, range(2))
+            makers |= {item.value.maker for item in found}
+            del found  # here, in the main thread
+    assert len(makers) == 2, "the threads last"
+    assert len(Made.threads) >= 8  # all but the last of each
+    assert all(maker == freed for maker, freed in Made.threads)
+
+
+def test_what_its_own_thread_lets_go_is_freed_at_once() -> None:
+    Made.threads = []
+    del OwnThreads(Made).value
+    OwnThreads(Made)
+    assert len(Made.threads) == 2
+
+
+def resident_pages() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1])
+
+
+def test_factorisations_of_threads_do_not_pile_up() -> None:
+    """SciPy's SuperLU frees nothing that another thread made: 12 MB each here, 7 GB in a solve."""
+    n = 120
+    line = sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+    A, M = sparse.csr_matrix(sparse.kronsum(line, line)), sparse.csr_matrix(sparse.eye_array(n * n))
+
+    def factored(_: int) -> Pencil:
+        return build_pencil([A], [M], 0.0, np.zeros((n * n, 0)), np.zeros(0))
+
+    with threads_permitted(2):
+        held = []
+        for _ in range(12):
+            side_by_side(factored, range(2))
+            gc.collect()
+            held.append(PAGE * resident_pages())
+    assert max(held[2:]) - held[2] < 60e6
