@@ -112,6 +112,7 @@ def test_the_command_says_what_is_slow(
     monkeypatch.setattr(command, "show_findings", lambda *_: None)
     monkeypatch.setattr("ccd_casadi.cases.case_problem.problem_of", lambda _: chain)
     options = SimpleNamespace(
+        resume=False,
         case=ROOT / "runs" / "two_mass.toml", out=tmp_path / "run", quiet=False, no_report=True,
         surrogate=None, scheduler=None, workers=1, seed=0,
         formulation=more[1] if more else None,
