@@ -28,12 +28,12 @@ from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
 from ccd_casadi.fixed_structure.structure import (
     response,
-    response_and_slope,
     response_and_slopes,
     roots,
     second_slopes,
     state_space,
 )
+from ccd_casadi.kernels import sections
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.synthesis.norms import hinf_norm
@@ -78,7 +78,12 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
         np.testing.assert_allclose((up[1] - down[1]) / (2 * h), second[:, i], atol=1e-6)
     ends = [response(structure, kappa, s * np.exp(x)) for x in (h, -h)]
     np.testing.assert_allclose(np.log(ends[0] / ends[1]) / (2 * h), slope, atol=1e-7)
-    np.testing.assert_allclose(response_and_slope(structure, kappa, s)[1], slope)
+    own = np.empty(len(kappa), complex)
+    for i, at in enumerate(s):  # the kernel's
+        K, ln_slope = sections.controller(structure.factors, np.exp(kappa), at, own)
+        np.testing.assert_allclose(K, sections.gain(structure.factors, np.exp(kappa), at))
+        np.testing.assert_allclose([K, ln_slope], [response(structure, kappa, at), slope[i]])
+        np.testing.assert_allclose(own, slopes[i], atol=1e-12)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, SLOW])

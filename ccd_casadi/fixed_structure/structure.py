@@ -118,22 +118,6 @@ def response(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
     return value
 
 
-def response_and_slope(
-    structure: Structure, kappa: Array, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """K(s) and ∂ln K/∂ln s.
-
-    K depends on s by its ratios to the frequencies only, so the slope is minus the sum of the
-    derivatives to their logarithms.
-    """
-    value = np.exp(kappa[0]) * np.ones_like(s)
-    slope = np.zeros_like(value)
-    for factor, sign, _, parts in _factors(structure, np.exp(kappa), s):
-        value = value * factor if sign > 0 else value / factor
-        slope -= sign * parts[0] / factor
-    return value, slope
-
-
 def response_and_slopes(
     structure: Structure, kappa: Array, s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
