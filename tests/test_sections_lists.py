@@ -8,8 +8,10 @@ from test_sections_codesign import PID, quick
 
 from ccd_casadi.codesign import sections_races
 from ccd_casadi.codesign.catalogue import restricted
+from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
+from ccd_casadi.codesign.sections_lists import ListedSections
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import Uncertainty
@@ -59,3 +61,19 @@ def test_one_search_seeds_the_next_and_all_is_counted(
             alone = Sampler(restricted(case, {"m1": (m1,)}), store, pool)
             other = co_design(alone, Lifted(points=4), 0).result["objective"]
             assert result["objective"] <= other + 1e-4 * abs(other)
+
+
+def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A catalogue of a ball screw was cut where the neighbour's controller led nowhere."""
+    case = listed(w2=-0.995)
+    with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
+        search = ListedSections(Direct(starts=1), 0, lambda _: pytest.fail("no judge here"))
+        first = search.search(Sampler(restricted(case, {"m1": VALUES[:1]}), store, pool), None)
+        monkeypatch.setattr(ListedSections, "_near", lambda *_: None)
+        other = Sampler(restricted(case, {"m1": VALUES[-1:]}), store, pool)
+        found = search.search(other, first)
+    assert found.result["status"] == "searched"
+    assert found.problem is not None
+    assert found.problem.source.held["m1"] == VALUES[-1]

@@ -1,8 +1,9 @@
 """Searches over lists of values with a controller of fixed structure, each near another's end.
 
 The first is a whole one, with races. From then on a search begins at the nearest θ and controller
-that are known and takes local steps on the true function. What is found so is good for its J; the
-best combination is then designed as any other case, from that controller.
+that are known and takes local steps on the true function. Where these find nothing a whole one is
+made: a part is not empty for that. What is found so is good for its J; the best combination is then
+designed as any other case, from that controller.
 """
 
 from collections.abc import Callable
@@ -62,20 +63,29 @@ class ListedSections:
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
             return _nothing(forbidden)
-        if near is None:
-            first = search_sections(sampler, self.formulation, self.seed)
-            if first.end is None:
-                return _nothing(first.outcome.message)
-            self.members = sections_of_problem(first.end.asked.problem).members
-            return _found(first.end.asked.problem, first.end.best)
+        found = None if near is None else self._near(sampler, near)
+        return self._anew(sampler) if found is None else found
+
+    def _anew(self, sampler: Sampler) -> Solution:
+        first = search_sections(sampler, self.formulation, self.seed)
+        if first.end is None:
+            return _nothing(first.outcome.message)
+        more = sections_of_problem(first.end.asked.problem).members
+        self.members = tuple(dict.fromkeys((*self.members, *more)))
+        return _found(first.end.asked.problem, first.end.best)
+
+    def _near(self, sampler: Sampler, near: Solution) -> Solution | None:
+        """None where local steps from there find no design."""
+        problem = sampler.problem
         known = _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
-            return _nothing("no theta was found near by that meets the constraints")
+            return None
         truth = TrueBandwidth(sampler.of(carried(known, problem, self.members)), "near by")
         truth, best = by_pieces(truth, truth.at(theta), SETTLED)
-        return _found(truth.sampler.problem, best)
+        found = _found(truth.sampler.problem, best)
+        return found if np.isfinite(found.result.get("objective", np.inf)) else None
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
