@@ -25,7 +25,7 @@ class _Package(ModuleType):
             super().__setattr__(name, value)
 
     def __dir__(self) -> list[str]:
-        return sorted(self.__all__)
+        return sorted(vars(self)["__all__"])
 
 
 def from_stub(package: str) -> list[str]:

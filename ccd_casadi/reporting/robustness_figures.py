@@ -42,7 +42,7 @@ def gains_table(found: Study) -> Table:
     scale = np.array([[1.0], [1.0], [1e6], [1.0]])
     return over_frequency(
         ("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *scale * found.gains,
-        special=hz[found.gains.argmax(axis=1)],
+        special=hz[found.gains.argmax(axis=1)].tolist(),
     )  # fmt: skip
 
 
