@@ -16,12 +16,6 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.cases.measured_case import MeasuredCase
     from ccd_casadi.codesign.inner_answer import InnerAnswer
 
-CODES = {
-    "verified": ExitCode.DONE,
-    "infeasible": ExitCode.INFEASIBLE,
-    "not_verified": ExitCode.NOT_VERIFIED,
-}
-
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Print one JSON object; with both break frequencies given, of that single synthesis."""
@@ -112,7 +106,7 @@ def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> E
     }
     json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
     print()
-    return CODES[found.status]
+    return ExitCode.of(found.status)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

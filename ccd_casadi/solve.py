@@ -17,12 +17,6 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
     from ccd_casadi.codesign.solution import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
-_CODES = {
-    "verified": ExitCode.DONE,
-    "not_verified": ExitCode.NOT_VERIFIED,
-    "infeasible": ExitCode.INFEASIBLE,
-}
-
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
@@ -235,7 +229,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             sampler = Sampler(problem, samples, workers, quiet=options.quiet)
             solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
             write_run(folder, case, solution)
-        code = _CODES[solution.result["status"]]
+        code = ExitCode.of(solution.result["status"])
         if not options.quiet:
             print(summary(solution))
             print(f"run folder    {folder}")

@@ -16,75 +16,13 @@ used: this module alone loads nothing, and scikit-learn comes when something is 
 """
 
 import sys as _sys
-from importlib import import_module as _import_module
-from types import ModuleType as _ModuleType
 
 from surrogates import interrupts as _interrupts
+from surrogates.lazy_names import from_stub as _from_stub
 
 if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
     _interrupts.starting()
 
 del _interrupts
 
-# Every public name, and the module that defines it.
-_PUBLIC = {
-    "Basis": "radial_basis",
-    "DesignKind": "sampling_plan",
-    "Errors": "interface",
-    "Extrapolation": "extrapolation",
-    "GaussianProcess": "gaussian_process",
-    "Hyperparameters": "covariance",
-    "Kernel": "covariance",
-    "Kind": "fitting",
-    "Polynomial": "polynomial",
-    "Quality": "quality",
-    "RadialBasis": "radial_basis",
-    "Roughness": "quality",
-    "Samples": "samples",
-    "Surrogate": "interface",
-    "SurrogateRegressor": "estimator",
-    "SurrogateFileError": "serialise",
-    "SurrogateFitError": "interface",
-    "checked": "samples",
-    "condition": "gaussian_process",
-    "corners": "sampling_plan",
-    "design": "sampling_plan",
-    "errors": "validation",
-    "extrapolation": "extrapolation",
-    "fit": "fitting",
-    "fit_outputs": "fitting",
-    "fit_polynomial": "polynomial",
-    "fit_radial_basis": "radial_basis",
-    "grid": "sampling_plan",
-    "latin_hypercube": "sampling_plan",
-    "load": "serialise",
-    "loo_errors": "gaussian_process",
-    "quality_of": "quality",
-    "save": "serialise",
-    "sobol": "sampling_plan",
-    "to_casadi": "casadi_export",
-}
-__all__ = sorted(_PUBLIC)
-
-
-def __getattr__(name: str) -> object:
-    if name not in _PUBLIC:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(_import_module(f"{__name__}.{_PUBLIC[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return __all__
-
-
-class _Package(_ModuleType):
-    """Keeps `surrogates.extrapolation` the function when the module of that name is imported."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if not (name in _PUBLIC and isinstance(value, _ModuleType)):
-            super().__setattr__(name, value)
-
-
-_sys.modules[__name__].__class__ = _Package
+__all__ = _from_stub(__name__)

@@ -19,6 +19,15 @@ class ExitCode(IntEnum):
     NOT_VERIFIED = 4
     INTERRUPTED = 130
 
+    @classmethod
+    def of(cls, status: str) -> "ExitCode":
+        """How a command ends whose design came to this.
+
+        >>> ExitCode.of("verified"), ExitCode.of("infeasible"), ExitCode.of("not_verified")
+        (<ExitCode.DONE: 0>, <ExitCode.INFEASIBLE: 3>, <ExitCode.NOT_VERIFIED: 4>)
+        """
+        return cls.DONE if status == "verified" else cls[status.upper()]
+
 
 def one_line(value: object) -> str:
     """Any text on one line: what a terminal would obey is escaped, a long middle left out."""

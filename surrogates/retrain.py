@@ -14,12 +14,6 @@ from surrogates.serialise import SurrogateFileError
 from surrogates.truth import TruthError, TruthInterrupted, opener_of
 
 RESUMABLE = "the same command resumes from there"
-CODES = {
-    "verified": ExitCode.DONE,
-    "not_verified": ExitCode.NOT_VERIFIED,
-    "infeasible": ExitCode.INFEASIBLE,
-}
-
 
 def parser() -> argparse.ArgumentParser:
     """The command's options."""
@@ -92,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
               f"evaluations, surrogate {outcome.version} in {folder}")  # fmt: skip
     elif outcome.status != "verified":
         print(f"{folder}: {outcome.status} ({outcome.reason})", file=sys.stderr)
-    return CODES[outcome.status]
+    return ExitCode.of(outcome.status)
 
 
 if __name__ == "__main__":

@@ -64,6 +64,18 @@ def test_an_extra_that_an_error_names_has_the_package() -> None:
     assert [(name, extra) for name, extra in asked if distribution(name) not in EXTRAS[extra]] == []
 
 
+def test_every_file_beside_the_sources_ships() -> None:
+    found = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    for package, patterns in found["package-data"].items():
+        place = ROOT / package
+        shipped = {path for pattern in patterns for path in place.glob(pattern)}
+        there = {
+            path for path in place.rglob("*")
+            if path.is_file() and path.suffix != ".py" and "__pycache__" not in path.parts
+        }  # fmt: skip
+        assert there <= shipped, there - shipped
+
+
 def test_a_version_that_is_not_published_has_no_date() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     version = PROJECT["version"]

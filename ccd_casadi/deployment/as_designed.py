@@ -6,18 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.channels import Channel, split
 from ccd_casadi.deployment.discretise import (
     FASTEST,
     Conversion,
     Target,
-    discretise,
     loop_at,
     needed_rate,
     nice_rate,
 )
-from ccd_casadi.deployment.judgement import SampledSet, statics_of, unverified
+from ccd_casadi.deployment.judgement import SampledSet
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
     SAMPLED_EXCESS,
@@ -26,7 +24,6 @@ from ccd_casadi.deployment.outcome import (
     Trial,
 )
 from ccd_casadi.deployment.rate_choice import conversions_of
-from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction
 from ccd_casadi.deployment.robust_set import WorstFirst, section_members
 from ccd_casadi.deployment.sampled import SampledFigures
@@ -103,24 +100,13 @@ def deploy_as_designed(
         remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
         raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
     rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
-    delay, period = timing.delay_at(rate), 1.0 / rate
-    singles = [discretise(item.channel.controller, best.conversion, period, delay)
-               for item in orders]  # fmt: skip
-    channels = [item.channel for item in orders]
-    realisation = limited(realise(channels, singles, saturation), full.bandwidth)
-    plants = SampledSet(run, dense, period, delay)
-    sampled, checked = plants.figures(realisation)
+    plants = SampledSet(
+        run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation
+    )
     progress("simulation")
-    worst = [max(checked, key=lambda item: item.badness).at] if checked else []
-    stable = sampled.stable and all(item.figures.stable for item in checked)
-    bounded = sections.compliance_max is not None and stable
-    compliance = plants.compliance(realisation) if bounded else None
-    measured, simulated = plants.simulated(realisation, worst, seed) if stable else (None, ())
-    return Deployment(
-        orders, limits, K, full, tuple(trials), target, rate, delay, best.conversion,
-        plants.nominal, realisation, sampled, measured, checked, simulated, unverified(run),
-        statics_of(run, realisation.system), compliance, sections.compliance_max,
-    )  # fmt: skip
+    return plants.deployment(
+        limits, K, full, trials, target, compliance_max=sections.compliance_max, seed=seed
+    )
 
 
 def _require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timing) -> None:

@@ -18,9 +18,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree as ET
 
-from ccd_casadi.deployment.fmu_wrapper import WRAPPER
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.package_text import package_text
 
 FILE = "controller.fmu"
 NAME = "controller"  # modelIdentifier
@@ -40,8 +40,9 @@ def write_fmu(path: Path, realisation: Realisation, c_files: Mapping[str, str], 
     Raises UserError where there is a compiler and it fails.
     """
     sources = {name: c_files[name] for name in ("controller.h", "controller.c")}
-    guid = hashlib.sha256("".join([*sources.values(), WRAPPER]).encode()).hexdigest()[:32]
-    sources["fmu.c"] = WRAPPER.replace("@GUID@", guid)
+    wrapper = package_text("deployment/templates/fmu.c")
+    guid = hashlib.sha256("".join([*sources.values(), wrapper]).encode()).hexdigest()[:32]
+    sources["fmu.c"] = wrapper.replace("@GUID@", guid)
     K = realisation.system
     description = _description(K.B.shape[1], len(K.C), K.period, guid, title)
     library = compiled(sources)

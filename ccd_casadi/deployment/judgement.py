@@ -1,65 +1,84 @@
 """A realised controller on the plants of a set: exact sampled figures, then a simulation."""
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.compliance import sampled_compliance
-from ccd_casadi.deployment.realisation import Realisation
+from ccd_casadi.deployment.discretise import Conversion, Target, discretise
+from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
+from ccd_casadi.deployment.realisation import realise
+from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
 from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
-    SampledFigures,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
-from ccd_casadi.deployment.simulation import MeasuredSensitivity, measure_set
+from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.synthesis.statics import Statics, statics
+from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 class SampledSet:
-    """The nominal plant and the members of a set behind a hold of `period` and a delay, in s."""
+    """A controller as it runs, on the nominal plant and on the members of a set.
+
+    Behind every plant are a hold of a period and a delay in s. `sampled` and `checked` are the
+    exact figures of the loops on the nominal plant and on every member.
+    """
 
     def __init__(
-        self, run: FinishedRun, members: Sequence[Member], period: float, delay: float
-    ) -> None:
-        self.run = run
+        self, run: FinishedRun, members: Sequence[Member], orders: Sequence[ChannelOrders],
+        conversion: Conversion, rate_hz: float, delay: float, saturation: float | None,
+    ) -> None:  # fmt: skip
+        period = 1.0 / rate_hz
+        self.run, self.orders, self.conversion = run, tuple(orders), conversion
+        self.rate_hz, self.delay = rate_hz, delay
+        parts = [discretise(o.chosen.controller, conversion, period, delay) for o in orders]
+        realised = realise([item.channel for item in orders], parts, saturation)
+        self.realisation = limited(realised, run.figures.bandwidth)
         self.free = {Perturbation(): run.plant.plant_si()}
         self.free |= {m.at: m.plant.plant_si() for m in members}
-        self.nominal = sampled_plant(run.plant.plant_si(), period, delay)
-        self.members = {m.at: sampled_plant(m.plant.plant_si(), period, delay) for m in members}
+        held = {at: sampled_plant(plant, period, delay) for at, plant in self.free.items()}
+        loops = {at: sensitivity_loop(G, self.realisation.system) for at, G in held.items()}
+        figures = {at: sampled_figures(loop) for at, loop in loops.items()}
+        self.held, self.loops, self.sampled = held, loops, figures.pop(Perturbation())
+        self.checked = tuple(MemberLoop(at, item) for at, item in figures.items())
 
-    def figures(self, realisation: Realisation) -> tuple[SampledFigures, tuple[MemberLoop, ...]]:
-        """The exact figures of the loop on the nominal plant, and on every member."""
-        K = realisation.system
-        loops = tuple(
-            MemberLoop(at, sampled_figures(sensitivity_loop(plant, K)))
-            for at, plant in self.members.items()
-        )
-        return sampled_figures(sensitivity_loop(self.nominal, K)), loops
-
-    def compliance(self, realisation: Realisation) -> tuple[Perturbation, float]:
-        """The largest |GS| in m/N of all plants, and where; every sampled loop is stable."""
-        held = {Perturbation(): self.nominal, **self.members}
-        K = realisation.system
-        found = {
-            at: sampled_compliance(self.free[at], sensitivity_loop(plant, K))
-            for at, plant in held.items()
-        }
-        at = max(found, key=lambda item: found[item])
-        return at, found[at]
-
-    def simulated(
-        self, realisation: Realisation, shown: Collection[Perturbation], seed: int
-    ) -> tuple[MeasuredSensitivity, tuple[tuple[Perturbation, MeasuredSensitivity], ...]]:
-        """What a simulation measures on the nominal plant and on the members `shown`."""
-        chosen = {at: plant for at, plant in self.members.items() if at in shown}
+    def deployment(
+        self, limits: Limits, reduced: StateSpace, reduced_figures: DesignFigures,
+        trials: Sequence[Trial], target: Target, *, simulated: Collection[Perturbation] = (),
+        compliance_max: float | None, seed: int,
+    ) -> Deployment:  # fmt: skip
+        """All that was found, with a simulation on the worst member and those named."""
+        run, K = self.run, self.realisation.system
+        worst = [max(self.checked, key=lambda m: m.badness).at] if self.checked else []
+        found = Deployment(
+            self.orders, limits, reduced, reduced_figures, tuple(trials), target, self.rate_hz,
+            self.delay, self.conversion, self.held[Perturbation()], self.realisation, self.sampled,
+            None, self.checked, unverified=unverified(run), statics=statics_of(run, K),
+            compliance_max=compliance_max,
+        )  # fmt: skip
+        if not found.stable:
+            return found
+        shown = [item.at for item in self.checked if item.at in {*simulated, *worst}]
         nominal, *rest = measure_set(
-            [self.nominal, *chosen.values()], realisation.system, self.run.figures.bandwidth, seed
+            [found.plant, *(self.held[at] for at in shown)], K, run.figures.bandwidth, seed
         )
-        return nominal, tuple(zip(chosen, rest, strict=True))
+        compliance = None if compliance_max is None else self._compliance()
+        return replace(
+            found, measured=nominal, compliance=compliance,
+            measured_members=tuple(zip(shown, rest, strict=True)),
+        )  # fmt: skip
+
+    def _compliance(self) -> tuple[Perturbation, float]:
+        """The largest |GS| in m/N of all plants, and where; every sampled loop is stable."""
+        found = {at: sampled_compliance(self.free[at], loop) for at, loop in self.loops.items()}
+        return max(found.items(), key=lambda pair: pair[1])
 
 
 def unverified(run: FinishedRun) -> str:

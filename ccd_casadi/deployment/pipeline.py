@@ -4,11 +4,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.as_designed import deploy_as_designed
 from ccd_casadi.deployment.channels import Channel, assemble, split
-from ccd_casadi.deployment.discretise import Target, discretise
-from ccd_casadi.deployment.judgement import SampledSet, statics_of, unverified
+from ccd_casadi.deployment.discretise import Target
+from ccd_casadi.deployment.judgement import SampledSet
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
     SAMPLED_EXCESS,
@@ -16,7 +15,6 @@ from ccd_casadi.deployment.outcome import (
     Deployment,
 )
 from ccd_casadi.deployment.rate_choice import ChannelLoops, choose, conversions_of
-from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
@@ -75,29 +73,19 @@ def deploy(
     loops = ChannelLoops(channels, small, target)
     for attempt in range(1 + ADDED):
         trials, best, rate = choose(run, timing, loops, family, conversions, progress, attempt)
-        delay, period = timing.delay_at(rate), 1.0 / rate
-        sampled_controllers = [discretise(K, best.conversion, period, delay) for K in small]
-        realisation = limited(realise(channels, sampled_controllers, saturation), full.bandwidth)
-        plants = SampledSet(run, dense, period, delay)
-        sampled, checked = plants.figures(realisation)
-        outside = max((m for m in checked if not target.held(m.figures)), default=None,
-                      key=lambda m: m.badness)  # fmt: skip
+        plants = SampledSet(
+            run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation
+        )
+        outside = max((m for m in plants.checked if not target.held(m.figures)),
+                      default=None, key=lambda m: m.badness)  # fmt: skip
         if timing.rate_hz is not None or outside is None:
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
     progress("simulation")
-    stable = sampled.stable and all(item.figures.stable for item in checked)
-    shown = {item.at for item in family}
-    if checked:
-        shown.add(max(checked, key=lambda m: m.badness).at)
-    bounded = inner.compliance_max is not None and stable
-    compliance = plants.compliance(realisation) if bounded else None
-    measured, simulated = plants.simulated(realisation, shown, seed) if stable else (None, ())
-    return Deployment(
-        orders, limits, reduced, reduced_figures, trials, target, rate, delay,
-        best.conversion, plants.nominal, realisation, sampled, measured, checked, simulated,
-        unverified(run), statics_of(run, realisation.system), compliance, inner.compliance_max,
+    return plants.deployment(
+        limits, reduced, reduced_figures, trials, target, seed=seed,
+        simulated={item.at for item in family}, compliance_max=inner.compliance_max,
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from ccd_casadi.explorer.session import Session
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.user_code import permit_user_code
+from ccd_casadi.support.worker_process import end_with_parent
 
 BEHIND = 10  # niceness of what fills the box
 
@@ -33,14 +34,7 @@ def _prepare(user_code: bool, behind: bool) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(limits=1)
     permit_user_code(user_code).__enter__()
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def leave() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=leave, daemon=True).start()
+    end_with_parent()
 
 
 class Background:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import shown_rows
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLACK, CYCLE
+from ccd_casadi.reporting.tables import spread
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.loop_responses import Loop
 
@@ -127,7 +127,7 @@ def caption_bode(loop: Loop, channels: Sequence[Channel] = ()) -> str:
 
 def table_bode(loop: Loop) -> Table:
     """Magnitudes, and phases of a scalar loop, at some frequencies."""
-    rows = shown_rows(loop.hz, [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz])
+    rows = spread(loop.hz, [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz])
     if loop.plant.shape[1:] == (1, 1):
         head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
         G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])

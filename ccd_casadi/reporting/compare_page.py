@@ -37,7 +37,6 @@ from ccd_casadi.reporting.sections_loops import compared_html
 from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
@@ -101,7 +100,7 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
         if lines:
             sections.insert(0, Section(f"Verdict: {LABELS[method.name]}", lines))
     path, title = folder / "report.html", f"Comparison: {comparison.case.path.name}"
-    text = with_turntables(page(title, sections, head, index=""))
+    text = page(title, sections, head, index="")
     write_whole(path, text)
     return path
 

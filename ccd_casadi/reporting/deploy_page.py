@@ -34,6 +34,7 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -41,7 +42,6 @@ from ccd_casadi.synthesis.closed_loop import responses
 from surrogates.files import write_whole
 
 POINTS = 900
-SHOWN = 40  # measured points in the plot, and rows in the tables
 PERIODS = 6.0  # of ω_b that the step is shown for
 
 
@@ -125,7 +125,8 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         for gain, label, colour, line in zip(gains, labels, colours, lines, strict=True)
     ]
     if found.measured is not None:
-        at = _spread(found.measured.omega / HZ, low)
+        first = int(np.searchsorted(found.measured.omega / HZ, low))
+        at = [first + i for i in spread(found.measured.omega[first:])]
         curves.append(
             Curve(found.measured.omega[at] / HZ, found.measured.gain[at],
                   "measured in the simulation", BLACK, "", ".")
@@ -152,14 +153,10 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         [[top], [bottom]], key="deployed-loop", heights=(3.4, 2.4),
         title="Sensitivity and controller: full, reduced and sampled, over frequency",
     )  # fmt: skip
-    rows = [int(np.abs(hz - f).argmin()) for f in np.geomspace(low, high, SHOWN)]
-    table = Table(
+    table = over_frequency(
         ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
-        tuple(
-            (float(hz[i]), *(float(g[i]) for g in (*gains, *controllers)))
-            for i in sorted(set(rows))
-        ),
-    )
+        hz, *gains, *controllers,
+    )  # fmt: skip
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
         f"up to half the sampling rate. There the controller's gain is "
@@ -172,13 +169,6 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
 
 def _gain(response: np.ndarray) -> Array:
     return np.asarray(np.linalg.norm(response, 2, axis=(1, 2)))
-
-
-def _spread(hz: Array, low: float) -> list[int]:
-    """Places of frequencies from `low` on, evenly spread over the axis."""
-    first = int(np.searchsorted(hz, low))
-    wanted = np.geomspace(hz[first], hz[-1], SHOWN)
-    return sorted({first + int(np.abs(hz[first:] - f).argmin()) for f in wanted})
 
 
 def _facts(run: FinishedRun, found: Deployment) -> str:
@@ -234,8 +224,7 @@ def _step(run: FinishedRun, found: Deployment) -> str:
     svg = figure_lines(
         [[panel]], key="deployed-step", title="Step of the reference", heights=(3.0,)
     )
-    rows = np.unique(np.linspace(0, len(t) - 1, SHOWN).astype(int))
-    table = Table(("ms", "y"), tuple((1e3 * float(t[i]), float(y[i])) for i in rows))
+    table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
     return figure_html(svg, caption, table)
 

@@ -9,13 +9,14 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_p
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.loops import forbidden, shown_rows
+from ccd_casadi.reporting.loops import forbidden, marked
 from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, stage_modes_html
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of, nyquist_panel
 from ccd_casadi.reporting.page import Section, Table, figure_html, number
 from ccd_casadi.reporting.sections_loops import Loops, gain_panels
 from ccd_casadi.reporting.signals import Moved, signals_of
 from ccd_casadi.reporting.svg import GREEN, GREY
+from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.classical_margins import least_margins
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from ccd_casadi.codesign.verify import VerifiedDesign
 
 HEIGHT = 3.0  # inches of a row
-ROWS = 40  # of the move's table
 
 
 def glance(problem: CoDesignProblem, verified: "VerifiedDesign", bandwidth_hz: float) -> Section:
@@ -83,9 +83,7 @@ def glance_of_sections(
         f"The machine at this design, and its loop on {counted(count, 'plant')} of the set (blue: "
         f"the model; band, green: the others). S stays below S_max = {S_max:g}"
     )
-    tables = [Table(("Hz", "largest |S|"), tuple(
-        (float(loops.hz[i]), float(np.abs(loops.S[:, i]).max()))
-        for i in shown_rows(loops.hz, [])))]  # fmt: skip
+    tables = [over_frequency(("Hz", "largest |S|"), loops.hz, np.abs(loops.S).max(axis=0))]
     if moves is not None:
         panels, told, table = moves
         rows.append([nyquist_panel(list(loops.L), S_max, HEIGHT), panels[-1]])
@@ -148,16 +146,13 @@ def _move_words(move: Moved) -> str:
 
 def _table(loop: Loop) -> Table:
     L = loop.plant @ loop.controller
-    rows = shown_rows(loop.hz, [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)])
     if L.shape[1:] != (1, 1):
-        return Table(("Hz", "σ_max(S)"), tuple(
-            (float(loop.hz[i]), float(loop.gains[0, i])) for i in rows))  # fmt: skip
-    return Table(("Hz", "|S|", "Re L", "Im L"), tuple(
-        (float(loop.hz[i]), float(loop.gains[0, i]), float(L[i, 0, 0].real), float(L[i, 0, 0].imag))
-        for i in rows))  # fmt: skip
+        return over_frequency(("Hz", "σ_max(S)"), loop.hz, loop.gains[0], special=marked(loop))
+    L = L[:, 0, 0]
+    return over_frequency(
+        ("Hz", "|S|", "Re L", "Im L"), loop.hz, loop.gains[0], L.real, L.imag, special=marked(loop)
+    )
 
 
 def _move_table(move: Moved) -> Table:
-    rows = np.unique(np.linspace(0, len(move.time) - 1, ROWS).astype(int))
-    return Table(("ms", "error µm"), tuple(
-        (1e3 * float(move.time[i]), 1e6 * float(move.error[i])) for i in rows))  # fmt: skip
+    return over_time(("ms", "error µm"), 1e3 * move.time, 1e6 * move.error)

@@ -30,7 +30,6 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.sections_page import binding_words
-from ccd_casadi.reporting.steps import with_steps
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import loop_data
@@ -79,7 +78,7 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         ),
         Section("What limits the bandwidth", _limits(run, rule)),
     ]
-    return with_steps(page(title, sections, head, index))
+    return page(title, sections, head, index)
 
 
 def _limits(run: FinishedRun, rule: str) -> str:

@@ -10,13 +10,13 @@ from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY, ORANGE
+from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 from ccd_casadi.synthesis.synthesis import synthesise
 
 Areas = tuple[tuple[np.ndarray, str], ...]  # corners x + iy, colours
-SHOWN = 45  # rows of a data table
 
 
 def synthesised_loop(
@@ -172,13 +172,12 @@ def caption_gains(loop: Loop, *, S_max: float) -> str:
 
 def table_gains(loop: Loop) -> Table:
     """Gains and bounds at some frequencies, the marked ones among them."""
-    rows = shown_rows(loop.hz, [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)])
     pairs = zip(loop.gains, loop.bounds, strict=True)
-    columns = [loop.hz, *(column for pair in pairs for column in pair)]
     head = ("Hz", "|S|", "bound", "|KS| N/m", "bound N/m", "|T|", "bound")
-    return Table(head, tuple(tuple(float(c[i]) for c in columns) for i in rows))
+    columns = [column for pair in pairs for column in pair]
+    return over_frequency(head, loop.hz, *columns, special=marked(loop))
 
 
-def shown_rows(hz: Array, special: Sequence[float]) -> list[int]:
-    wanted = [*np.geomspace(hz[0], hz[-1], SHOWN), *special]
-    return sorted({int(np.abs(hz - value).argmin()) for value in wanted})
+def marked(loop: Loop) -> list[float]:
+    """Frequencies in Hz that a table of the loop does not leave out."""
+    return [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)]

@@ -11,11 +11,10 @@ from ccd_casadi.fixed_structure.measured import clearances, controller_response
 from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.loops import forbidden, shown_rows
+from ccd_casadi.reporting.loops import forbidden
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.page import (
     Section,
-    Table,
     facts_html,
     figure_html,
     header,
@@ -25,6 +24,7 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.sections_page import controller_html
 from ccd_casadi.reporting.svg import GREY
+from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import HZ
 from surrogates.files import write_whole
 
@@ -96,11 +96,11 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
         "Grey: what |S| may reach between two lines, if GK bends there as around them. A resonance "
         "that fits between two lines is not seen."
     )
-    table = Table(("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"), tuple(
-        (float(hz[i]), float(abs(G[i])), float(size[i]), float(L[i].real), float(L[i].imag),
-         float(abs(K[i] * S[i])), float(abs(L[i] * S[i])))
-        for i in shown_rows(hz, [answer["bandwidth_hz"], answer["sensitivity_peak_hz"]])
-    ))  # fmt: skip
+    table = over_frequency(
+        ("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"),
+        hz, np.abs(G), size, L.real, L.imag, np.abs(K * S), np.abs(L * S),
+        special=[answer["bandwidth_hz"], answer["sensitivity_peak_hz"]],
+    )  # fmt: skip
     return figure_html(svg, words, table)
 
 

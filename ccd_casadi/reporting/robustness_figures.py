@@ -6,6 +6,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import BLUE, CYCLE, GREY, ORANGE
+from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
 from ccd_casadi.robust.move import Move
 from ccd_casadi.robust.perturbed import Line
 from ccd_casadi.robust.structured import StructuredBound
@@ -13,7 +14,6 @@ from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
-SHOWN = 45  # rows of a table
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
 
@@ -39,16 +39,11 @@ def gains(found: Study) -> str:
 def gains_table(found: Study) -> Table:
     """Some frequencies, the peaks among them."""
     hz = found.hz
-    wanted = np.concatenate([np.geomspace(hz[0], hz[-1], SHOWN), hz[found.gains.argmax(axis=1)]])
-    rows = sorted({int(np.abs(hz - value).argmin()) for value in wanted})
-    head = ("Hz", "S", "T", "GS µm/N", "KS N/m")
-    return Table(
-        head,
-        tuple(
-            (float(hz[i]), *map(float, np.array([1.0, 1.0, 1e6, 1.0]) * found.gains[:, i]))
-            for i in rows
-        ),
-    )
+    scale = np.array([[1.0], [1.0], [1e6], [1.0]])
+    return over_frequency(
+        ("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *scale * found.gains,
+        special=hz[found.gains.argmax(axis=1)].tolist(),
+    )  # fmt: skip
 
 
 def perturbed(run: FinishedRun, found: Study) -> str:
@@ -148,7 +143,7 @@ def structured(bound: StructuredBound) -> str:
 
 def structured_table(bound: StructuredBound) -> Table:
     """The surroundings of the highest peak."""
-    best = np.sort(np.argsort(-bound.mu)[:SHOWN])
+    best = np.sort(np.argsort(-bound.mu)[:ROWS])
     rows = tuple((float(bound.hz[i]), float(bound.mu[i])) for i in best)
     return Table(("Hz", "μ, complex errors"), rows)
 
@@ -187,14 +182,11 @@ def move(found: Move, key: str) -> str:
 
 def move_table(found: Move) -> Table:
     """Some instants."""
-    wanted = np.linspace(0, np.flatnonzero(found.time <= 2.0 * found.duration)[-1], SHOWN)
+    n = int(np.count_nonzero(found.time <= 2.0 * found.duration))
     unit, scale = _unit(found.peak_error)
     head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *_names(found.force))
-    rows = tuple(
-        (1e3 * float(found.time[i]), 1e3 * float(found.position[i]), float(found.acceleration[i]),
-         scale * float(found.error[i]), *map(float, found.force[i])) for i in wanted.astype(int)
-    )  # fmt: skip
-    return Table(head, rows)
+    columns = (1e3 * found.time, 1e3 * found.position, found.acceleration, scale * found.error)
+    return over_time(head, *(column[:n] for column in (*columns, *found.force.T)))
 
 
 def _names(force: Array) -> list[str]:

@@ -18,8 +18,9 @@ from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, se
 from ccd_casadi.reporting.bode import phase_deg
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import Areas, above, forbidden, section_bounds
-from ccd_casadi.reporting.page import Table, figure_html, number
+from ccd_casadi.reporting.page import figure_html, number
 from ccd_casadi.reporting.svg import CYCLE, GREY, ORANGE
+from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from ccd_casadi.codesign.sections_run import VerifiedSections
 
 POINTS = 700
-ROWS = 40  # of the tables
 BOUNDS = {"S": "its shape", "KS": "weighted_level/|W_KS|", "T": "weighted_level/|W_T|"}
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
@@ -99,9 +99,7 @@ def compared_html(
         top, hz = np.abs(loops.S).max(axis=0), designs[name][1].bandwidth / HZ
         curves.append(Curve(loops.hz, top, name, CYCLE[i % len(CYCLE)]))
         words.append(f"{name}: ω_b = {hz:.2f} Hz, ‖S‖∞ = {top.max():.3f}")
-        rows = np.unique(np.linspace(0, len(top) - 1, ROWS).astype(int))
-        tables.append(Table((f"Hz, {name}", "|S| largest"), tuple(
-            (float(loops.hz[k]), float(top[k])) for k in rows)))  # fmt: skip
+        tables.append(over_time((f"Hz, {name}", "|S| largest"), loops.hz, top))
     levels = (
         Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
         Level(2**-0.5, "-3 dB", colour=GREY),
@@ -190,7 +188,6 @@ def gains_html(
 ) -> str:
     """S, KS, T, L and GS of the model in a band of all plants; `key` is unique in the page."""
     S, KS, T = gain_panels(problem, verified, loops)
-    x = (float(loops.hz[0]), float(loops.hz[-1]))
 
     def gain(of: str) -> str:
         return f"|{of}|" if len(loops.L) else f"σ_max({of})"
@@ -198,16 +195,12 @@ def gains_html(
     more = _open_loop(problem, verified, loops)
     svg = figure_lines([[S], [KS, T], *more], key=key, heights=(3.4, *[2.6] * (1 + len(more))),
                        title="The loop of every plant of the set over frequency")  # fmt: skip
-    rows = [int(np.abs(loops.hz - f).argmin()) for f in np.geomspace(*x, ROWS)]
-    table = Table(
+    S_size, KS_size, T_size = np.abs(loops.S), np.abs(loops.KS), np.abs(loops.T)
+    table = over_frequency(
         ("Hz", f"{gain('S')} model", f"{gain('S')} least", f"{gain('S')} largest",
          f"{gain('KS')} largest N/m", f"{gain('T')} largest"),
-        tuple(
-            (float(loops.hz[i]), float(abs(loops.S[0, i])), float(np.abs(loops.S[:, i]).min()),
-             float(np.abs(loops.S[:, i]).max()), float(np.abs(loops.KS[:, i]).max()),
-             float(np.abs(loops.T[:, i]).max()))
-            for i in sorted(set(rows))
-        ),
+        loops.hz, S_size[0], S_size.min(axis=0), *(of.max(axis=0) for of in (S_size, KS_size,
+                                                                             T_size)),
     )  # fmt: skip
     one = "The set holds one plant, the model." if len(loops.S) == 1 else (
         f"The band spans {counted(len(loops.S), 'plant')} of the set."
@@ -248,10 +241,8 @@ def force_step_html(verified: "VerifiedSections") -> str:
                  legend="upper left")  # fmt: skip
     svg = figure_lines([[step]], key="sections-force", heights=(3.2,),
                        title="A step of force on every plant")  # fmt: skip
-    rows = np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
-    table = Table(("ms", "µm model", "µm least", "µm largest"), tuple(
-        (1e3 * float(t[i]), float(y[0, i]), float(y[:, i].min()), float(y[:, i].max()))
-        for i in rows))  # fmt: skip
+    head = ("ms", "µm model", "µm least", "µm largest")
+    table = over_time(head, 1e3 * t, y[0], y.min(axis=0), y.max(axis=0))
     moved = counted(len(y), "plant")
     words = f"A force of 1 N at the actuator moves {moved} of the set, until they rest."
     return figure_html(svg, words, table)

@@ -17,6 +17,7 @@ from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, figure_html, number
 from ccd_casadi.reporting.svg import BLUE, GREY
+from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
-ROWS = 40
 
 
 def move_panels(verified: "VerifiedSections") -> tuple[list[Panel], str, Table]:
@@ -72,9 +72,7 @@ def move_panels(verified: "VerifiedSections") -> tuple[list[Panel], str, Table]:
         f"{stroke} mm in {number(1e3 * end, 4)} ms {where} ({how}; for other moves the options of "
         f"robustness). {' '.join(words)}"
     )
-    rows = np.unique(np.linspace(0, POINTS - 1, ROWS).astype(int))
-    table = Table(tuple(heads), tuple(tuple(float(c[i]) for c in columns) for i in rows))
-    return panels, caption, table
+    return panels, caption, over_time(heads, *columns)
 
 
 def move_html(panels: list[Panel], caption: str, table: Table) -> str:

@@ -56,7 +56,6 @@ from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_fi
 from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
-from ccd_casadi.reporting.turntable import with_turntables
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Ahead, WorkerLost
@@ -124,7 +123,7 @@ def report_html(
                 drawn |= drawn_elsewhere(work)
             bar.advance(sum(name in parts for name in ELSEWHERE))
     sections = [section for name in parts for section in drawn[name]]
-    return with_turntables(page(title, [*sections, _provenance(case, solution)], head))
+    return page(title, [*sections, _provenance(case, solution)], head)
 
 
 def ready() -> None:

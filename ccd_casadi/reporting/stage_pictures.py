@@ -99,7 +99,7 @@ def surface_of(stage: RibStage, theta: Sequence[float], shape: ModeShape) -> Sur
 def mode_shape_figure(stage: RibStage, theta: Sequence[float], count: int = 6) -> str:
     """The first flexible modes with their frequencies in Hz, as a figure's HTML.
 
-    Without the script of `with_turntables`, and on paper, the pictures stand still.
+    Without the page's script, and on paper, the pictures stand still.
     """
     modes = first_modes(stage, theta, count)
     surface = surface_of(stage, theta, modes[0].shape)

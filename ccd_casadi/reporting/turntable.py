@@ -11,9 +11,8 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.reporting.page import escape, with_script
+from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import COLOUR_MAP
-from ccd_casadi.reporting.turntable_script import CSS, LIGHT, SCRIPT, SHADE
 from ccd_casadi.support.arrays import Array
 
 AZIMUTH, ELEVATION = -62.0, 44.0  # degrees, of the camera as seen from the object
@@ -22,6 +21,8 @@ MARGIN = 6.0
 REACH = 0.08  # the largest displacement is drawn as this share of the object's width
 UNIT = 1e-4  # m; coordinates are written as whole multiples of it
 SHARES = 999  # displacements are written as so many parts of the largest
+LIGHT = (-0.45, 0.75, 0.9)  # right, up, towards the viewer: it stays with the camera
+SHADE = (0.66, 0.34)  # brightness of a quad: first + second · cosine to the light
 STOPS = 17  # of the colour map, linear in between
 
 # corners of a cell's six faces, counter-clockwise from outside, by (axis, side)
@@ -190,6 +191,8 @@ def data(surface: Surface, pictures: Sequence[Picture]) -> str:
         "size": _whole(size / UNIT),
         "reach": round(REACH * float(size[0]) / UNIT),
         "view": [AZIMUTH, ELEVATION],
+        "light": LIGHT,
+        "shade": SHADE,
         "frame": [WIDTH, HEIGHT, MARGIN],
         "stops": colour_stops().astype(int).tolist(),
     }
@@ -212,8 +215,3 @@ def legend(words: str) -> str:
         '<g font-size="13"><text x="0" y="15">0</text><text x="264" y="15">1</text>'
         f'<text x="292" y="15">{escape(words)}</text></g></svg>'
     )
-
-
-def with_turntables(document: str) -> str:
-    """A finished page with the script and its style; one without turntables stays as it is."""
-    return with_script(document, SCRIPT, CSS) if 'class="turntable"' in document else document

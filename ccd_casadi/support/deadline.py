@@ -5,26 +5,20 @@ the pipe is pickled between this process and its own child, and never stored.
 """
 
 import math
-import multiprocessing
 import pickle
 import resource
-import signal
 import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
-from threadpoolctl import threadpool_limits
-
-from ccd_casadi.support.worker_process import answered
+from ccd_casadi.support.worker_process import WorkerProcess, called, interrupts_held
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
 STARTING = 60.0  # seconds that the process itself may take to come up
-_SPAWN = multiprocessing.get_context("spawn")
 
 
 class Overrun(RuntimeError):
@@ -35,8 +29,7 @@ class Runner:
     """One process for calls with a deadline each; a context manager."""
 
     def __init__(self) -> None:
-        self._process: multiprocessing.process.BaseProcess | None = None
-        self._pipe: Connection | None = None
+        self._worker: WorkerProcess | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -56,7 +49,7 @@ class Runner:
 
         Raises Overrun after `seconds`, and where the process dies.
         """
-        pipe = self._ready()
+        pipe = self._ready().pipe
         try:
             pipe.send_bytes(pickle.dumps((_apply, (seconds, function, args, kwargs))))
             if not pipe.poll(seconds):
@@ -73,27 +66,22 @@ class Runner:
         result: R = value
         return result
 
-    def _ready(self) -> Connection:
-        if self._pipe is None or self._process is None or not self._process.is_alive():
+    def _ready(self) -> WorkerProcess:
+        if self._worker is None or not self._worker.process.is_alive():
             self._end()
-            self._pipe, theirs = _SPAWN.Pipe()
-            self._process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
-            self._process.start()
-            theirs.close()
-            if not self._pipe.poll(STARTING):
+            with interrupts_held():
+                self._worker = WorkerProcess()
+            self._worker.send(pickle.dumps((called, int)))  # answered as soon as it is up
+            if not self._worker.pipe.poll(STARTING):
                 self._end()
                 raise Overrun(f"the process did not start within {STARTING:g} s")
-            self._pipe.recv_bytes()
-        return self._pipe
+            self._worker.answer()
+        return self._worker
 
     def _end(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-            self._process.close()
-        if self._pipe is not None:
-            self._pipe.close()
-        self._process = self._pipe = None
+        if self._worker is not None:
+            self._worker.end()
+        self._worker = None
 
 
 def _apply(task: tuple) -> object:
@@ -102,15 +90,3 @@ def _apply(task: tuple) -> object:
     spent = math.ceil(time.process_time() + seconds + GRACE)
     resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     return function(*args, **kwargs)
-
-
-def _serve(pipe: Connection) -> None:
-    """Answer until the pipe ends; a first message says that the process is up."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's to deal with
-    try:
-        with threadpool_limits(limits=1):
-            pipe.send_bytes(b"")
-            while True:
-                pipe.send_bytes(answered(pipe.recv_bytes()))
-    except (EOFError, OSError):
-        return

@@ -37,7 +37,7 @@ class Ahead:
         resource_tracker.ensure_running()
         with interrupts_held():
             self._worker = WorkerProcess()
-        self._worker.send(pickle.dumps((_called, ready)))
+        self._worker.send(pickle.dumps((called, ready)))
         self._waiting = 1
 
     def __enter__(self) -> Self:
@@ -45,10 +45,7 @@ class Ahead:
 
     def __exit__(self, *_: object) -> None:
         with interrupts_held():
-            self._worker.process.kill()
-            self._worker.process.join()
-            self._worker.process.close()
-            self._worker.pipe.close()
+            self._worker.end()
 
     def begin(self, function: Callable[[T], object], task: T) -> None:
         """Let it go on with this task."""
@@ -69,7 +66,8 @@ class Ahead:
         return value
 
 
-def _called(function: Callable[[], object]) -> None:
+def called(function: Callable[[], object]) -> None:
+    """A task of a call without arguments whose result is of no use."""
     function()
 
 
@@ -94,6 +92,13 @@ class WorkerProcess:
             return self.pipe.recv_bytes()
         except (EOFError, OSError):
             return None
+
+    def end(self) -> None:
+        """Kill it, whatever it is doing."""
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+        self.pipe.close()
 
     def exit_code(self) -> int | None:
         self.process.join(1.0)
@@ -129,7 +134,7 @@ def _serve(pipe: connection.Connection) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(answered(pipe.recv_bytes()))
@@ -151,8 +156,12 @@ def answered(message: bytes) -> bytes:
             return pickle.dumps((False, RuntimeError(text)))
 
 
-def _end_with_parent() -> None:
-    """End this worker as soon as its parent has ended, even by SIGKILL and in mid-task."""
+def end_with_parent() -> None:
+    """End this process as soon as its parent has ended, even by SIGKILL and in mid-task."""
     parent: Any = multiprocessing.parent_process()
-    parent.join()
-    os._exit(1)
+
+    def leave() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=leave, daemon=True).start()

@@ -1,11 +1,6 @@
-"""The script that reads values off the drawn curves, one cursor across all figures of one axis.
-
-It takes the numbers from the paths as they are drawn and from the ends of the axes, so that a page
-carries no number twice: to about a thousandth of an axis. Without it, and on paper, figures stand
-as they are.
-"""
-
-SCRIPT = """
+// Reads values off the drawn curves, one cursor across all figures of one axis: numbers come from
+// the paths as drawn and the ends of the axes, to about a thousandth of an axis, so that a page
+// carries none twice. Without it, and on paper, figures stand as they are.
 "use strict";
 (() => {
   const NS = "http://www.w3.org/2000/svg";
@@ -27,7 +22,7 @@ SCRIPT = """
   function curves(p) {
     return Object.entries(p.d.names).map(([i, name]) => {
       const path = p.svg.querySelector(`[id$="-curve${i}"] path`);
-      const points = [...(path?.getAttribute("d") ?? "").matchAll(/[ML]\\s*(\\S+)\\s+(\\S+)/g)];
+      const points = [...(path?.getAttribute("d") ?? "").matchAll(/[ML]\s*(\S+)\s+(\S+)/g)];
       return [name, points.map((m) => [+m[1], +m[2]])];
     });
   }
@@ -52,7 +47,7 @@ SCRIPT = """
         p.line.setAttribute(key, to);
       const found = p.curves.map(([name, points]) => {
         const y = at(points, x);
-        return y === null ? "" : `${name || p.d.y.replace(/ \\(.*/, "")} ${short(p.value(Y, y))}`;
+        return y === null ? "" : `${name || p.d.y.replace(/ \(.*/, "")} ${short(p.value(Y, y))}`;
       });
       p.words.textContent = [short(v), ...found.filter(Boolean)].join(" · ");
       const left = x < (X[3] + X[4]) / 2;
@@ -70,4 +65,3 @@ SCRIPT = """
     p.svg.addEventListener("pointerleave", () => show(null, 0));
   }
 })();
-"""

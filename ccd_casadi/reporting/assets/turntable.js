@@ -1,45 +1,12 @@
-"""The script and the style that turn the pictures of `turntable`; nothing of it is fetched.
-
-Without the script, and on paper, the pictures drawn in Python stand in its place.
-"""
-
-LIGHT = (-0.45, 0.75, 0.9)  # right, up, towards the viewer: it stays with the camera
-SHADE = (0.66, 0.34)  # brightness of a quad: first + second · cosine to the light
-
-CSS = """
-.turntable .views { display: grid; gap: 10px 18px;
-  grid-template-columns: repeat(auto-fit, minmax(max(200px, 30%), 1fr)); }
-.turntable .view { position: relative; break-inside: avoid; }
-.turntable .view p { margin: 0; font-size: 14px; }
-.turntable .drawn { position: relative; }
-.turntable canvas { position: absolute; inset: 0; width: 100%; height: 100%; cursor: grab;
-  touch-action: pan-y; user-select: none; }
-.turntable canvas:active { cursor: grabbing; }
-.turntable .controls { display: flex; flex-wrap: wrap; align-items: center; gap: 6px 20px;
-  margin: 0 0 10px; font-size: 13.5px; color: var(--soft); }
-.turntable .controls label { display: flex; align-items: center; gap: 6px; }
-.turntable .controls input { width: 120px; accent-color: #005a8c; }
-.turntable .controls output { width: 3.2em; font-variant-numeric: tabular-nums; }
-.turntable .controls button { font: inherit; color: var(--link); cursor: pointer;
-  background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: 2px 12px;
-  min-width: 5em; }
-@media screen { .turntable .drawn.painted svg { visibility: hidden; } }
-@media print { .turntable canvas, .turntable .controls { display: none; }
-  .turntable .views { row-gap: 4px; } .turntable .view p { font-size: 9pt; line-height: 1.2; }
-  .turntable .drawn { margin: -2px 0; } }
-@media (prefers-reduced-motion: reduce) { .turntable .controls .play { display: none; } }
-"""
-
-SCRIPT = """
+// Turns the pictures of turntable.py; without it, and on paper, those drawn in Python stand.
 "use strict";
 (() => {
-  const LIGHT = [@LIGHT@], SHADE = [@SHADE@];
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
   const unit = (v) => v.map((c) => c / Math.hypot(...v));
 
   function start(root) {
     const d = JSON.parse(root.querySelector("script").textContent);
-    const light = unit(LIGHT), n = d.points.length / 3, count = d.quads.length / 4;
+    const light = unit(d.light), n = d.points.length / 3, count = d.quads.length / 4;
     const state = { turn: d.view[0], tilt: d.view[1], amplitude: 100, phase: 1, begun: null };
     const right = new Float64Array(n), up = new Float64Array(n), near = new Float64Array(n);
     const depth = new Float64Array(count), bright = new Float64Array(count);
@@ -100,7 +67,7 @@ SCRIPT = """
         const nx = y1 * z2 - z1 * y2, ny = z1 * x2 - x1 * z2, nz = x1 * y2 - y1 * x2;
         if (nz <= 0) continue;
         const cosine = (nx * light[0] + ny * light[1] + nz * light[2]) / Math.hypot(nx, ny, nz);
-        bright[q] = SHADE[0] + SHADE[1] * Math.max(0, cosine);
+        bright[q] = d.shade[0] + d.shade[1] * Math.max(0, cosine);
         depth[q] = near[A] + near[B] + near[C] + near[D];
         front.push(q);
       }
@@ -202,4 +169,3 @@ SCRIPT = """
   }
   document.querySelectorAll(".turntable").forEach(start);
 })();
-""".replace("@LIGHT@", ", ".join(map(str, LIGHT))).replace("@SHADE@", ", ".join(map(str, SHADE)))

@@ -1,7 +1,4 @@
-"""The C between FMI 2.0 and the generated controller: types and functions of the standard."""
-
-# Declared here and not by the standard's headers, which nobody has to have then.
-WRAPPER = r"""/* FMI 2.0 for co-simulation around controller.c, made by ccd-casadi. */
+/* FMI 2.0 for co-simulation around controller.c, made by ccd-casadi. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -144,4 +141,3 @@ NONE(fmi2GetRealStatus, int kind, double *value) REFUSED
 NONE(fmi2GetIntegerStatus, int kind, int *value) REFUSED
 NONE(fmi2GetBooleanStatus, int kind, fmi2Boolean *value) REFUSED
 NONE(fmi2GetStringStatus, int kind, const char **value) REFUSED
-"""

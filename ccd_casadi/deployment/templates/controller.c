@@ -1,0 +1,87 @@
+#include "controller.h"
+
+/* The sizes of A's diagonal blocks, and the blocks row by row. */
+static const int blocks[] = $blocks;
+static const double A[] = $A;
+/* Row by row: states x errors, forces x states, forces x errors. */
+static const double B[] = $B;
+static const double C[] = $C;
+static const double D[] = $D;
+$L/* State of a start: states x (errors, then forces). */
+static const double X[] = $X;
+/* Feedforward: derivatives x forces x references. */
+static const double F[] = $F;
+
+void controller_reset(controller_state *state)
+{
+    int i;
+    for (i = 0; i < CONTROLLER_STATES; i++)
+        state->x[i] = 0.0;
+}
+
+void controller_takeover(controller_state *state, const double e[CONTROLLER_ERRORS],
+                         const double u[CONTROLLER_FORCES])
+{
+    const double *x = X;
+    int i, j;
+
+    for (i = 0; i < CONTROLLER_STATES; i++) {
+        double sum = 0.0;
+        for (j = 0; j < CONTROLLER_ERRORS; j++)
+            sum += *x++ * e[j];
+        for (j = 0; j < CONTROLLER_FORCES; j++)
+            sum += *x++ * u[j];
+        state->x[i] = sum;
+    }
+}
+
+void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES])
+{
+    int i, k;
+
+    for (i = 0; i < CONTROLLER_FORCES; i++) {
+        f[i] = 0.0;
+        for (k = 0; k < 5; k++)
+            f[i] += F[(k * CONTROLLER_FORCES + i) * CONTROLLER_ERRORS + axis] * r[k];
+    }
+}
+
+void controller_step(controller_state *state, const double e[CONTROLLER_ERRORS],
+                     double u[CONTROLLER_FORCES])
+{
+    static const double none[CONTROLLER_FORCES];
+
+    controller_step_forward(state, e, none, u);
+}
+
+void controller_step_forward(controller_state *state, const double e[CONTROLLER_ERRORS],
+                             const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES])
+{
+    double next[$room];
+$cut_declared    const double *a = A;
+    int i, j, block, start = 0;
+
+    for (i = 0; i < CONTROLLER_FORCES; i++) {
+        double sum = 0.0;
+        for (j = 0; j < CONTROLLER_STATES; j++)
+            sum += C[i * CONTROLLER_STATES + j] * state->x[j];
+        for (j = 0; j < CONTROLLER_ERRORS; j++)
+            sum += D[i * CONTROLLER_ERRORS + j] * e[j];
+        sum += f[i];
+$clip        u[i] = sum;
+    }
+    for (block = 0; start < CONTROLLER_STATES; block++) {
+        const int end = start + blocks[block];
+        for (i = start; i < end; i++) {
+            double sum = 0.0;
+            for (j = start; j < end; j++)
+                sum += *a++ * state->x[j];
+            for (j = 0; j < CONTROLLER_ERRORS; j++)
+                sum += B[i * CONTROLLER_ERRORS + j] * e[j];
+$cut_used            next[i] = sum;
+        }
+        start = end;
+    }
+    for (i = 0; i < CONTROLLER_STATES; i++)
+        state->x[i] = next[i];
+}

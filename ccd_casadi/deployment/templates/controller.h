@@ -1,0 +1,43 @@
+/* H-infinity controller of $title, made by ccd-casadi.
+ *
+ *     v[k] = C x[k] + D e[k] + f[k],   u[k] = $limits
+ *     x[k+1] = A x[k] + B e[k]$back
+ *
+ * Call controller_step once every $period s ($rate Hz). It was $verified with
+ * $delay s from reading y to the new u at the actuator, and a zero-order hold.
+ *   e: e[i] = r[i] - y[i] in m, i = 0 .. CONTROLLER_ERRORS - 1
+ *   u: u[i] in N, i = 0 .. CONTROLLER_FORCES - 1
+ * Compile with -ffp-contract=off where results have to be the same on every machine.
+ */
+#ifndef CONTROLLER_H
+#define CONTROLLER_H
+
+#define CONTROLLER_ERRORS $p
+#define CONTROLLER_FORCES $m
+#define CONTROLLER_STATES $n
+#define CONTROLLER_PERIOD $period
+
+typedef struct {
+    double x[$room];
+} controller_state;
+
+/* Put the controller to rest. */
+void controller_reset(controller_state *state);
+
+/* Take over without a jump: the next step with errors e gives the forces u. */
+void controller_takeover(controller_state *state, const double e[CONTROLLER_ERRORS],
+                         const double u[CONTROLLER_FORCES]);
+
+/* One sample: the forces for these errors; the state is advanced. */
+void controller_step(controller_state *state, const double e[CONTROLLER_ERRORS],
+                     double u[CONTROLLER_FORCES]);
+
+/* The same with feedforward f in N added before the limit. */
+void controller_step_forward(controller_state *state, const double e[CONTROLLER_ERRORS],
+                             const double f[CONTROLLER_FORCES], double u[CONTROLLER_FORCES]);
+
+/* Feedforward of one reference: its position and four derivatives r[0] .. r[4], axis from 0.
+ * The forces are those that the plant needs $ahead s later, when they act. */
+void controller_forward(int axis, const double r[5], double f[CONTROLLER_FORCES]);
+
+#endif

@@ -1,0 +1,39 @@
+"""A package's public names: each is imported from its module when it is first used.
+
+The stub beside the package says which and from where, as editors and type checkers read it.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+
+
+class _Package(ModuleType):
+    """Keeps a public function where a module of its name is imported, as a command's is."""
+
+    _modules: dict[str, str]
+
+    def __getattr__(self, name: str) -> object:
+        if name not in self._modules:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = getattr(import_module(self._modules[name]), name)
+        setattr(self, name, value)
+        return value
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in self._modules and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted(vars(self)["__all__"])
+
+
+def from_stub(package: str) -> list[str]:
+    """Give a package that is being imported the names of its stub; they are returned, sorted."""
+    module = sys.modules[package]
+    with open(f"{str(module.__file__).removesuffix('.py')}.pyi", encoding="utf-8") as stub:
+        lines = [line.split() for line in stub if line.startswith("from ")]
+    # `from MODULE import NAME as NAME`
+    vars(module)["_modules"] = {words[3]: words[1] for words in lines}
+    module.__class__ = _Package
+    return sorted(vars(module)["_modules"])
