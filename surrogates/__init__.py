@@ -28,7 +28,6 @@ del _interrupts
 
 # Every public name, and the module that defines it.
 _PUBLIC = {
-    "Basis": "radial_basis",
     "DesignKind": "sampling_plan",
     "Errors": "interface",
     "Extrapolation": "extrapolation",
@@ -38,7 +37,6 @@ _PUBLIC = {
     "Kind": "fitting",
     "Polynomial": "polynomial",
     "Quality": "quality",
-    "RadialBasis": "radial_basis",
     "Roughness": "quality",
     "Samples": "samples",
     "Surrogate": "interface",
@@ -54,7 +52,6 @@ _PUBLIC = {
     "fit": "fitting",
     "fit_outputs": "fitting",
     "fit_polynomial": "polynomial",
-    "fit_radial_basis": "radial_basis",
     "grid": "sampling_plan",
     "latin_hypercube": "sampling_plan",
     "load": "serialise",

@@ -22,9 +22,8 @@ from surrogates.flat_limit import (
     remainder_of_matern,
 )
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
-from surrogates.interface import Array, Surrogate, no_deviation
-from surrogates.polynomial import Polynomial, total_degree
-from surrogates.radial_basis import DEGREES, Basis, RadialBasis
+from surrogates.interface import Array, Surrogate
+from surrogates.polynomial import Polynomial
 
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
@@ -49,8 +48,7 @@ def to_casadi(
     optimisation that does not use it.
 
     Raises:
-        ValueError: no surrogates, surrogates of different numbers of inputs, or the
-            deviation of one that has none.
+        ValueError: no surrogates, or surrogates of different numbers of inputs.
         TypeError: no expression is registered for the kind of surrogate.
     """
     members = list(surrogate) if isinstance(surrogate, Sequence) else [surrogate]
@@ -115,28 +113,6 @@ def _(polynomial: Polynomial, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
         return (value,)
     leverage = ca.sumsqr(ca.mtimes(ca.DM(polynomial.root), phi))
     return value, ca.sqrt(polynomial.residual_variance * (1.0 + leverage))
-
-
-@expression.register
-def _(surrogate: RadialBasis, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
-    if std:
-        raise no_deviation("radial basis function")
-    unit = in_unit_box(surrogate, x)
-    d = surrogate.lower.size
-    _, s = squared_distances(unit, surrogate.X, np.ones(d))
-    match surrogate.basis:
-        case Basis.CUBIC:
-            phi = s * ca.sqrt(s + UNDER_ROOT)
-        case Basis.QUINTIC:
-            phi = -s * s * ca.sqrt(s + UNDER_ROOT)
-        case Basis.MULTIQUADRIC:
-            phi = -ca.sqrt(1.0 + surrogate.epsilon**2 * s)
-        case Basis.GAUSSIAN:
-            phi = ca.exp(-(surrogate.epsilon**2) * s)
-    v = 2.0 * unit - 1.0
-    tail = products_of(total_degree(d, DEGREES[surrogate.basis]), [ca.MX.ones(d), v, v * v])
-    sum_ = ca.dot(ca.DM(surrogate.weights), phi) + ca.dot(ca.DM(surrogate.tail), tail)
-    return (surrogate.output_mean + surrogate.output_scale * sum_,)
 
 
 def in_unit_box(surrogate: Surrogate, x: ca.MX) -> ca.MX:

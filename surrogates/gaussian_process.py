@@ -71,11 +71,6 @@ class GaussianProcess:
             raise ValueError("there must be one noise to each sample, or none")
         freeze(self.lower, self.upper, self.X, self.targets, self.weights, self.sample_noise)
 
-    @property
-    def has_std(self) -> bool:
-        """A process knows its deviation."""
-        return True
-
     @cached_property
     def left_out(self) -> Array:
         """Leave-one-out residuals (n,), output units."""
