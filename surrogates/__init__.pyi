@@ -19,9 +19,6 @@ from surrogates.polynomial import fit_polynomial as fit_polynomial
 from surrogates.quality import Quality as Quality
 from surrogates.quality import Roughness as Roughness
 from surrogates.quality import quality_of as quality_of
-from surrogates.radial_basis import Basis as Basis
-from surrogates.radial_basis import RadialBasis as RadialBasis
-from surrogates.radial_basis import fit_radial_basis as fit_radial_basis
 from surrogates.samples import Samples as Samples
 from surrogates.samples import checked as checked
 from surrogates.sampling_plan import DesignKind as DesignKind

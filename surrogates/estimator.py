@@ -55,7 +55,7 @@ class SurrogateRegressor(RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: ArrayLike, return_std: bool = False) -> Array | tuple[Array, Array]:
-        """The mean (m,), and with `return_std` its deviation, where the kind knows one."""
+        """The mean (m,), and with `return_std` its deviation."""
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, dtype=np.float64)
         found: Array | tuple[Array, Array] = self.surrogate_.predict(X, return_std)

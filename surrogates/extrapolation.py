@@ -22,7 +22,7 @@ class Extrapolation:
 
     hull: the distance to their convex hull; nearest: to the nearest sample; spacing: the
     median distance of a sample to its nearest neighbour. deviation: the predicted
-    deviation over that met one spacing from the samples (95 % quantile), None without one.
+    deviation over that met one spacing from the samples (95 % quantile), None where that is 0.
     reasons: a sentence for everything amiss; none, and the point is supported.
     """
 
@@ -71,20 +71,18 @@ def extrapolation(surrogate: Surrogate, X: ArrayLike, x: ArrayLike) -> Extrapola
             f"the nearest sample is {nearest:.3g} box widths away, where samples are "
             f"{spacing:.3g} apart"
         )
-    deviation = None
-    if surrogate.has_std:
-        rng = np.random.default_rng(0)
-        step = rng.standard_normal(samples[:NEAREST].shape)
-        step *= spacing / np.linalg.norm(step, axis=1, keepdims=True)
-        around = low + span * np.clip(samples[:NEAREST] + step, 0.0, 1.0)
-        usual = float(np.quantile(surrogate.predict(around, return_std=True)[1], 0.95))
-        here = float(surrogate.predict(low + span * point, return_std=True)[1][0])
-        deviation = here / usual if usual > 0.0 else None
-        if deviation is not None and deviation > DEVIATIONS:
-            reasons.append(
-                f"the predicted deviation is {deviation:.3g} times what is usual "
-                "one spacing from a sample"
-            )
+    rng = np.random.default_rng(0)
+    step = rng.standard_normal(samples[:NEAREST].shape)
+    step *= spacing / np.linalg.norm(step, axis=1, keepdims=True)
+    around = low + span * np.clip(samples[:NEAREST] + step, 0.0, 1.0)
+    usual = float(np.quantile(surrogate.predict(around, return_std=True)[1], 0.95))
+    here = float(surrogate.predict(low + span * point, return_std=True)[1][0])
+    deviation = here / usual if usual > 0.0 else None
+    if deviation is not None and deviation > DEVIATIONS:
+        reasons.append(
+            f"the predicted deviation is {deviation:.3g} times what is usual "
+            "one spacing from a sample"
+        )
     return Extrapolation(hull, nearest, spacing, deviation, tuple(reasons))
 
 

@@ -12,7 +12,6 @@ from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate, SurrogateFitError
 from surrogates.maximum_likelihood import fit_process
 from surrogates.polynomial import Polynomial, fit_polynomial
-from surrogates.radial_basis import RadialBasis, fit_radial_basis
 from surrogates.samples import checked
 
 Noise = ArrayLike | None
@@ -24,7 +23,6 @@ class Kind(StrEnum):
 
     GAUSSIAN_PROCESS = "gaussian_process"
     POLYNOMIAL = "polynomial"
-    RADIAL_BASIS = "radial_basis"
 
 
 @overload
@@ -66,7 +64,7 @@ def fit(
     gradient_noise: float | None = None,
     seed: int = 0,
     starts: int = 5,
-) -> GaussianProcess | Polynomial | RadialBasis:
+) -> GaussianProcess | Polynomial:
     """Fit a surrogate to samples of one output, with gradients if there are any.
 
     X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X, which processes
@@ -91,8 +89,6 @@ def fit(
             return fit_process(samples, family, gradient_noise, seed, starts)
         case Kind.POLYNOMIAL:
             return fit_polynomial(samples)
-        case Kind.RADIAL_BASIS:
-            return fit_radial_basis(samples)
 
 
 def fit_outputs(

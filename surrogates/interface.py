@@ -43,10 +43,6 @@ class Surrogate(Protocol):
         """Upper bounds (d,) of the sampled box, in input units."""
 
     @property
-    def has_std(self) -> bool:
-        """Whether it knows a standard deviation of its own prediction."""
-
-    @property
     def left_out(self) -> Array:
         """Residuals (n,) of the samples, each predicted without it, in output units."""
 
@@ -91,8 +87,3 @@ def freeze(*arrays: Array) -> None:
     """Make arrays that whoever holds the surrogate shares read-only."""
     for array in arrays:
         array.flags.writeable = False
-
-
-def no_deviation(kind: str) -> ValueError:
-    """Return the error of asking a surrogate for the deviation it does not have."""
-    return ValueError(f"a {kind} has no standard deviation: ask for its value only (std=False)")

@@ -59,11 +59,6 @@ class Polynomial:
         """The total degree p."""
         return int(self.exponents.sum(axis=1).max())
 
-    @property
-    def has_std(self) -> bool:
-        """Least squares know their deviation."""
-        return True
-
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
     @overload

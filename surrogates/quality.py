@@ -238,7 +238,9 @@ def _left_out(process: GaussianProcess, seed: int) -> tuple[Samples, Array, Arra
     """The samples, residuals and deviations one by one, residuals fold by fold: nothing of x."""
     samples = _samples(process)
     folded = held_out(
-        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
+        lambda part: conditioned(
+            process.hyperparameters, part, process.kernel, np.empty(0), process.jitter
+        ),
         samples,
         min(FOLDS, len(process.X)),
         seed,

@@ -22,14 +22,12 @@ from surrogates.files import write_whole
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.interface import Surrogate
 from surrogates.polynomial import Polynomial
-from surrogates.radial_basis import RadialBasis
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")
 KINDS: dict[str, type[Any]] = {
     "gaussian_process": GaussianProcess,
     "polynomial": Polynomial,
-    "radial_basis": RadialBasis,
 }
 
 
@@ -109,7 +107,10 @@ def _encode(value: Any) -> Any:
 
 def _member(record: Any) -> Any:
     body = dict(record)
-    return _decode(KINDS[body.pop("kind")], body)
+    kind = body.pop("kind")
+    if kind not in KINDS:
+        raise ValueError(f"kind {kind!r:.60} is none of {', '.join(KINDS)}; fit it again")
+    return _decode(KINDS[kind], body)
 
 
 def _decode(cls: Any, value: Any) -> Any:

@@ -7,11 +7,9 @@ import pytest
 from surrogates import (
     Hyperparameters,
     Surrogate,
-    checked,
     condition,
     design,
     fit,
-    fit_radial_basis,
 )
 
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
@@ -45,10 +43,6 @@ MAKERS = {
     "rbf+gradients": lambda: process("rbf", True),
     "polynomial": lambda: fit(X, Y, **BOX, kind="polynomial"),
     "polynomial+gradients": lambda: fit(X, Y, DY, **BOX, kind="polynomial"),
-    "cubic": lambda: fit_radial_basis(checked(X, Y, **BOX), "cubic", smoothing=0.0),
-    "quintic": lambda: fit_radial_basis(checked(X, Y, **BOX), "quintic", smoothing=1e-6),
-    "multiquadric": lambda: fit_radial_basis(checked(X, Y, **BOX), "multiquadric", 2.0),
-    "gaussian": lambda: fit_radial_basis(checked(X, Y, **BOX), "gaussian", 2.0),
 }
 MADE: dict[str, Surrogate] = {}
 MEMBERS = pytest.mark.parametrize("name", list(MAKERS))

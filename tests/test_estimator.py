@@ -13,7 +13,6 @@ from surrogates import Kind, SurrogateRegressor, to_casadi
     "kind",
     [
         Kind.POLYNOMIAL,
-        pytest.param(Kind.RADIAL_BASIS, marks=pytest.mark.slow),
         pytest.param(Kind.GAUSSIAN_PROCESS, marks=pytest.mark.slow),
     ],
 )

@@ -107,6 +107,8 @@ def damage(document: dict, where: str, value: object) -> dict:
         ("surrogates", 3, "damaged"),
         ("extra", [], "damaged"),
         ("kind", "polynomial", "damaged"),
+        ("kind", "radial_basis", "is none of gaussian_process, polynomial; fit it again"),
+        ("kind", ["x"], "damaged"),
         ("weights", None, "weights"),
         ("weights", [1.0, 2.0], "one weight"),
         ("weights", [1.0, None], "finite"),

@@ -32,17 +32,9 @@ from surrogates import (
 def test_function_equals_prediction(name: str) -> None:
     s = member(name)
     at = np.vstack([T, X[:5]])
-    g = to_casadi(s, std=s.has_std).map(len(at))
-    if s.has_std:
-        mean, std = s.predict(at, return_std=True)
-        ours = g(at.T)
-        np.testing.assert_allclose(flat(ours[1]), std, atol=1e-9 * Y.std(), rtol=0)
-    else:
-        mean, ours = s.predict(at), [g(at.T)]
-        with pytest.raises(ValueError, match="no standard deviation"):
-            s.predict(at, return_std=True)
-        with pytest.raises(ValueError, match="no standard deviation"):
-            to_casadi(s)
+    mean, std = s.predict(at, return_std=True)
+    ours = to_casadi(s).map(len(at))(at.T)
+    np.testing.assert_allclose(flat(ours[1]), std, atol=1e-9 * Y.std(), rtol=0)
     np.testing.assert_allclose(flat(ours[0]), mean, atol=1e-9 * Y.std(), rtol=0)
     assert mean.shape == (65,)
     assert np.sqrt(np.mean((s.predict(T) - f(T)) ** 2)) < 0.1 * Y.std()
@@ -66,16 +58,12 @@ def test_derivatives_match_differences(name: str, at_sample: bool) -> None:
     for i, e in enumerate(1e-4 * np.eye(3)):
         difference = (4.0 * central(e) - central(2.0 * e)) / 3.0
         assert gradient[i] == pytest.approx(difference[0], abs=5e-8)
-        # The third derivative of r³ jumps at a sample, so a difference of slopes is O(h).
-        atol = 5e-4 if at_sample and "cubic" in name else 1e-5
-        np.testing.assert_allclose(hessian.reshape(3, 3)[i], difference[1:], atol=atol)
+        np.testing.assert_allclose(hessian.reshape(3, 3)[i], difference[1:], atol=1e-5)
 
 
 @MEMBERS
 def test_deviation_slope_matches_differences(name: str) -> None:
     s = member(name)
-    if not s.has_std:
-        return
     u = ca.MX.sym("u", 3)
     std = to_casadi(s)(LOW + u * SPAN)[1] / Y.std()
     values = ca.Function("v", [u], [std, ca.gradient(std, u)])
@@ -121,7 +109,7 @@ def test_generated_c_code_compiles_and_agrees(tmp_path: Path) -> None:
     functions = []
     for i, name in enumerate(MAKERS):
         s, x = member(name), ca.MX.sym("x", 3)
-        outputs = to_casadi(s, std=s.has_std).call([x])
+        outputs = to_casadi(s).call([x])
         function = ca.Function(f"m{i}", [x], [*outputs, ca.gradient(outputs[0], x)])
         code.add(function)
         functions.append(function)

@@ -36,11 +36,9 @@ def test_extrapolation_is_flagged_with_its_reason() -> None:
     assert "outside the hull" in " ".join(out.reasons)
     assert "deviation is" in " ".join(out.reasons)
     assert "input 0, 1 is outside" in extrapolation(s, inner, [2.5, -1.0]).reasons[0]
-    plain = fit(inner, smooth(inner), **BOX, kind="radial_basis")
-    assert extrapolation(plain, inner, [1.9, 2.9]).deviation is None
     # A hole in the middle is no matter of the hull.
     ring = X[np.hypot(X[:, 0] / 2, X[:, 1] / 1.5 - 1) > 0.8]
-    hole = extrapolation(fit(ring, smooth(ring), **BOX, kind="radial_basis"), ring, [0.0, 1.5])
+    hole = extrapolation(fit(ring, smooth(ring), **BOX, kind="polynomial"), ring, [0.0, 1.5])
     assert hole.hull < 1e-6
     assert "nearest sample" in hole.reasons[0]
 

@@ -1,7 +1,7 @@
 """A modal table as a smooth function of θ, with exact derivatives and the error of rows left out.
 
 In the frame of `frames` the entries of ln K, ln D, B and C are interpolated one by one (by
-polynomials, or radial basis functions where these predict left-out rows better). The matrix
+polynomials, or Gaussian processes where these predict left-out rows better). The matrix
 logarithm makes K = exp(ln K) positive definite at every θ, and frequencies, which follow powers
 of lengths and masses, nearly linear. Source: Arsigny et al., SIAM J. Matrix Anal. Appl. 29 (2007),
 for log-Euclidean interpolation; the derivative of exp is that of Daleckii and Krein.
@@ -21,7 +21,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from surrogates import Kind, Surrogate, SurrogateFitError, fit, to_casadi
 
-GOOD = 1e-3  # of an entry's range: below it a polynomial is not compared with radial functions
+GOOD = 1e-3  # of an entry's range: below it a polynomial is not compared with a process
 DAMPED = 0.1  # responses are compared at s = (0.1 + j) ω: resonances that move do not drown it
 FREQUENCIES = 120
 
@@ -188,16 +188,16 @@ class InterpolatedModes:
 
 
 def fit_entry(theta: Array, values: Array) -> Surrogate:
-    """One entry over θ, by a polynomial, or by radial functions where these predict better.
+    """One entry over θ, by a polynomial, or by a process where that predicts better.
 
-    Radial functions choose among many shapes: on few samples the best left-out error is luck.
+    A process chooses its length scales: on few samples the best left-out error is luck.
     """
     bounds = {"lower": theta.min(axis=0), "upper": theta.max(axis=0)}
     try:
         best: Surrogate = fit(theta, values, kind=Kind.POLYNOMIAL, **bounds)
         enough = len(theta) >= 2 * comb(theta.shape[1] + 3, 3)
         if enough and best.loo.rms > GOOD * np.ptp(values) > 0.0:
-            other = fit(theta, values, kind=Kind.RADIAL_BASIS, **bounds)
+            other = fit(theta, values, noise=0.0, starts=2, **bounds)
             best = min(best, other, key=lambda member: member.loo.rms)
     except (SurrogateFitError, ValueError) as error:
         raise PlantError(f"the samples cannot be interpolated: {error}; add samples") from error
