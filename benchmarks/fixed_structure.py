@@ -19,6 +19,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from robust_design import synthesise_robustly
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.fixed_structure import Bounds, Sampling, ShapeEnd, Structure, certify
@@ -28,7 +29,7 @@ from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.trust_region import ascend
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import lattice, synthesise_robustly
+from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
 from ccd_casadi.plants.registry import MODELS

@@ -32,10 +32,10 @@ from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.backends import slicot
 from ccd_casadi.synthesis.backends.standard_plant import (
     balance,
-    certify,
     close,
     mixed_sensitivity,
 )
+from ccd_casadi.synthesis.norms import hinf_norm
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds
@@ -96,11 +96,13 @@ def compared(design: Design, plant: ScaledPlant, runner: Runner) -> dict:
     if found.controller is None:
         return {"sb10ad": "no controller"}
     difference = found.gamma_opt / 1e3 - 1.0
-    judged = certify(balance(scaled), found.controller, found.gamma * (1.0 + SLACK))
+    loop = close(balance(scaled), found.controller)
+    stable = np.linalg.eigvals(loop.A).real.max() < 0.0
+    norm = hinf_norm(loop)[0] if stable else np.nan
     words = "equal" if abs(difference) <= AGREE else "above" if difference > 0.0 else "below"
-    if words != "equal" and not judged.passed:
+    if words != "equal" and not norm <= found.gamma * (1.0 + SLACK):
         words += ", its controller does not keep it"
-    return {"sb10ad": words, "difference": difference, "norm": judged.norm / found.gamma}
+    return {"sb10ad": words, "difference": difference, "norm": norm / found.gamma}
 
 
 def one(seed: int, index: int, runner: Runner) -> dict:

@@ -36,6 +36,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from robust_design import synthesise_robustly
 from sections_judge import Case, figures
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structure
@@ -49,7 +50,6 @@ from ccd_casadi.fixed_structure.sections_design import MARGIN, designed
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.fixed_structure.worst_plant import synthesise_robustly
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.support.deadline import Overrun, Runner

@@ -1,7 +1,7 @@
 """Plants that others reported as hard, from the published data: standard plants with their source.
 
-`gamma` is the published optimum where there is one, `digits` its rounding or search tolerance;
-`reason` is a word of the answer where no controller exists.
+`gamma` is the published optimum where there is one, `digits` its rounding or search tolerance.
+`irregular`: D12 or D21 without full rank, or a zero on the axis; Riccati solvers may have neither.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,31 @@ class HardPlant:
     plant: StandardPlant
     gamma: float | None = None
     digits: float = 0.0
-    reason: str = ""
+    irregular: bool = False
+
+
+def regularised(plant: StandardPlant, size: float) -> StandardPlant:
+    """The plant with small disturbances of every state and measurement, and small costs of them.
+
+    Its loop contains the given one: a controller that keeps its norm below γ keeps the other's
+    too. `size` is relative to B1, C1 and to D12, D21.
+    """
+    n, m, p = len(plant.A), plant.B2.shape[1], plant.C2.shape[0]
+    z, w = plant.D11.shape
+    b = size * (np.linalg.norm(plant.B1, 2) or 1.0)
+    c = size * (np.linalg.norm(plant.C1, 2) or 1.0)
+    d12, d21 = (size * (np.linalg.norm(part, 2) or 1.0) for part in (plant.D12, plant.D21))
+    return StandardPlant(
+        A=plant.A,
+        B1=np.hstack([plant.B1, b * np.eye(n), np.zeros((n, p))]),
+        B2=plant.B2,
+        C1=np.vstack([plant.C1, c * np.eye(n), np.zeros((m, n))]),
+        C2=plant.C2,
+        D11=np.block([[plant.D11, np.zeros((z, n + p))], [np.zeros((n + m, w + n + p))]]),
+        D12=np.vstack([plant.D12, np.zeros((n, m)), d12 * np.eye(m)]),
+        D21=np.hstack([plant.D21, np.zeros((p, n)), d21 * np.eye(p)]),
+        D22=plant.D22,
+    )
 
 
 def given(
@@ -47,18 +71,6 @@ def augmented(G: control.StateSpace, W: control.StateSpace, effort: bool) -> Sta
 
 def performance_weight(bandwidth: float, peak: float, low: float) -> control.StateSpace:
     return control.ss(control.tf([1.0 / peak, bandwidth], [1.0, bandwidth * low]))
-
-
-def stacked_double_integrators() -> StandardPlant:
-    """[P11 P12; P21 P22] of four copies of 1/s², as Octave stacks them: 8 states."""
-    A, B, C = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
-    none = np.zeros((2, 1))
-    return StandardPlant.from_parts(
-        np.kron(np.eye(4), A),
-        np.vstack([np.hstack(row) for row in ([B, none], [none, B], [B, none], [none, B])]),
-        np.vstack([np.hstack([C, C, 0 * C, 0 * C]), np.hstack([0 * C, 0 * C, C, C])]),
-        np.zeros((2, 2)), 1, 1,
-    )  # fmt: skip
 
 
 def balancing_board() -> StandardPlant:
@@ -171,27 +183,30 @@ HARD = {
             "python-control #152",
             given([[-0.01, -0.992], [0, -0.75]], [[0.992, 0], [0, 1]], [[1, -0.8], [0, -1]],
                   [[0.8, 0], [1, 0]]),
+            irregular=True,
         ),
         HardPlant(
             "python-control #367",
             given([[-1, 0, 0], [0, -12, -5], [0, 4, 0]], [[2, 0], [0, 0.5], [0, 0]],
                   [[-0.5, 0, -0.5], [0, 0, 0], [-0.5, 0, -0.5]], [[0, 0], [0, 1], [0, 0]]),
+            irregular=True,
         ),
         HardPlant(
             "python-control #973",
             augmented(control.ss(control.tf([1, 1], [1, 0.5, 4])),
                       control.ss(control.tf([2, -2.2, 1], [3, 0.2, 0.01])), False),
+            irregular=True,
         ),
         HardPlant(
             "python-control #895 (Scherer 1997)",
             given([[0, 10, 2], [-1, 1, 0], [0, 2, -5]], [[1, 0], [0, 1], [1, 0]],
                   [[1, 0, 0], [0, 0, 0], [0, 1, 0]], [[0, 0], [0, 1], [2, 0]]),
         ),
-        HardPlant("pkg-control #13", stacked_double_integrators(), reason="no control reaches"),
         HardPlant(
             "pkg-control #14",  # z = x and W_u u, W_u = 10(s + 1)/(s + 100)
             given([[0, 1, 0], [0, 0, 0], [0, 0, -100]], [[0, 0], [1, 1], [0, 1]],
                   [[1, 0, 0], [0, 0, -990], [1, 0, 0]], [[0, 0], [0, 10], [0, 0]]),
+            irregular=True,
         ),
         HardPlant("dkpy #46 (its weights)", balancing_board()),
         HardPlant(
@@ -215,7 +230,7 @@ HARD = {
         HardPlant("Skogestad 3.8, 25 and 0.25", skogestad_3_8(25.0, 0.25), 6.73, 1e-2),
         HardPlant("Skogestad 2.17, design 1", skogestad_2_17(1), 1.37, 5e-3),
         HardPlant("Skogestad 2.17, design 2", skogestad_2_17(2), 2.19, 1e-2),
-        HardPlant("COMPleib AC2", compleib_AC2(), 0.1115, 5e-5),
+        HardPlant("COMPleib AC2", compleib_AC2(), 0.1115, 5e-5, irregular=True),
         HardPlant(
             "COMPleib AC4",
             given([[-0.876, 1, -0.1209, 0], [8.9117, 0, -130.75, 0], [0, 0, -150, 0],

@@ -20,7 +20,6 @@ class Topic(StrEnum):
     HIDDEN_MODE = "hidden mode"
     ZERO = "transmission zero"
     DOMAIN = "domain"
-    EFFORT = "control effort"
     UNITS = "units"
     DERIVATIVES = "derivatives"
 

@@ -33,7 +33,6 @@ class How(StrEnum):
 
     PRESENT = "one synthesis at the present weights"
     SEARCHED = "full inner search: the largest bandwidth at this θ"
-    RUN = "the design of the run"
     SECTIONS = "fixed structure, climbed from its anchors at this θ"
     HELD = "fixed structure, the controller designed last, judged at this θ"
 

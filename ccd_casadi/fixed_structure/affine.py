@@ -97,13 +97,6 @@ class Affine:
         if len(self.slope) != len(other.slope):
             raise ValueError(f"{len(self.slope)} and {len(other.slope)} variables: use `of`")
 
-    def power(self, exponent: int) -> "Affine":
-        """f to a power from 1 on."""
-        out = self
-        for _ in range(exponent - 1):
-            out = out * self
-        return out
-
     def of(self, variables: int) -> "Affine":
         """The same of more variables, of which the first are its own."""
         more = np.zeros((variables - len(self.slope), self.slope.shape[1]), self.slope.dtype)

@@ -1,44 +1,36 @@
-"""The worst plants of a box are searched and added to the set until none passes a bound.
+"""The worst plants of a box, searched; the run adds them to its set until none exceeds a bound.
 
     max over p in the box of  max_j c_j(κ, τ; p)
 
 by compass searches from many points at once, of more than four parameters by ascent: each of the
 largest c_j of a plant, made linear in p, points to a corner of the box, and steps towards these
-corners are tried. An unstable loop is worst of all. What the end says is
-what was done: the number of plants that were looked at, a lattice of the box among them, and the
-worst of them. For what lies between there is `box_proof`.
+corners are tried. An unstable loop is worst of all. For what lies between there is `box_proof`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.box_proof import Proof, prove
-from ccd_casadi.fixed_structure.certificate import Certificate, certify
-from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import plants_of_rows
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, to_theta
 from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
-from ccd_casadi.fixed_structure.sections_design import SectionsDesign, in_problem_units
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 WITHIN = 1e-4  # ln: by how much a plant of the box may pass a bound and count as within
 UNSTABLE = 10.0  # ln: what an unstable loop counts as
 LATTICE = 200  # plants, evenly over the box
 SEARCHES = 6
 ROUNDS = 7  # of a compass search, its step halved each time
-AT_ONCE = 3  # plants added in one round
 FEW = 4  # parameters up to which every one is moved on its own
 LARGEST = 3  # constraints of a plant that are followed
 STEPS = (1.0, 0.3)  # towards the corner that a constraint points to
@@ -52,31 +44,6 @@ class Excess:
     option: int
     point: Array
     value: float
-
-
-@dataclass(frozen=True)
-class RobustDesign:
-    """A design on a set of plants that the search found, judged on many more.
-
-    `added` are the set's (option, point); `worst` what the search found last; `certificate` is the
-    judge's on `checked` plants of a lattice and the worst ones, `proof` for the whole box. `words`
-    say what holds where.
-    """
-
-    design: SectionsDesign
-    added: tuple[tuple[int, Array], ...]
-    worst: Excess
-    certificate: Certificate | None
-    proof: Proof | None
-    checked: int
-    rounds: int
-    seconds: float
-    words: str
-
-    @property
-    def certified(self) -> bool:
-        """On every plant that was looked at."""
-        return self.design.certified and self.certificate is not None and self.certificate.passed
 
 
 def lattice(uncertain: UncertainPlant, count: int, seed: int) -> list[tuple[int, Array]]:
@@ -213,80 +180,4 @@ def _towards_corners(
             point = head.point + step * (corner - head.point)
             if np.abs(point - head.point).max() > 0.0:
                 found.append((row, point))
-    return found
-
-
-def synthesise_robustly(
-    uncertain: UncertainPlant,
-    structure: Structure | ChannelStructure,
-    bounds: Bounds,
-    *,
-    sampling: Sampling | None = None,
-    starts: int = 12,
-    seed: int = 0,
-    initial: Sequence[Array | StateSpace] = (),
-    rounds: int = 8,
-    count: int = LATTICE,
-    progress: Callable[[str], None] | None = None,
-    workers: Pool | None = None,
-) -> RobustDesign:
-    """max ω_b with every bound on every plant of a box, as far as searches find none that fails.
-
-    The set starts with the models and the corners of the box. Each round designs on the set,
-    searches the worst plants of the box, and adds those that pass a bound. Searches start
-    from the worst of `count` plants of a lattice, the judge looks at as many. The searches of the
-    race and the plants of the judge are spread over `workers`.
-    """
-    begun = perf_counter()
-    tell = progress or (lambda words: None)
-    members = uncertain.corners()
-    made = synthesise(
-        uncertain.plants(members), structure, bounds, sampling=sampling, starts=starts, seed=seed,
-        initial=initial, progress=progress, workers=workers,
-    )  # fmt: skip
-    looked, turn = 0, 0
-    worst = Excess(0, uncertain.nominal, np.nan)
-    while made.certified:
-        heads, seen = worst_plants(uncertain, structure, made.kappa, made.bandwidth, bounds,
-                                    sampling, seed=seed + turn, count=count)  # fmt: skip
-        looked += seen
-        worst = heads[0]
-        turn += 1
-        tell(f"worst of {seen} plants: {np.expm1(worst.value):+.2%} of a bound at {worst.point}")
-        if worst.value <= WITHIN or turn > rounds:
-            break
-        members = members + _apart(heads, members, uncertain.box)
-        made = synthesise(uncertain.plants(members), structure, bounds, sampling=sampling,
-                                   seed=seed, initial=[made.kappa], only_initial=True,
-                                   progress=progress)  # fmt: skip
-    judged: Certificate | None = None
-    proof: Proof | None = None
-    checked = 0
-    if made.certified and made.controller is not None:
-        points = [*lattice(uncertain, count, seed + 1000), (worst.option, worst.point)]
-        checked = len(points)
-        tolerant = bounds.looser(2.0 * WITHIN)
-        judged = certify(uncertain.plants(points), made.controller, tolerant, sampling,
-                         integrator=structure.integrator, workers=workers)  # fmt: skip
-        proof = prove(uncertain, structure, made.kappa, made.bandwidth, bounds, sampling)
-    if judged is None or proof is None:
-        words = made.words
-    else:
-        found = f"{np.expm1(worst.value):+.1e} of a bound; {proof.words}"
-        words = f"{judged.words}; searches over {looked} plants found none worse than {found}"
-    return RobustDesign(made, tuple(members), worst, judged, proof, checked, turn,
-                        perf_counter() - begun, words)  # fmt: skip
-
-
-def _apart(
-    heads: Sequence[Excess], members: Sequence[tuple[int, Array]], box: Array
-) -> list[tuple[int, Array]]:
-    """Of the plants that pass a bound some, each away from the others and from what is there."""
-    width = np.maximum(box[1] - box[0], 1e-300)
-    found: list[tuple[int, Array]] = []
-    for head in heads:
-        near = [np.abs((head.point - point) / width).max(initial=0.0) for option, point in
-                (*members, *found) if option == head.option]  # fmt: skip
-        if head.value > WITHIN and (not near or min(near) > 1e-4) and len(found) < AT_ONCE:
-            found.append((head.option, head.point))
     return found

@@ -109,14 +109,6 @@ def plant_from_control(system: Any, M_K: float) -> ScaledPlant:
     return scale_state_space(space, M_K)
 
 
-def controller_from_control(system: Any) -> StateSpace:
-    """A continuous controller in SI, e = r - y to u. Raises UserError where it is discrete."""
-    space, period = from_control(system)
-    if period:
-        raise UserError("the controller is in discrete time; give the continuous one")
-    return space
-
-
 def write_mat(path: Path, design: DesignFile) -> None:
     """Write the systems and θ as MATLAB version 5. Raises UserError where that cannot be done."""
     content: dict[str, Any] = {}

@@ -23,7 +23,7 @@ from ccd_casadi.support.arrays import Array
 NAMES = ("h", "t_o", "t_i", "t_c", "H", "x_i")
 LOWER = (1e-3, 3e-3, 3e-3, 3e-3, 6e-3, 67.5e-3)
 UPPER = (4e-3, 8e-3, 8e-3, 8e-3, 20e-3, 95e-3)
-IS_RIB = (True, False, True, False, True)  # from the centre outwards
+IS_RIB = (True, False, True, False, True)  # t_c/2, b_2, t_i, b_1, t_o: from the centre
 
 Point = tuple[float, float]
 

@@ -25,4 +25,3 @@ class Backend:
 
 SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot")
 LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi")
-GENERAL = (SLICOT, LMI)

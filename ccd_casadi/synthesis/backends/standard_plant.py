@@ -1,4 +1,4 @@
-"""The standard plant of H∞ control, its loop with a controller, and what makes it solvable.
+"""The standard plant of H∞ control and its loop with a controller.
 
 ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 """
@@ -10,12 +10,7 @@ import numpy as np
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
 from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.norms import hinf_norm
-from ccd_casadi.synthesis.synthesis import Certificate
 from ccd_casadi.synthesis.weights import Weights
-
-RANK = 1e-9  # relative: a singular value below it is zero
-ON_AXIS = 1e-9  # |Re λ| over the largest |λ| of a pole that counts as on the axis
 
 
 @dataclass(frozen=True)
@@ -97,31 +92,6 @@ def balance(plant: StandardPlant) -> StandardPlant:
     return StandardPlant.from_parts(A, B, C, whole.D, plant.C2.shape[0], plant.B2.shape[1])
 
 
-def regularised(plant: StandardPlant, size: float) -> StandardPlant:
-    """The plant with small disturbances of every state and measurement, and small costs of them.
-
-    Its loop contains the given one: a controller that keeps its norm below γ keeps the other's
-    too. Poles and zeros on the axis, D12 and D21 without full rank do it no harm. `size` is
-    relative to B1, C1 and to D12, D21.
-    """
-    n, m, p = len(plant.A), plant.B2.shape[1], plant.C2.shape[0]
-    z, w = plant.D11.shape
-    b = size * (np.linalg.norm(plant.B1, 2) or 1.0)
-    c = size * (np.linalg.norm(plant.C1, 2) or 1.0)
-    d12, d21 = (size * (np.linalg.norm(part, 2) or 1.0) for part in (plant.D12, plant.D21))
-    return StandardPlant(
-        A=plant.A,
-        B1=np.hstack([plant.B1, b * np.eye(n), np.zeros((n, p))]),
-        B2=plant.B2,
-        C1=np.vstack([plant.C1, c * np.eye(n), np.zeros((m, n))]),
-        C2=plant.C2,
-        D11=np.block([[plant.D11, np.zeros((z, n + p))], [np.zeros((n + m, w + n + p))]]),
-        D12=np.vstack([plant.D12, np.zeros((n, m)), d12 * np.eye(m)]),
-        D21=np.hstack([plant.D21, np.zeros((p, n)), d21 * np.eye(p)]),
-        D22=plant.D22,
-    )
-
-
 def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
     """The loop from w to z. Raises LinAlgError where it is not well posed."""
     p, m = plant.C2.shape[0], plant.B2.shape[1]
@@ -136,73 +106,6 @@ def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
     B = np.vstack([plant.B1 + plant.B2 @ DD, K.B @ F @ plant.D21])
     C = np.hstack([plant.C1 + plant.D12 @ DC, plant.D12 @ EC])
     return StateSpace(A, B, C, plant.D11 + plant.D12 @ DD)
-
-
-def certify(plant: StandardPlant, K: StateSpace, gamma: float) -> Certificate:
-    """Rebuild the loop and prove it: its eigenvalues, and its norm against `gamma`.
-
-    For plants that are no mixed-sensitivity problem; for those `closed_loop.measure` judges.
-    """
-    failed = Certificate(False, np.nan, np.nan, gamma, False)
-    if not all(np.isfinite(part).all() for part in vars(K).values()):
-        return failed
-    try:
-        loop = close(plant, K)
-        A, B, C = balanced(loop.A, loop.B, loop.C)
-        right = float(np.linalg.eigvals(A).real.max())
-        norm = hinf_norm(StateSpace(A, B, C, loop.D))[0] if right < 0.0 else np.nan
-    except np.linalg.LinAlgError:
-        return failed
-    return Certificate(right < 0.0, right, norm, gamma, bool(right < 0.0 and norm <= gamma))
-
-
-# ---- what makes a plant solvable --------------------------------------------------------------
-
-
-def obstacles(plant: StandardPlant) -> tuple[str, ...]:
-    """Why no controller stabilises the plant; empty where one does. (Hautus's rank tests.)"""
-    found = []
-    poles = np.linalg.eigvals(plant.A)
-    scale = max(float(np.abs(poles).max(initial=0.0)), 1e-300)
-    for pole in poles[(poles.real >= -ON_AXIS * scale) & (poles.imag >= 0.0)]:
-        if _deficient(plant.A, plant.B2, pole):
-            found.append(f"no control reaches the unstable mode at s = {_number(pole)}")
-        if _deficient(plant.A.T, plant.C2.T, pole):
-            found.append(f"no measurement sees the unstable mode at s = {_number(pole)}")
-    return tuple(dict.fromkeys(found))
-
-
-def irregularities(plant: StandardPlant) -> tuple[str, ...]:
-    """What a Riccati solver may not have: D12, D21 without full rank, zeros on the axis."""
-    found = []
-    if np.linalg.matrix_rank(plant.D12) < plant.D12.shape[1]:
-        found.append("D12 has not full column rank: a control costs nothing at high frequency")
-    elif _zero_on_axis(plant.A, plant.B2, plant.C1, plant.D12):
-        found.append("(A, B2, C1, D12) has a zero on the imaginary axis")
-    if np.linalg.matrix_rank(plant.D21) < plant.D21.shape[0]:
-        found.append("D21 has not full row rank: a measurement has no noise at high frequency")
-    elif _zero_on_axis(plant.A.T, plant.C2.T, plant.B1.T, plant.D21.T):
-        found.append("(A, B1, C2, D21) has a zero on the imaginary axis")
-    return tuple(found)
-
-
-def _deficient(A: Array, B: Array, pole: complex) -> bool:
-    values = np.linalg.svd(np.hstack([A - pole * np.eye(len(A)), B]), compute_uv=False)
-    return bool(values[-1] <= RANK * values[0])
-
-
-def _zero_on_axis(A: Array, B: Array, C: Array, D: Array) -> bool:
-    """Where D has full column rank the zeros are the modes of A - BD⁺C that (I - DD⁺)C misses."""
-    inverse = np.linalg.pinv(D)
-    F, seen = A - B @ inverse @ C, C - D @ inverse @ C
-    values = np.linalg.eigvals(F)
-    scale = max(float(np.abs(values).max(initial=0.0)), 1e-300)
-    on_axis = values[np.abs(values.real) <= ON_AXIS * scale]
-    return any(_deficient(F.T, seen.T, value) for value in on_axis)
-
-
-def _number(s: complex) -> str:
-    return f"{s.real:.3g}" if abs(s.imag) <= ON_AXIS * abs(s) else f"{s.real:.3g} ± {s.imag:.3g}j"
 
 
 def without_d22(plant: StandardPlant) -> StandardPlant:
