@@ -94,11 +94,12 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
         (down,), (up,) = first.gradient, second.gradient
         return (first.bandwidth - second.bandwidth + up * b - down * a) / (up - down)
 
-    (thin, _), (thick, _) = at(0.0198), at(0.0200)
-    assert thin.gradient[0] * thick.gradient[0] < 0.0
-    near = meeting(thin, thick)
-    close = [at(near - 1e-6)[0], at(near + 1e-6)[0]]
-    assert close[0].gradient[0] * close[1].gradient[0] < 0.0
+    (thin, _), (thick, _) = at(0.0205), at(0.0225)
+    assert thin.gradient[0] > 0.0 > thick.gradient[0]
+    while thick.theta[0] - thin.theta[0] > 2e-6:
+        middle = at(0.5 * (thin.theta[0] + thick.theta[0]))[0]
+        thin, thick = (middle, thick) if middle.gradient[0] > 0.0 else (thin, middle)
+    close, near = (thin, thick), thin.theta[0]
     kink, envelope = at(meeting(*close))
     assert kink.bandwidth > max(one.bandwidth for one in (thin, thick, *close)) * (1.0 - 1e-9)
     assert sections_kkt(problem, kink, None, envelope).stationarity < 1e-5
