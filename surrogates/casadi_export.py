@@ -7,13 +7,20 @@ samples and 8 inputs, mean with gradient: 0.07 ms so, 0.25 ms unrolled in SX (an
 
 from collections.abc import Sequence
 from functools import singledispatch
-from math import factorial
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from surrogates.covariance import ROOT5, Kernel
+from surrogates.flat_limit import (
+    UNDER_ROOT,
+    FlatLimit,
+    even_odd,
+    matern_series,
+    remainder_of_exp,
+    remainder_of_matern,
+)
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
 from surrogates.interface import Array, Surrogate
 from surrogates.polynomial import Polynomial
@@ -21,10 +28,12 @@ from surrogates.polynomial import Polynomial
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
 NEAR = 1e-2
-# Added to s under the root of the odd terms, which start at r³: AD finds 0 · 1e15 and not 0 · inf.
-UNDER_ROOT = 1e-30
-# Taylor coefficients in r of (1 + a r + a² r²/3) e^(-a r), a = √5: those of r and r³ vanish.
-TAYLOR = [(-ROOT5) ** m * ((m - 1) * (m - 3)) / (3.0 * factorial(m)) for m in range(10)]
+
+
+class _Symbols:
+    exp = staticmethod(ca.exp)
+    sqrt = staticmethod(ca.sqrt)
+    choose = staticmethod(ca.if_else)
 
 
 def to_casadi(
@@ -52,6 +61,9 @@ def to_casadi(
     return ca.Function(name, [x], outputs, ["x"], ["mean", "std"][: len(outputs)])
 
 
+SYMBOLS = _Symbols()
+
+
 @singledispatch
 def expression(surrogate: Surrogate, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     """Return (mean,) or, with `std`, (mean, std) of a surrogate at the symbol x (d).
@@ -69,13 +81,17 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     unit = in_unit_box(process, x)
     z, s = squared_distances(unit, process.X, lengths)
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
-    weights = process.weights.reshape(-1, n)
-    total = ca.dot(ca.DM(weights[0]), phi[0])
-    if process.has_gradients:
-        # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
-        along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
-        total -= 2.0 * ca.dot(along, phi[1])
-    mean = process.output_mean + process.output_scale * p.signal_variance * total
+    if process.flat is not None:
+        scaled = flat_mean(process.flat, unit)
+    else:
+        weights = process.weights.reshape(-1, n)
+        total = ca.dot(ca.DM(weights[0]), phi[0])
+        if process.has_gradients:
+            # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
+            along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
+            total -= 2.0 * ca.dot(along, phi[1])
+        scaled = p.signal_variance * total
+    mean = process.output_mean + process.output_scale * scaled
     if not std:
         return (mean,)
     k = phi[0]
@@ -102,6 +118,27 @@ def _(polynomial: Polynomial, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
 def in_unit_box(surrogate: Surrogate, x: ca.MX) -> ca.MX:
     """x̂ = (x - lower) / (upper - lower)."""
     return (x - ca.DM(surrogate.lower)) / ca.DM(surrogate.upper - surrogate.lower)
+
+
+def flat_mean(flat: FlatLimit, unit: ca.MX) -> ca.MX:
+    """`FlatLimit.mean` of a symbol."""
+    p = ca.dot(ca.DM(flat.polynomial), legendre_products(flat.exponents, 2.0 * unit - 1.0))
+    x = (unit - 0.5) / ca.DM(flat.lengths)
+    if flat.kernel is Kernel.RBF:
+        u = ca.mtimes(ca.DM(flat.points), x)
+        total = ca.dot(ca.DM(flat.values), remainder_of_exp(u, flat.degree, SYMBOLS))
+        if flat.slopes is not None:
+            along = ca.mtimes(ca.DM(flat.slopes), x)
+            total += ca.dot(along, remainder_of_exp(u, flat.degree - 1, SYMBOLS))
+        return ca.exp(-0.5 * ca.sumsqr(x)) * (p + total)
+    z = ca.repmat(x, 1, len(flat.points)) - ca.DM(flat.points.T)
+    s = ca.sum1(z * z).T
+    remainders = remainder_of_matern(s, int(flat.slopes is not None), SYMBOLS)
+    total = ca.dot(ca.DM(flat.values), remainders[0])
+    if flat.slopes is not None:
+        along = ca.sum1(z * ca.DM(flat.slopes.T)).T
+        total -= 2.0 * ca.dot(along, remainders[1])
+    return p + total
 
 
 def legendre_products(exponents: Array, v: ca.MX) -> ca.MX:
@@ -134,24 +171,15 @@ def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
     r = ca.sqrt(far)
     e = ca.exp(-ROOT5 * r)
     closed = [(1.0 + ROOT5 * r + (5.0 / 3.0) * far) * e, (-5.0 / 6.0) * (1.0 + ROOT5 * r) * e]
+    c = matern_series(10)
     # φ = Σ c_m r^m and φ' = Σ (m/2) c_m r^(m-2); c_1 = c_3 = 0, which is what makes
     # the kernel twice differentiable.
-    c1 = [0.5 * (m + 2) * TAYLOR[m + 2] for m in range(len(TAYLOR) - 2)]
-    taylor = [_even_odd(TAYLOR, 5, s, near), _even_odd(c1, 3, s, near)]
+    c1 = [0.5 * (m + 2) * c[m + 2] for m in range(len(c) - 2)]
+    taylor = [even_odd(c, 5, s, near), even_odd(c1, 3, s, near)]
     return [
         ca.if_else(s < NEAR**2, inner, outer)
         for inner, outer in zip(taylor[: order + 1], closed, strict=False)
     ]
-
-
-def _even_odd(c: Sequence[float], first_odd: int, s: ca.MX, r: ca.MX) -> ca.MX:
-    """Σ c_m r^m by Horner in s = r², the odd terms from first_odd with one r outside."""
-    even = odd = 0.0 * s
-    for coefficient in reversed(c[0::2]):
-        even = coefficient + s * even
-    for coefficient in reversed(c[first_odd::2]):
-        odd = coefficient + s * odd
-    return even + s ** ((first_odd - 1) // 2) * r * odd
 
 
 def products_of(exponents: Array, powers: list[ca.MX]) -> ca.MX:

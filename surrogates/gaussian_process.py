@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
 from surrogates.covariance import Hyperparameters, Kernel, covariance, radial
+from surrogates.flat_limit import FlatLimit, flat_limit
 from surrogates.interface import Array, Errors, box, freeze, points_in
 from surrogates.likelihood import factorise, symmetric_inverse
 from surrogates.samples import Samples, checked
@@ -21,9 +22,6 @@ from surrogates.validation import errors
 # Rounding leaves the predictive variance at noise-free samples anywhere within a
 # few eps of zero, of either sign; below this share of σ² it is taken as the floor.
 VARIANCE_FLOOR = 1e-20
-# Share of the prior variance that a fit adds to the diagonal: without it the weights of smooth
-# functions reach 1e10 and cancel, and IPOPT ends on the rounding (docs/surrogates.md).
-JITTER = 1e-10
 CHUNK = 4000  # points that `mean_at_many` takes at a time, which bounds its memory
 TWO_SIDED_95 = 1.959963984540054
 
@@ -97,6 +95,11 @@ class GaussianProcess:
             self.sample_noise,
         )[0]
 
+    @cached_property
+    def flat(self) -> FlatLimit | None:
+        """The mean without cancellation, where large weights of a smooth function would cancel."""
+        return flat_limit(self.kernel, self.hyperparameters, self.X, self.weights)
+
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
     @overload
@@ -111,11 +114,14 @@ class GaussianProcess:
             ValueError: X does not have the inputs of the box.
         """
         unit = (points_in(self, X) - self.lower) / (self.upper - self.lower)
+        if not return_std and self.flat is not None:
+            return self.output_mean + self.output_scale * self.flat.mean(unit)
         p = self.hyperparameters
         k = p.signal_variance * covariance(
             self.kernel, unit, self.X, p.length_scales, gradients_of_b=self.has_gradients
         )
-        mean = self.output_mean + self.output_scale * (k @ self.weights)
+        scaled = k @ self.weights if self.flat is None else self.flat.mean(unit)
+        mean = self.output_mean + self.output_scale * scaled
         if not return_std:
             return mean
         v = solve_triangular(self.factor, k.T, lower=True)
@@ -160,14 +166,12 @@ def condition(
     kernel: Kernel | str = Kernel.MATERN52,
     dY: ArrayLike | None = None,
     noise: ArrayLike | None = None,
-    jitter: float = 0.0,
 ) -> GaussianProcess:
     """Condition a process of given (scaled) hyperparameters on samples.
 
     X (n, d) in input units, Y (n,) in output units, dY (n, d) = ∂Y/∂X. `noise` (n,) are
     standard deviations of Y where the samples differ in it, output units; their
-    variances add to that of the hyperparameters. `jitter` is the least share of
-    the prior variance added to the diagonal: JITTER keeps sums of large weights from cancelling.
+    variances add to that of the hyperparameters.
 
     Raises:
         SurrogateFitError: wrong shapes, values that are not finite, or a covariance
@@ -175,21 +179,17 @@ def condition(
     """
     samples = checked(X, Y, lower, upper, dY, noise)
     own = np.empty(0) if noise is None else samples.noise_variances
-    return conditioned(hyperparameters, samples, Kernel(kernel), own, jitter)
+    return conditioned(hyperparameters, samples, Kernel(kernel), own)
 
 
 def conditioned(
-    hyperparameters: Hyperparameters,
-    samples: Samples,
-    kernel: Kernel,
-    sample_noise: Array,
-    jitter: float,
+    hyperparameters: Hyperparameters, samples: Samples, kernel: Kernel, sample_noise: Array
 ) -> GaussianProcess:
     """As `condition`, of samples that are checked already."""
     mean, scale = samples.scaling
     unit, targets = samples.unit, samples.targets
     gradients = samples.dY is not None
-    L, added = factorise(kernel, unit, hyperparameters, gradients, jitter, sample_noise)
+    L, jitter = factorise(kernel, unit, hyperparameters, gradients, 0.0, sample_noise)
     process = GaussianProcess(
         kernel=kernel,
         lower=samples.lower,
@@ -200,7 +200,7 @@ def conditioned(
         X=unit,
         targets=targets,
         weights=cho_solve((L, True), targets),
-        jitter=added,
+        jitter=jitter,
         loo=Errors(0.0, 0.0, 0.0),
         sample_noise=sample_noise,
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from surrogates.calibration import calibrated, centred
 from surrogates.covariance import Hyperparameters, Kernel
-from surrogates.gaussian_process import JITTER, GaussianProcess, conditioned
+from surrogates.gaussian_process import GaussianProcess, conditioned
 from surrogates.interface import Array, SurrogateFitError
 from surrogates.likelihood import (
     LENGTH_BOUNDS,
@@ -60,7 +60,7 @@ def fit_process(
             "Gaussian process holds: use kind='polynomial', or fewer samples"
         )
     parameters = estimate(samples, kernel, gradient_noise, seed, starts)
-    process = conditioned(parameters, samples, kernel, uneven_noise(samples), JITTER)
+    process = conditioned(parameters, samples, kernel, uneven_noise(samples))
     return calibrated(centred(process))
 
 
@@ -94,7 +94,7 @@ def estimate(
 
 def _left_out(parameters: Hyperparameters, samples: Samples, kernel: Kernel) -> float:
     """The error left out of the process of these hyperparameters, about its own mean."""
-    return centred(conditioned(parameters, samples, kernel, np.empty(0), JITTER)).loo.rms
+    return centred(conditioned(parameters, samples, kernel, np.empty(0))).loo.rms
 
 
 def uneven_noise(samples: Samples) -> Array:

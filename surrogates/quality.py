@@ -238,9 +238,7 @@ def _left_out(process: GaussianProcess, seed: int) -> tuple[Samples, Array, Arra
     """The samples, residuals and deviations one by one, residuals fold by fold: nothing of x."""
     samples = _samples(process)
     folded = held_out(
-        lambda part: conditioned(
-            process.hyperparameters, part, process.kernel, np.empty(0), process.jitter
-        ),
+        lambda part: conditioned(process.hyperparameters, part, process.kernel, np.empty(0)),
         samples,
         min(FOLDS, len(process.X)),
         seed,

@@ -26,7 +26,6 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, condition, design, fit_outputs, to_casadi
-from surrogates.gaussian_process import JITTER
 
 STEP = 1e-4  # share of the box below which a step counts as small
 SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
@@ -168,7 +167,6 @@ def update_quantities(
             upper=upper,
             kernel=process.kernel,
             dY=np.array([sample.gradients[i] for sample in samples]),
-            jitter=JITTER,
         )
         for i, process in enumerate(processes)
     )
