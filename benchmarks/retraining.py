@@ -23,8 +23,9 @@ from ccd_casadi.codesign.retraining import CoDesignTruth
 from ccd_casadi.reporting.retrained_run import open_run
 from surrogates import sobol
 from surrogates.acquisition import objective_and_violation
-from surrogates.retraining import Settings, iterate, retrain, thinned
-from surrogates.versions import Versions
+from surrogates.iteration import STARTS, fit_all
+from surrogates.optimum import predicted_optimum
+from surrogates.retraining import Settings, retrain, thinned
 
 ROOT = Path(__file__).parent.parent
 CASES = ("two_mass", "two_mass_paper")
@@ -53,17 +54,30 @@ def retrained(folder: Path, case: str, seed: int) -> dict[str, float | str | Non
         outcome = retrain(folder, truth, Settings(seed=seed))
         seconds = perf_counter() - began
     result = json.loads((folder / "result.json").read_text())
-    versions = Versions(folder)
-    counts = [versions.load(name)[1].samples for name in versions.names()]
+    lines = [json.loads(line) for line in (folder / "retrain.jsonl").read_text().splitlines()]
+    rounds = [line for line in lines if line["event"] == "round"]
     return {
         "status": outcome.status,
         "reason": outcome.reason,
         "objective": result["objective"],
-        "fitted": counts,
+        "designs": FIRST + sum(len(line["batch"]) for line in rounds),
         "syntheses": FIRST + outcome.spent,
-        "rounds": outcome.rounds,
+        "rounds": len(rounds),
         "seconds": seconds,
+        "lines": rounds,
     }
+
+
+def count_until(folder: Path, case: str, rounds: list[dict], optimum: float) -> int | None:
+    """Designs sampled before the first round whose prediction was the optimum."""
+    with opened(folder, case) as truth:
+        sampled = FIRST
+        for line in rounds:
+            x = np.array(line["batch"][0])  # the predicted optimum comes first
+            if line["predicted"] is not None and reached(truth, x, line["predicted"], optimum):
+                return sampled
+            sampled += len(line["batch"])
+    return None
 
 
 def fixed(folder: Path, case: str, seed: int, optimum: float) -> int | None:
@@ -72,9 +86,12 @@ def fixed(folder: Path, case: str, seed: int, optimum: float) -> int | None:
         with opened(folder / str(n), case) as truth:
             truth.evaluate(sobol(truth.lower, truth.upper, n, seed))
             observed, failed = thinned(truth, truth.samples())
-            found = iterate(truth, observed, failed, Versions(folder / str(n)), seed)
-            predicted = found.version.objective
-            if predicted is not None and reached(truth, found.near[0], predicted, optimum):
+            surrogates = fit_all(truth, observed, seed)
+            J, violation = objective_and_violation(truth, observed.X, observed.Y)
+            first = observed.X[np.argmin(np.where(violation <= 0.0, J, np.inf))]
+            starts = np.vstack([first, sobol(truth.lower, truth.upper, STARTS, seed)])
+            found = predicted_optimum(truth, surrogates, starts, failed)
+            if found is not None and reached(truth, found.x, found.objective, optimum):
                 return n
         n *= 2
     return None
@@ -94,8 +111,10 @@ def main() -> None:
             optimum = min(run["objective"] for run in runs)
             for seed, run in enumerate(runs):
                 place = Path(name) / case
+                rounds = run.pop("lines")
                 row = {"case": case, "seed": seed, **run, "optimum": optimum}
                 row["loss"] = run["objective"] / optimum - 1.0
+                row["retrained_until"] = count_until(place / f"c{seed}", case, rounds, optimum)
                 row["fixed_until"] = fixed(place / f"f{seed}", case, seed, optimum)
                 table.append(row)
                 print(json.dumps(row), flush=True)

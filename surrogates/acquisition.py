@@ -1,15 +1,17 @@
-"""Where new truth helps most: the predicted optimum, then constrained expected improvement.
+"""Where new truth helps most: constrained expected improvement, and exploration, q at a time.
 
 With y ~ N(μ(x), diag σ²(x)), J and g are linearised in y,
 
     σ_J² = Σ_i (∂J/∂y_i)² σ_i²,      σ_g² = Σ_i (∂g/∂y_i)² σ_i²,
 
-and the merit of a point is EI(x) Π_j P(g_j <= 0), where with the best known J* and
-u = (J* - J(x, μ)) / σ_J the expected improvement is EI = σ_J (u Φ(u) + φ(u)).
+and the merit of a point is EI(x) Π_j P(g_j <= 0), times the chance of a value there, where with
+the best known J* and u = (J* - J(x, μ)) / σ_J the expected improvement is
+EI = σ_J (u Φ(u) + φ(u)).
 Source: Schonlau, Welch and Jones (1998); batches by the kriging believer of Ginsbourger,
 Le Riche and Carraro (2010).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -18,7 +20,6 @@ import numpy as np
 from surrogates.casadi_export import to_casadi
 from surrogates.gaussian_process import GaussianProcess, condition
 from surrogates.interface import Array
-from surrogates.ipopt import end_points
 from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth
 
@@ -52,26 +53,46 @@ class Posterior:
         allowed = violation <= SLACK * self.truth.tolerance
         return int(np.flatnonzero(allowed)[np.argmin(J[allowed])]) if allowed.any() else None
 
-    def new(self, X: Array) -> Array:
-        """Which (m,) of X (m, d) were not asked before, nor are by a point without a value."""
-        known = distances(self.truth, X, self.observed.X) > NEAR
-        return np.asarray(known & (distances(self.truth, X, self.failed) > AVOID))
+    def distance(self, X: Array) -> Array:
+        """Distances (m,) of X (m, d) to the nearest point asked before, shares of the box."""
+        return distances(self.truth, X, np.vstack([self.observed.X, self.failed]))
+
+    def chance_of_value(self, X: Array) -> Array:
+        """A guess (m,) at the probability that the truth has a value at X (m, d).
+
+        r_f² / (r_f² + r_k²) of the distances to the nearest failed and known point, 0 within
+        AVOID of a failed one: regions without truth are left alone once they are found.
+        """
+        if not len(self.failed):
+            return np.ones(len(X))
+        to_failed = distances(self.truth, X, self.failed)
+        to_known = distances(self.truth, X, self.observed.X)
+        guess = to_failed**2 / np.maximum(to_failed**2 + to_known**2, 1e-300)
+        return np.where(to_failed < AVOID, 0.0, guess)
 
     def with_prediction_at(self, x: Array) -> "Posterior":
         """The same with its own prediction at x (d,) taken for an observation."""
-        truth, old, symbol = self.truth, self.observed, ca.MX.sym("x", len(x))
-        mean = to_casadi(list(self.surrogates), std=False)(symbol)
-        told = ca.Function("told", [symbol], [mean, ca.jacobian(mean, symbol)])
-        y, slope = (np.array(part) for part in told(x))
-        dY = None if old.dY is None else np.concatenate([old.dY, slope[None]])
-        new = Observations(np.vstack([old.X, x]), np.vstack([old.Y, y.ravel()]), dY)
+        truth, old = self.truth, self.observed
+        mean = to_casadi(list(self.surrogates), std=False)
+        y = np.array(mean(x)).ravel()
+        dY = None
+        if old.dY is not None:
+            symbol = ca.MX.sym("x", len(x))
+            slope = ca.Function("slope", [symbol], [ca.jacobian(mean(symbol), symbol)])(x)
+            dY = np.concatenate([old.dY, np.array(slope)[None]])
+        new = Observations(np.vstack([old.X, x]), np.vstack([old.Y, y]), dY)
         surrogates = tuple(
             condition(
-                process.hyperparameters, new.X, new.Y[:, i], lower=truth.lower, upper=truth.upper,
-                kernel=process.kernel, dY=None if dY is None else dY[:, i],
+                process.hyperparameters,
+                new.X,
+                new.Y[:, i],
+                lower=truth.lower,
+                upper=truth.upper,
+                kernel=process.kernel,
+                dY=None if dY is None else dY[:, i],
             )
             for i, process in enumerate(self.surrogates)
-        )  # fmt: skip
+        )
         return replace(self, surrogates=surrogates, observed=new)
 
 
@@ -98,9 +119,10 @@ def expected_improvement(posterior: Posterior, X: Array, best: float | None) -> 
     """
     from scipy.special import ndtr
 
+    truth = posterior.truth
     pairs = [process.predict(X, return_std=True) for process in posterior.surrogates]
     mean, std = (np.array(part).T for part in zip(*pairs, strict=True))
-    J, J_std, g, g_std = _linearised(posterior.truth, X, mean, std)
+    J, J_std, g, g_std = _linearised(truth, X, mean, std)
     certain = g_std <= EXACT
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         each = np.where(certain, g <= EXACT, ndtr(-g / np.where(certain, 1.0, g_std)))
@@ -108,7 +130,8 @@ def expected_improvement(posterior: Posterior, X: Array, best: float | None) -> 
         if best is None:
             return feasible * float(np.ptp(posterior.values()[0]))
         u = (best - J) / J_std
-        gain = J_std * (u * ndtr(u) + np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi))
+        density = np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
+        gain = J_std * (u * ndtr(u) + density)
     gain = np.where(J_std > 0.0, gain, np.maximum(best - J, 0.0))
     return np.nan_to_num(gain * feasible, nan=0.0)
 
@@ -121,23 +144,42 @@ def _linearised(truth: Truth, X: Array, mean: Array, std: Array) -> tuple[Array,
     outputs = [np.array(o) for o in ca.Function("j", [x, y], [J, g, *slopes])(X.T, mean.T)]
     variance = (std**2).T
     J_std = np.sqrt((outputs[2] ** 2 * variance).sum(axis=0))
-    # column-major: the constraints run fastest
-    to_y = outputs[3].reshape(len(variance), g.numel(), len(X))
+    count, k = g.numel(), len(variance)
+    to_y = outputs[3].reshape(k, count, len(X))  # column-major: the constraints run fastest
     return outputs[0].ravel(), J_std, outputs[1], np.sqrt((to_y**2 * variance[:, None]).sum(axis=0))
 
 
-def maximiser(posterior: Posterior, near: list[Array], seed: int) -> tuple[Array, float]:
-    """The new point (d,) of largest expected improvement, and that; 0 where none helps.
+def scaled_deviation(posterior: Posterior, X: Array) -> Array:
+    """Root of the mean square deviation of the outputs, in units of their own spread, (m,)."""
+    scale = np.maximum(np.ptp(posterior.observed.Y, axis=0), 1e-100)
+    each = [
+        process.predict(X, return_std=True)[1] / size
+        for process, size in zip(posterior.surrogates, scale, strict=True)
+    ]
+    return np.nan_to_num(np.sqrt(np.mean(np.square(each), axis=0)))
 
-    Seeded candidates over the box and around `near`, then ever closer around the best of them.
+
+def maximiser(
+    posterior: Posterior, explore: bool, near: Sequence[Array], seed: int
+) -> tuple[Array, float]:
+    """The point (d,) of largest merit that is not known yet, and its merit; 0 where none helps.
+
+    Merit is the expected improvement, or the deviation to `explore`. Seeded candidates over the
+    box and around `near`, then ever closer around the best of them.
     """
-    lower, upper = posterior.truth.lower, posterior.truth.upper
+    truth = posterior.truth
+    lower, upper = truth.lower, truth.upper
     rng = np.random.default_rng(seed)
+    J, _ = posterior.values()
     at = posterior.incumbent()
-    best = None if at is None else float(posterior.values()[0][at])
+    best = None if at is None else float(J[at])
 
     def merit(X: Array) -> Array:
-        return np.where(posterior.new(X), expected_improvement(posterior, X, best), 0.0)
+        if explore:
+            found = scaled_deviation(posterior, X)
+        else:
+            found = expected_improvement(posterior, X, best)
+        return np.where(posterior.distance(X) > NEAR, found * posterior.chance_of_value(X), 0.0)
 
     def cloud(centre: Array, scale: float) -> Array:
         step = scale * rng.standard_normal((CLOUD, len(lower))) * (upper - lower)
@@ -152,37 +194,33 @@ def maximiser(posterior: Posterior, near: list[Array], seed: int) -> tuple[Array
     return X[top], float(score[top])
 
 
-def choose(posterior: Posterior, near: list[Array], count: int, seed: int) -> Array:
-    """A batch (<= count, d): the first of `near` if it is new, then by expected improvement.
+def choose(
+    posterior: Posterior,
+    first: Array | None,
+    count: int,
+    explore: int,
+    near: Sequence[Array],
+    seed: int,
+) -> Array:
+    """A batch (<= count, d): `first`, then by improvement, the last `explore` by deviation.
 
-    The prediction at each counts as true before the next is sought (kriging believer).
+    The prediction at each counts as true before the next is sought (kriging believer); `first`
+    is left out where it is known already.
     """
-    chosen = [x for x in near[:1] if posterior.new(x[None])[0]]
-    for number in range(count):
-        if number >= len(chosen):
-            x, merit = maximiser(posterior, near, seed + number)
-            if merit <= 0.0:
-                break
-            chosen.append(x)
-        posterior = posterior.with_prediction_at(chosen[number])
-    return np.array(chosen[:count]).reshape(-1, len(posterior.truth.lower))
+    chosen: list[Array] = []
 
+    def take(x: Array) -> None:
+        nonlocal posterior
+        chosen.append(x)
+        posterior = posterior.with_prediction_at(x)
 
-def predicted_optimum(posterior: Posterior, starts: Array) -> tuple[Array, float] | None:
-    """The best local optimum of the means and its J, by IPOPT from `starts` (m, d); None without.
-
-    min J(x, s(x))  s.t.  g(x, s(x)) <= 0,  lower <= x <= upper,  ‖x̂ - x̂_f‖ >= AVOID
-
-    with s the means, x̂ in the unit box and x_f the points where the truth had no value.
-    """
-    truth = posterior.truth
-    lower, width = truth.lower, truth.upper - truth.lower
-    z = ca.MX.sym("z", len(lower))
-    x = lower + width * z
-    y = to_casadi(list(posterior.surrogates), std=False)(x)
-    free = [AVOID**2 - ca.sumsqr(z - point) for point in (posterior.failed - lower) / width]
-    g = ca.vertcat(truth.constraints(x, y), *free)
-    program = {"x": z, "f": truth.objective(x, y), "g": g}
-    ends = [end for end in end_points(program, (starts - lower) / width) if end.converged]
-    best = min(ends, key=lambda end: end.objective, default=None)
-    return None if best is None else (lower + width * best.z, best.objective)
+    if first is not None and posterior.distance(first[None])[0] > NEAR:
+        take(first)
+    room = count - len(chosen)
+    for number in range(room):
+        x, merit = maximiser(posterior, number >= room - explore, near, seed + number)
+        if merit <= 0.0:  # nothing to be gained: then to be learnt
+            x, merit = maximiser(posterior, True, near, seed + number)
+        if merit > 0.0:
+            take(x)
+    return np.array(chosen).reshape(-1, len(posterior.truth.lower))

@@ -7,7 +7,9 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-LOCAL = ("*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # copied otherwise
+from surrogates.pending_points import FOLDER
+
+LOCAL = (FOLDER, "*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # of one place, or copied otherwise
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -9,7 +9,7 @@ from surrogates.files import copy_run
 from surrogates.interface import SurrogateFitError
 from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from surrogates.options import ExitCode, Parser, number, one_line, usable_cores, whole
-from surrogates.retraining import Settings, only_job, retrain
+from surrogates.retraining import Settings, retrain
 from surrogates.serialise import SurrogateFileError
 from surrogates.truth import TruthError, TruthInterrupted, opener_of
 
@@ -29,6 +29,8 @@ def parser() -> argparse.ArgumentParser:
         help="relative agreement of prediction and truth (default: the case's)")  # fmt: skip
     add("--batch", metavar="Q", type=whole(1), default=default.batch,
         help="points a round (default: %(default)s)")  # fmt: skip
+    add("--explore", metavar="SHARE", type=number(0.0, 1.0), default=default.explore,
+        help="share of a batch at the largest deviation (default: %(default)s)")  # fmt: skip
     add("--workers", metavar="N", type=whole(1), default=usable_cores(),
         help="worker processes (default: all cores)")  # fmt: skip
     add("--scheduler", metavar="ADDRESS",
@@ -50,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return ended.code if isinstance(ended.code, int) else ExitCode.DONE
     run, quiet = options.run, options.quiet
     folder = run if options.out is None else options.out
-    settings = Settings(options.budget, options.batch, options.seed)
+    settings = Settings(options.budget, options.batch, options.explore, options.seed)
     try:
         opener = opener_of(run)
         if folder != run:
@@ -60,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             scheduler=options.scheduler, seed=options.seed, quiet=quiet,
             user_code=not options.no_user_code,
         )  # fmt: skip
-        with ctrl_c_noticed(), only_job(folder), opened as truth:
+        with ctrl_c_noticed(), opened as truth:
             outcome = retrain(folder, truth, settings, quiet)
     except (TruthError, SurrogateFileError, SurrogateFitError) as error:
         print(one_line(error), file=sys.stderr)

@@ -1,8 +1,12 @@
-"""The surrogates that a run folder keeps, RUN_DIR/surrogates/0001.json ...
+"""The surrogates that a run folder keeps: RUN_DIR/surrogates/0001.json ... and their index.
 
-A version is written once and never changed; RUN_DIR/surrogate.json is the newest.
+A version is written once and never changed. Its number is taken by making the file, so that two
+jobs never share one; `index.json` lists all of them, and RUN_DIR/surrogate.json is the newest.
 """
 
+import json
+import os
+import secrets
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,12 +17,13 @@ from surrogates.gaussian_process import GaussianProcess
 from surrogates.serialise import SurrogateFileError, load, save
 
 FOLDER = "surrogates"
+INDEX = "index.json"
 NEWEST = "surrogate.json"
 
 
 @dataclass(frozen=True)
 class Version:
-    """The record that a version's file holds under `extra`.
+    """One surrogate of a run, as the index lists it.
 
     samples: how many it was fitted to. errors: output -> leave-one-out {rms, max, q2} in its
     unit. at_optimum: |J predicted - J true| / |J| at the true sample by the predicted optimum,
@@ -35,7 +40,7 @@ class Version:
 
 
 class Versions:
-    """The versions of one run folder. What adds must be the folder's only job."""
+    """The versions of one run folder. What reads and adds must hold a lock against other jobs."""
 
     def __init__(self, run: Path) -> None:
         self.run, self.folder = run, run / FOLDER
@@ -50,10 +55,20 @@ class Versions:
     ) -> Version:
         """Keep surrogates as the next version, child of the newest; `facts` fill a `Version`."""
         self.folder.mkdir(exist_ok=True)
-        parent = next(reversed(self.names()), None)
-        version = Version(f"{int(parent or 0) + 1:04d}", parent, **facts)
-        path = self.folder / f"{version.version}.json"
-        save(surrogates, path, extra | {"version": asdict(version)})
+        draft = self.folder / f".{secrets.token_hex(4)}.part"
+        try:
+            while True:
+                names = self.names()
+                parent = names[-1] if names else None
+                version = Version(f"{int(parent or 0) + 1:04d}", parent, **facts)
+                save(surrogates, draft, extra | {"version": asdict(version)})
+                try:
+                    os.link(draft, self.folder / f"{version.version}.json")  # never overwrites
+                    break
+                except FileExistsError:
+                    continue
+        finally:
+            draft.unlink(missing_ok=True)
         self.publish()
         return version
 
@@ -82,8 +97,13 @@ class Versions:
         return self.load(names[-1]) if names else None
 
     def publish(self) -> None:
-        """Make surrogate.json the newest version."""
-        newest = (self.folder / f"{self.names()[-1]}.json").read_bytes()
-        target = self.run / NEWEST
-        if not target.exists() or target.read_bytes() != newest:
-            write_whole(target, newest)
+        """Write the index of all versions, and surrogate.json as the newest of them."""
+        names = self.names()
+        records = [asdict(self.load(name)[1]) for name in names]
+        text = json.dumps({"versions": records}, indent=2, allow_nan=False) + "\n"
+        write_whole(self.folder / INDEX, text)
+        if names:
+            newest = (self.folder / f"{names[-1]}.json").read_bytes()
+            target = self.run / NEWEST
+            if not target.exists() or target.read_bytes() != newest:
+                write_whole(target, newest)

@@ -56,7 +56,7 @@ class Bench:
             versions = Versions(self.base)
             facts = {"samples": 1, "errors": {}, "at_optimum": None, "objective": None}
             versions.add(load(run / "surrogate.json")[0], {}, **facts, created="")  # type: ignore[arg-type]
-            (self.base / "retrain.lock").write_text("1\n")
+            (self.base / "retrain.jsonl").write_text('{"event": "start", "spent": 1}\n')
             return
         case = self.base.parent / "case.toml"
         case.write_text(toml(case_data()))

@@ -145,7 +145,8 @@ def spoil_folder(rng: random.Random, folder: Path) -> str:
         "case.toml",
         "truth.json",
         "surrogates/0001.json",
-        "retrain.lock",
+        "surrogates/index.json",
+        "retrain.jsonl",
     ]
     name = rng.choice(files)
     path = folder / name

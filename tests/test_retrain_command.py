@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camel import Camel
+from camel import Camel, entries
 
 import surrogates.retrain as retrain_module
 import surrogates.truth as truth_module
 from ccd_casadi.codesign.retraining import open_run
 from surrogates.interface import Array
 from surrogates.retrain import main
-from surrogates.retraining import only_job
 from surrogates.truth import Observations, TruthError, TruthInterrupted
 
 ROOT = Path(__file__).parent.parent
@@ -79,17 +78,6 @@ def test_exit_codes(
         assert ("resumes" in errors) == (code == 130)
 
 
-def test_a_second_job_is_told_in_one_line(
-    camel_copy: Path, installed: Callable[[Any], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    installed(lambda folder: pytest.fail("it was opened"))
-    with only_job(camel_copy):
-        assert main([str(camel_copy)]) == 2
-    assert capsys.readouterr().err == (
-        f"{camel_copy}: another job is retraining it; wait for it, or retrain a copy (--out)\n"
-    )
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -124,7 +112,7 @@ def test_a_folder_that_names_no_known_truth_is_refused(
 @pytest.mark.parametrize(
     "more",
     [["--budget", "0"], ["--budget", "many"], ["--tolerance", "nan"], ["--tolerance", "-1"],
-     ["--batch", "0"], ["--workers", "0"], ["--seed", "-1"], ["--what"]],
+     ["--batch", "0"], ["--explore", "1.5"], ["--workers", "0"], ["--seed", "-1"], ["--what"]],
 )  # fmt: skip
 def test_wrong_options_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str]
@@ -161,6 +149,8 @@ def test_a_copy_is_retrained_and_the_run_left_alone(
         assert capsys.readouterr() == ("", "")
     after = {path.name: path.read_bytes() for path in camel_copy.glob("*") if path.is_file()}
     assert after == before
+    assert entries(out)[: len(entries(camel_copy))] == entries(camel_copy)
+    assert [e["event"] for e in entries(out)][-4:] == ["start", "end", "start", "end"]
     with closing(sqlite3.connect(out / "samples.sqlite")) as database, database:
         assert database.execute("select x from t").fetchall() == [(7,)]
 
