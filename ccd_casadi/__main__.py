@@ -32,7 +32,7 @@ SCHEMA = "case.schema.json"
 OWN = {
     "new": "a plant and a case to begin with, in a folder of that name",
     "keys": "every table and key of a case file, as Markdown",
-    "schema": "the same as JSON Schema, for an editor",
+    "schema": "the same as JSON Schema, for an editor; with --result that of result.json",
 }
 
 
@@ -56,6 +56,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return ExitCode.DONE
     if words == ["schema"]:
         print(json.dumps(_schema().case_schema(), indent=1))
+        return ExitCode.DONE
+    if words == ["schema", "--result"]:
+        found = import_module("ccd_casadi.cases.result_schema").result_schema()
+        print(json.dumps(found, indent=1))
         return ExitCode.DONE
     if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
         return new(Path(words[1]))

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.cases.result_schema import FORMAT
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -129,10 +130,7 @@ def result_dict(
         **_robust(verified),
         "notes": list(plant_of(problem).notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **spent_entry(spent, look is not None and look.moved),
-        "seconds": seconds,
-        "seed": seed,
-        "versions": versions(),
+        **run_entry(spent, seconds, seed, look is not None and look.moved),
     }
     result["surrogate_quality"] = quality_dict(quality)
     result |= budget_entry(problem, verified.theta, verified.design.controller)
@@ -172,7 +170,17 @@ def infeasible_dict(
         "status": "infeasible",
         "reason": reason,
         "formulation": formulation,
-        **spent_entry(spent),
+        **run_entry(spent, seconds, seed),
+    }
+
+
+def run_entry(
+    spent: Mapping[str, int], seconds: float, seed: int, moved: bool = False
+) -> dict[str, Any]:
+    """What every result.json says of its run."""
+    return {
+        "format": FORMAT,
+        **spent_entry(spent, moved),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),

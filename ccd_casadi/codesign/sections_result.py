@@ -10,7 +10,13 @@ from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, FullOrder
-from ccd_casadi.codesign.result import compliance_dict, controller_dict, globality_dict, kkt_dict
+from ccd_casadi.codesign.result import (
+    compliance_dict,
+    controller_dict,
+    globality_dict,
+    kkt_dict,
+    run_entry,
+)
 from ccd_casadi.codesign.sections_run import VerifiedSections
 from ccd_casadi.codesign.sections_verdict import sections_verdict
 from ccd_casadi.codesign.surrogate_quality import quality_dict
@@ -22,10 +28,8 @@ from ccd_casadi.inner_problem.constraints import touched, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
 BINDS = {
@@ -255,10 +259,7 @@ def sections_result(
         "proof": proof_dict(verified.proof),
         "notes": notes,
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **spent_entry(spent),
-        "seconds": seconds,
-        "seed": seed,
-        "versions": versions(),
+        **run_entry(spent, seconds, seed),
     }
     assert made.controller is not None
     result |= budget_entry(verified.problem, verified.theta, made.controller)
