@@ -4,11 +4,11 @@ import json
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
+from ccd_casadi.support.package_text import package_text
 from surrogates.interrupts import begun
 from surrogates.options import one_line
 
@@ -58,8 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(json.dumps(_schema().case_schema(), indent=1))
         return ExitCode.DONE
     if words == ["schema", "--result"]:
-        found = import_module("ccd_casadi.cases.result_schema").result_schema()
-        print(json.dumps(found, indent=1))
+        print(package_text("templates/result.schema.json"), end="")
         return ExitCode.DONE
     if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
         return new(Path(words[1]))
@@ -87,8 +86,7 @@ def new(folder: Path) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in TEMPLATE:
-            text = (files("ccd_casadi") / "templates" / name).read_text(encoding="utf-8")
-            (folder / name).write_text(text, encoding="utf-8")
+            (folder / name).write_text(package_text(f"templates/{name}"), encoding="utf-8")
         schema = json.dumps(_schema().case_schema(), indent=1)
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:

@@ -17,10 +17,10 @@ from test_sections_error import CABLES
 
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
-from ccd_casadi.cases.result_schema import FORMAT, OF_A_DESIGN
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.measured_answer import measured_answer
+from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem import sections_bandwidth
@@ -37,6 +37,11 @@ SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design_with_gradients"),
     (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_error"),
 ]  # fmt: skip
+EVERY = {  # beside the schema's
+    "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",
+    "loop_warnings", "low_compliance", "notes", "outcome", "static_compliance",
+    "surrogate_quality", "syntheses_to_optimum", "units",
+}  # fmt: skip
 UNITS = [(sampler, "inner_unit"), (sampler, "design_unit")]
 
 
@@ -129,35 +134,48 @@ def test_what_was_spent_adds_up(run: Run) -> None:
     assert sum(run.result["spent"].values()) == run.result["syntheses"] > 0
 
 
-def test_the_result_has_the_same_keys_and_checks(
-    run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def schema(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert main(["schema", "--result"]) == 0
-    schema = json.loads(capsys.readouterr().out)
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert found["properties"]["format"] == {"const": FORMAT}
+    return found
+
+
+def test_the_result_has_the_same_keys_and_checks(run: Run, schema: dict[str, Any]) -> None:
     result = json.loads(json.dumps(run.result))
     jsonschema.validate(result, schema)
-    assert result["format"] == FORMAT
     assert result["status"] == "verified", result["reason"]
+    assert result.keys() >= schema["properties"].keys()
+    assert result.keys() >= EVERY
     assert {"certificate", "constraints", "prediction", "inner_optimum", "optimality"} <= {
         name for name, passed in result["checks"].items() if passed
     }
-    old = {key: item for key, item in result.items() if key not in ("format", "spent")}
-    jsonschema.validate(old, schema)
-    wrong = [result | {"format": 2}, old | {"format": 1}]
-    wrong += [old | {"syntheses": 1.5}, old | {"theta": {}}]
-    wrong += [{name: old[name] for name in old if name != key} for key in OF_A_DESIGN]
-    for other in wrong:
-        with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate(other, schema)
+
+
+def test_what_the_schema_refuses(schema: dict[str, Any]) -> None:
+    """And what was stored before there was a format passes."""
+    for place in sorted((Path(__file__).parent / "data/results").iterdir()):
+        old = json.loads(place.read_text())
+        jsonschema.validate(old, schema)
+        assert "format" not in old
+        wrong = [old | {"format": FORMAT + 1}, old | {"syntheses": 1.5}, old | {"status": "done"}]
+        wrong += [{name: old[name] for name in old if name != key} for key in schema["required"]]
+        if old["status"] != "infeasible":
+            wrong += [old | {"theta": {}}, old | {"bandwidth_hz": "50"}, old | {"checks": []}]
+            of_a_design = schema["else"]["required"]
+            wrong += [{name: old[name] for name in old if name != key} for key in of_a_design]
+        for other in wrong:
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(other, schema)
 
 
 @pytest.mark.parametrize("name", list(KINDS))
-def test_what_is_infeasible_has_a_result_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_infeasible_has_a_result_too(name: str, schema: dict[str, Any]) -> None:
     case = KINDS[name]
     result = solve(replace(case, inner=replace(case.inner, S_low=1e-6)), Direct(starts=1)).result
     assert (result["status"], result["format"]) == ("infeasible", FORMAT)
-    assert main(["schema", "--result"]) == 0
-    jsonschema.validate(result, json.loads(capsys.readouterr().out))
+    jsonschema.validate(result, schema)
 
 
 def test_a_resumed_run_is_the_same(run: Run) -> None:

@@ -12,7 +12,6 @@ from ccd_casadi.cases.budget import TABLE_CHECKS, UNITS
 from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
-from ccd_casadi.cases.result_schema import DRAFT
 from ccd_casadi.cases.sections import SECTIONS
 from ccd_casadi.plants.registry import BUILDERS, MODELS
 
@@ -27,6 +26,7 @@ _SHAPE = (
     "",
     "*Case study 1, ±3 %, damping × 0.5 to 2, 10 kHz with 100 µs, the same bounds on KS and T.*",
 )
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _PLANT = {
     "model": 'a model of the package, or "measured": a frequency response; or give function',
     "function": '"my_plant.py:model", relative to the case file: a Python function of θ',

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Any
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.cases.result_schema import FORMAT
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
@@ -25,6 +24,8 @@ from ccd_casadi.support.versions import versions
 from ccd_casadi.synthesis.statics import compliance_words
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 from surrogates import Quality
+
+FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or changes its meaning
 
 
 def figures_dict(figures: DesignFigures) -> dict[str, Any]:
