@@ -58,10 +58,8 @@ class Run:
 
     @property
     def controller(self) -> StateSpace:
-        found = self.first.verified or self.first.sections
-        assert found is not None
-        assert found.design.controller is not None
-        return found.design.controller
+        assert self.first.verified is not None
+        return self.first.verified.controller
 
     @property
     def value(self) -> float:
@@ -113,8 +111,8 @@ def test_the_value_is_that_of_the_controller(run: Run) -> None:
 
 
 def test_the_gradient_is_the_slope(run: Run, tmp_path: Path) -> None:
-    made = run.first.sections
-    case = run.problem if made is None else made.problem
+    assert run.first.verified is not None
+    case = run.first.verified.problem
     theta, way, h = np.array([60.3, 59.1]), np.array([0.8, 0.6]), 0.02
     with Workers(1) as pool, SampleStore(tmp_path / "samples.sqlite") as store:
         points = np.array([theta, theta + h * way, theta - h * way])
