@@ -28,6 +28,8 @@ from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
+FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or changes its meaning
+
 
 def result_dict(
     formulation: str,
@@ -81,10 +83,7 @@ def result_dict(
         "box_look": _box_look(look),
         "notes": list(plant.notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **spent_entry(spent, look is not None and look.moved),
-        "seconds": seconds,
-        "seed": seed,
-        "versions": versions(),
+        **run_entry(spent, seconds, seed, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **verified.evidence(promised),
         **budget_entry(problem, verified.theta, verified.controller),
@@ -164,7 +163,17 @@ def infeasible_dict(
         "status": "infeasible",
         "reason": reason,
         "formulation": formulation,
-        **spent_entry(spent),
+        **run_entry(spent, seconds, seed),
+    }
+
+
+def run_entry(
+    spent: Mapping[str, int], seconds: float, seed: int, moved: bool = False
+) -> dict[str, Any]:
+    """What every result.json says of its run."""
+    return {
+        "format": FORMAT,
+        **spent_entry(spent, moved),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),
