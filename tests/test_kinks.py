@@ -15,8 +15,8 @@ from ccd_casadi.codesign.bundle import Local, descend
 from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_kkt import joint_residual, sections_kkt
-from ccd_casadi.codesign.sections_truth import TrueBandwidth
 from ccd_casadi.codesign.sections_verdict import KKT_LEVEL, _optimal
+from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.optimality import Envelope

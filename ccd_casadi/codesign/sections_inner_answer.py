@@ -15,6 +15,7 @@ from ccd_casadi.codesign.sections_result import (
     proof_dict,
     sections_controller,
 )
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
 from ccd_casadi.inner_problem.sections_error import least_error_at
@@ -70,7 +71,7 @@ def sections_answer(
         **design_dict(asked, theta, made),
         "active": active_of(made),
         "feasible": True,
-        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * value,
+        "objective": objective(problem, theta, value),
         "robust": {
             "plants": checked,
             "passed": wide.passed,

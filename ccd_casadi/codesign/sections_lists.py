@@ -22,8 +22,9 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_run import search_sections
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
@@ -128,7 +129,7 @@ def _at(
 
 
 def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
-    J = objective(problem, best)
+    J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)
     result = {

@@ -18,13 +18,14 @@ from ccd_casadi.codesign.robust_check import OtherDamping, other_damping, reach_
 from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import Survival, loops_of
+from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
@@ -222,7 +223,7 @@ def _verified(outcome: FormulationResult, end: _End, rounds: int) -> VerifiedSec
         problem=problem,
         theta=best.theta,
         design=made,
-        objective=objective(problem, best),
+        objective=objective_of(problem, best),
         hardware_cost=hardware_cost(plant_of(problem), best.theta),
         kkt=kkt,
         race_gap=float(max(end.gap, 0.0)),

@@ -17,6 +17,7 @@ from ccd_casadi.codesign.robust_check import (
 )
 from ccd_casadi.codesign.survival import Survival, loops_of
 from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -107,13 +108,12 @@ def _verified(sampler: Sampler, x: Array) -> VerifiedDesign:
     found, robust = None, check_robust(problem, loops)
     if final.figures.certified:
         found, robust = survived(problem, loops, final.figures.bandwidth)
-    cost = hardware_cost(plant_of(problem), theta)
     return VerifiedDesign(
         x=x,
         theta=theta,
         design=final,
-        objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
-        hardware_cost=cost,
+        objective=objective(problem, theta, final.figures.bandwidth),
+        hardware_cost=hardware_cost(plant_of(problem), theta),
         active=_active(problem, quantities, x, final.figures),
         kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
         inner_gap=float(gap),
