@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.box_look import BoxLook
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.full_order import Beside
 from ccd_casadi.codesign.robust_check import reach_of
 from ccd_casadi.codesign.sections_entries import (
