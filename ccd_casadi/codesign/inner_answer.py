@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.result import (
+from ccd_casadi.codesign.design_entries import (
     compliance_dict,
     controller_dict,
     figures_dict,

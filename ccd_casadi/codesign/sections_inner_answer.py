@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.inner_answer import InnerAnswer, head_of
-from ccd_casadi.codesign.sections_result import (
+from ccd_casadi.codesign.sections_entries import (
     active_of,
     design_dict,
     proof_dict,
