@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES
+from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.deployment.sampled import (
     DiscreteStateSpace,
     sampled_figures,
@@ -33,8 +35,6 @@ from ccd_casadi.deployment.simulation import measure_sensitivity
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.rib_stage.geometry import NAMES
-from ccd_casadi.plants.rib_stage.plant import rib_stage
 from ccd_casadi.plants.scaling import StateSpace
 
 RESULTS = Path(__file__).with_suffix(".json")

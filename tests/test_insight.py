@@ -25,11 +25,11 @@ from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.two_mass import two_mass
 
 def model(theta):
     bowl = (theta["m1"] - 58.0) ** 2 + (theta["m2"] - 59.0) ** 2
-    return MODELS["two_mass"](theta, 0.01) | {"hardware_cost": COST}
+    return two_mass(theta, 0.01) | {"hardware_cost": COST}
 """
 
 

@@ -10,7 +10,7 @@ from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden, marked
-from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, stage_modes_html
+from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, surface_modes_html
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of, nyquist_panel
 from ccd_casadi.reporting.page import Section, Table, figure_html, number
 from ccd_casadi.reporting.sections_loops import Loops, gain_panels
@@ -97,8 +97,8 @@ def glance_of_sections(
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> str:
-    """Masses and springs with their modes, the first modes of a rib stage, or a table of modes."""
-    stage = stage_modes_html(problem, theta)
+    """Masses and springs with their modes, the first modes of a surface, or a table of modes."""
+    stage = surface_modes_html(problem, theta)
     if stage:
         return stage
     system = mechanics(plant_of(problem), theta)
