@@ -8,7 +8,6 @@ from typing import Any
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import (
@@ -23,6 +22,7 @@ from ccd_casadi.codesign.verdict import (
 )
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.versions import versions
@@ -76,7 +76,7 @@ def result_dict(
         "minimise": problem.figure.key,
         "verification_error": error,
         "checks": checks,
-        "active": list(verified.active()),
+        "active": list(verified.active),
         "inner_gap": verified.inner_gap,
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
