@@ -19,10 +19,10 @@ from ccd_casadi.explorer.landscape import field_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import end_words, move_words, standing_html, survival_words
+from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
 

@@ -17,7 +17,7 @@ from ccd_casadi.analysis.loop_figures import (
 )
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import roots, state_space
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 
 HZ = 2.0 * np.pi
 

@@ -16,10 +16,10 @@ from ccd_casadi.deployment.c_code import vectors
 from ccd_casadi.deployment.feedforward import feedforward
 from ccd_casadi.deployment.move import PARTS, Hardware, SampledMove, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
-from ccd_casadi.deployment.sampled import DiscreteStateSpace, sampled_plant
+from ccd_casadi.deployment.sampled import sampled_plant
 from ccd_casadi.deployment.simulation import simulate
 from ccd_casadi.deployment.structured_text import structured_text
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.demands import Limits
 from ccd_casadi.robust.setpoint import setpoint
 from ccd_casadi.support.errors import UserError
@@ -57,7 +57,7 @@ def pid() -> Realisation:
     for zeros, poles in factors:
         K = K * control.ss(control.tf(zeros, poles))
     found = K.sample(PERIOD, "tustin")
-    return of_one_channel(DiscreteStateSpace(found.A, found.B, found.C, found.D, PERIOD))
+    return of_one_channel(StateSpace(found.A, found.B, found.C, found.D, period=PERIOD))
 
 
 def test_the_setpoint_at_any_time_is_its_own_integral() -> None:

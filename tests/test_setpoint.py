@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace, scale_state_space
+from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.robust.demands import Limits
 from ccd_casadi.robust.move import mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import closed_loop
 
 # ---- the setpoint -------------------------------------------------------------------------------
 

@@ -23,7 +23,8 @@ from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import Shown
@@ -283,7 +284,7 @@ def _controller(path: Path, table: Mapping[str, Any], plant: ScaledPlant) -> Sta
         if found[key].shape != shape:
             words = f"is {found[key].shape}, not {shape} for this plant; solve the case again"
             raise UserError(f"{path}: {key}: {words}")
-    return StateSpace(**found)
+    return StateSpace(*(found[key] for key in "ABCD"))
 
 
 def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:

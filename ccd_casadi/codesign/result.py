@@ -16,7 +16,7 @@ from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import KKT_LEVEL, reason, verdict_dict
 from ccd_casadi.codesign.verify import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.setpoint import Setpoint
 from ccd_casadi.support.arrays import Array
 

@@ -16,7 +16,7 @@ from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.feedforward import feedforward
 from ccd_casadi.deployment.move import Hardware, SampledMove, move
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.robust.demands import Limits
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
 from ccd_casadi.support.arrays import Array

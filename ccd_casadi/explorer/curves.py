@@ -8,7 +8,8 @@ import numpy as np
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.sweep import missed_by
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.loops import section_bounds
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of
 from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of

@@ -15,7 +15,7 @@ from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.simulation import step_errors
 from ccd_casadi.deployment.words import against, reason_words, short_status
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index

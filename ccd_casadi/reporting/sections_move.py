@@ -11,9 +11,11 @@ from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, figure_html, number
 from ccd_casadi.reporting.svg import BLUE, GREY
@@ -21,7 +23,6 @@ from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

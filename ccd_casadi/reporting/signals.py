@@ -11,13 +11,14 @@ from ccd_casadi.deployment.sampled import sampled_plant, sensitivity_loop
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_system
+from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.setpoint import setpoint
-from ccd_casadi.robust.signals import ClosedLoop, closed_loop
 from ccd_casadi.support.arrays import Array
 
 STEP_POINTS = 240

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ccd_casadi.cases.run_folder import SampledController
+from ccd_casadi.lti.closed_loop import ClosedLoop
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.setpoint import Setpoint
-from ccd_casadi.robust.signals import ClosedLoop
 from ccd_casadi.support.arrays import Array
 
 STEPS = 50  # a period of the bandwidth, at least

@@ -11,6 +11,7 @@ from ccd_casadi.codesign.later_lines import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.demands import Demands
@@ -27,7 +28,7 @@ from ccd_casadi.robust.perturbed import (
     worst_in_box,
 )
 from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import Noise, closed_loop, gains, highest, noise, norms
+from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
