@@ -6,7 +6,7 @@ from fixed_structure_loops import FAST, LATE, loop, plant
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.analysis.loop import Loop, tustin, zeros
+from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_figures import (
     LoopFigures,
     gain_margin,
@@ -17,6 +17,7 @@ from ccd_casadi.analysis.loop_figures import (
 )
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import roots, state_space
+from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.state_space import StateSpace
 
 HZ = 2.0 * np.pi
@@ -106,7 +107,7 @@ def test_zeros_and_poles_near_the_bandwidth_are_named() -> None:
         kappa = rng.normal(4.0, 0.8, len(structure.names))
         K = state_space(structure, kappa)
         expected = roots(structure, kappa)[0]
-        found = np.sort(np.abs(zeros(K, 50.0)))
+        found = np.sort(np.abs(K.zeros(50.0)))
         np.testing.assert_allclose(found, np.sort(np.abs(expected)), rtol=1e-5)
     G, K = pair(0, None)
     w = 20.0 * HZ

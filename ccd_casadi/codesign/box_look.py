@@ -23,14 +23,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import acceptable, objective
+from ccd_casadi.codesign.direct import acceptable, true_objective
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, scaled_plant
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -95,7 +95,7 @@ def look_over_box(
         processes = ()
     samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
     feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
-    values = np.array([_objective(problem, sample) for sample in feasible])
+    values = np.array([objective(problem, sample.theta, sample.value) for sample in feasible])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best, begun = None, J, 0
     ended: list[tuple[Array, float]] = []
@@ -116,7 +116,7 @@ def look_over_box(
             for place in (end, begin):
                 found = quantities.at(place)
                 if acceptable(problem, place, found):
-                    value = objective(problem, place, found)
+                    value = true_objective(problem, place, found)
                     note(place, value)
                     if value < best - margin:
                         best_x, best = place, value
@@ -197,7 +197,8 @@ def _spread(
             keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
             first = sampler.bandwidths(np.array([more[i] for i in keep]), "looking over the box")
             refuted = any(
-                sample.feasible and _objective(sampler.problem, sample) < hopes[i]
+                sample.feasible
+                and objective(sampler.problem, sample.theta, sample.value) < hopes[i]
                 for i, sample in zip(keep, first, strict=True)
             )
             known = [*known, *first]
@@ -238,7 +239,6 @@ def _optimistic_objective(
     axes = [np.linspace(lower[k], upper[k], MESH) for k in (-2, -1)]
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     levels = problem.inner.levels
-    plant = plant_of(problem)
     out = np.empty(len(thetas))
     for i, theta in enumerate(thetas):
         X = np.hstack([np.tile(theta, (len(mesh), 1)), mesh])
@@ -252,7 +252,7 @@ def _optimistic_objective(
         )
         hope = COARSE * (bandwidth[0] + OPTIMISM * bandwidth[1])
         best = float(hope[allowed].max()) if allowed.any() else -np.inf
-        out[i] = problem.w1 * hardware_cost(plant, theta) + problem.w2 * best
+        out[i] = objective(problem, theta, best)
     return out
 
 
@@ -289,8 +289,3 @@ def _starts(
 
 def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
     return not unmet(problem, sample.theta)
-
-
-def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
-    cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.value

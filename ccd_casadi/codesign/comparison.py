@@ -11,14 +11,15 @@ import numpy as np
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.conclusions import conclusions
+from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.published import PUBLISHED
-from ccd_casadi.codesign.result import figures_dict
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.sections_result import active_of, design_dict
+from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
+from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
@@ -99,12 +100,12 @@ def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProb
 
     With sections: with the anchors and the plant set of the best.
     """
-    raced = [m for m in methods if m.solution is not None and m.solution.sections is not None]
-    if raced:
-        best = min(raced, key=lambda m: m.figures["objective"])
+    ends = [m for m in methods if m.solution is not None and m.solution.verified is not None]
+    if ends and problem.sections is not None:
+        best = min(ends, key=lambda m: m.figures["objective"])
         assert best.solution is not None
-        assert best.solution.sections is not None
-        return best.solution.sections.problem
+        assert best.solution.verified is not None
+        return best.solution.verified.problem
     solved = [m for m in methods if m.solution is not None and m.solution.problem is not None]
     if problem.robust is None or problem.robust.design_shift is not None or not solved:
         return problem
@@ -132,11 +133,8 @@ def _formulation(
     if solution.verified is not None:
         path = (*path, solution.verified.theta)
         figures["first_resonance_hz"] = _resonance(problem, solution.verified.theta)
-    made = None
-    if solution.sections is not None:
-        path = (*path, solution.sections.theta)
-        figures["first_resonance_hz"] = _resonance(problem, solution.sections.theta)
-        made = solution.sections.design
+    end = solution.verified
+    made = end.design if isinstance(end, VerifiedSections) else None
     return Method(name, figures, path, trace, solution=solution, sections=made)
 
 

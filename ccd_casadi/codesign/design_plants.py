@@ -16,6 +16,7 @@ import numpy as np
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import LABELS, missed_by
 from ccd_casadi.plants.plant import theta_words
@@ -87,7 +88,7 @@ def best_over_design_plants(
         alone = solve(sampler.of(replace(problem, robust=None), traced=False))
         if alone.verified is not None:
             for i, each in enumerate(samplers):
-                outcome, held = continued(each, alone.verified.x)
+                outcome, held = continued(each, alone.verified.point)
                 share = max(share, held)
                 if outcome is not None:
                     found[i] = min(found[i], conclude(each, outcome), key=order)
@@ -135,7 +136,7 @@ def _reason(sampler: Sampler, problem: CoDesignProblem, best: Solution, share: f
     words = str(best.result["reason"])
     if _verified(best):
         return words
-    if best.verified is not None:
+    if isinstance(best.verified, VerifiedDesign):
         missed = missed_words(problem, best.verified.design.figures)
         parts = [words, missed, remedies(problem, share) if missed else ""]
         return "; ".join(part for part in parts if part)

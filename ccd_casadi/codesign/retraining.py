@@ -159,11 +159,7 @@ class CoDesignTruth:
             )
         result = solution.result
         result |= spent_entry({"store": self.spent})
-        end: Array | None = None
-        if solution.verified is not None:
-            end = solution.verified.x
-        elif solution.sections is not None:
-            end = np.array(solution.sections.theta)
+        end = None if solution.verified is None else solution.verified.point
         result["retraining"] = mark | {"x": None if end is None else end.tolist()}
         write_run(self.folder, self.case, solution)
         self.write_page(self.folder, self.case, self.sampler.problem, solution)

@@ -6,7 +6,6 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.catalogue import best_of_lists
@@ -14,14 +13,12 @@ from ccd_casadi.codesign.design_plants import best_over_design_plants
 from ccd_casadi.codesign.direct import Direct, solve_direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import MANY, Formulation
-from ccd_casadi.codesign.full_order import full_order_beside
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer_problem import unmet_constraint
-from ccd_casadi.codesign.result import infeasible_dict
+from ccd_casadi.codesign.result import infeasible_dict, result_dict
 from ccd_casadi.codesign.second_look import conclude, conclude_with_look, rescue
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.sections_result import beside_dict, sections_result
 from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
@@ -32,7 +29,6 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.progress import Progress
 
 
 def solve(
@@ -158,15 +154,8 @@ def solution_of_sections(
     spent: dict[str, Any] = {"spent": found.spent, "seconds": seconds, "seed": seed}
     if found.verified is None:
         return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
-    verified = found.verified
-    theta = np.array(verified.theta)
-    of_error = sections_of_problem(problem).of_error
-    quality = surrogate_quality(found.outcome.surrogates, theta, seed, of_error=of_error)
-    result = sections_result(
-        problem, name, found.outcome, verified, tolerance=tolerance, quality=quality, **spent
+    quality = surrogate_quality(found.outcome.surrogates, found.verified, seed, quiet=quiet)
+    result = result_dict(
+        name, found.outcome, found.verified, tolerance=tolerance, quality=quality, **spent
     )
-    with Progress(1, "full order beside it", quiet=quiet) as bar:
-        beside = full_order_beside(verified.problem, verified.theta, verified.design)
-        bar.advance()
-    result["full_order"] = beside_dict(beside)
-    return Solution(result, found.outcome, None, quality, sections=found.verified)
+    return Solution(result, found.outcome, found.verified, quality)

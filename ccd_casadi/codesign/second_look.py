@@ -11,12 +11,12 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.lifted import solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
-from ccd_casadi.codesign.result import infeasible_dict, predicted_bandwidth, result_dict
+from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.surrogate_quality import surrogate_quality
-from ccd_casadi.codesign.verdict import KKT_LEVEL
-from ccd_casadi.codesign.verify import VerifiedDesign, verify
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.codesign.verify import verify
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
@@ -49,7 +49,7 @@ def conclude_with_look(
         outcome = _resumed(sampler, again, outcome, x, seed)
         ends = [verify(sampler, end) for end in _distinct(x, outcome.x)]
         verified = _best([verified, *ends], formulation.tolerance)
-    if verified.kkt.stationarity > KKT_LEVEL:
+    if verified.kkt.stationarity > verified.kkt_level:
         with sampler.spent.on("polish"):
             starts = perturbed(sampler, verified.x, seed)
         ends = [verify(sampler, end) for end in starts]
@@ -84,7 +84,7 @@ def _resumed(
 
 
 def _prediction_error(outcome: FormulationResult, verified: VerifiedDesign) -> float:
-    return abs(predicted_bandwidth(outcome, verified) / verified.design.figures.bandwidth - 1.0)
+    return abs(predicted_value(outcome, verified) / verified.value - 1.0)
 
 
 def _distinct(x: Array, other: Array | None) -> list[Array]:
@@ -99,7 +99,7 @@ def _best(found: list[VerifiedDesign], tolerance: float) -> VerifiedDesign:
     feasible = [item for item in found if item.feasible] or found
     least = min(item.objective for item in feasible)
     near = [item for item in feasible if item.objective <= least + tolerance * abs(least)]
-    stationary = [item for item in near if item.kkt.stationarity <= KKT_LEVEL]
+    stationary = [item for item in near if item.kkt.stationarity <= item.kkt_level]
     return min(stationary or near, key=lambda item: item.objective)
 
 
@@ -124,9 +124,8 @@ def conclude(
         )
         return Solution(result, outcome, None)
     verified = verify(sampler, outcome.x) if verified is None else verified
-    quality = surrogate_quality(outcome.surrogates, verified.x, seed, quiet=sampler.quiet)
+    quality = surrogate_quality(outcome.surrogates, verified, seed, quiet=sampler.quiet)
     result = result_dict(
-        sampler.problem,
         formulation,
         outcome,
         verified,

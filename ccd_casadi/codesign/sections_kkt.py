@@ -21,11 +21,11 @@ from scipy.linalg import null_space, qr
 from scipy.optimize import nnls
 
 from ccd_casadi.codesign.kkt import ACTIVE, STEP, Kink, KktCertificate
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, hardware_at, objective_gradient
+from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.constraints import constraint_sizes
+from ccd_casadi.inner_problem.objective import hardware_at, objective, objective_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 
@@ -150,7 +150,7 @@ def _slopes(
     theta = np.array(sample.theta)
 
     def value(at: BandwidthSample) -> float:
-        return problem.w1 * hardware_cost(plant_of(problem), at.theta) + problem.w2 * at.value
+        return objective(problem, at.theta, at.value)
 
     found = []
     for sign in (-1.0, 1.0):

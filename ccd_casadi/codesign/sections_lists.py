@@ -22,8 +22,10 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_run import search_sections
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
@@ -90,8 +92,8 @@ class ListedSections:
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
         solution = self.solve(sampler.of(carried(_start(found), sampler.problem, self.members)))
-        if solution.sections is not None:
-            self.members = sections_of_problem(solution.sections.problem).members
+        if solution.verified is not None:
+            self.members = sections_of_problem(solution.verified.problem).members
         return solution
 
 
@@ -112,10 +114,11 @@ def carried(
 
 def _start(found: Solution) -> CoDesignProblem:
     """The problem of a solution with its θ as the start and its controller as the anchor."""
-    made = found.sections
+    made = found.verified
     if made is None:
         assert found.problem is not None
         return found.problem
+    assert isinstance(made, VerifiedSections)
     return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
 
 
@@ -128,7 +131,7 @@ def _at(
 
 
 def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
-    J = objective(problem, best)
+    J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)
     result = {

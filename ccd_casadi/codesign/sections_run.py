@@ -11,21 +11,23 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import KktCertificate
+from ccd_casadi.codesign.full_order import full_order_beside
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
-from ccd_casadi.codesign.robust_check import OtherDamping, other_damping, reach_of, survived
+from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_direct import polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import sections_kkt
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.survival import Survival, loops_of
-from ccd_casadi.fixed_structure import Certificate, SectionsDesign
-from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.worst_plant import Excess
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
@@ -34,45 +36,10 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
 
 AGAIN = 3  # times that the outer problem is solved at most
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
-
-
-@dataclass(frozen=True)
-class VerifiedSections:
-    """The design of a run at θ, and what was found out about it.
-
-    `certificate` is the judge's on the set, `wide` on a lattice of `checked` plants of the box;
-    `proof` is for the whole of it; `worst` the worst plant that was found. `race_gap`: by how much
-    (relative) the race at the end beats the design. `predicted` is what the surrogate says at θ of
-    `value`, ω_b* in rad/s or the least RMS error in m.
-    """
-
-    problem: CoDesignProblem
-    theta: tuple[float, ...]
-    design: SectionsDesign
-    objective: float
-    hardware_cost: float
-    kkt: KktCertificate
-    race_gap: float
-    raced: Raced
-    wide: Certificate
-    checked: int
-    proof: Proof
-    worst: Excess
-    predicted: float
-    value: float
-    rounds: int
-    survival: Survival | None
-    damping: OtherDamping | None
-
-    @property
-    def kept(self) -> bool:
-        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
-        found, ends = self.survival, reach_of(self.problem)
-        along = found is None or found.within(*ends)
-        return self.wide.passed and not self.proof.refuted and along
 
 
 @dataclass(frozen=True)
@@ -98,7 +65,7 @@ def run_sections(sampler: Sampler, formulation: Nested | Lifted | Direct, seed: 
     found = search_sections(sampler, formulation, seed)
     made = None
     if found.end is not None:
-        made = _verified(found.outcome, found.end, found.rounds)
+        made = _verified(found.end, found.rounds)
     return SectionsRun(found.outcome, made, sampler.spent.by_purpose)
 
 
@@ -144,7 +111,7 @@ def conclude_sections(sampler: Sampler, outcome: FormulationResult) -> SectionsR
         outcome = replace(outcome, message=outcome.message or words)
         return SectionsRun(outcome, None, sampler.spent.by_purpose)
     end = _end(sampler, outcome.x[: len(sampler.problem.names)])
-    verified = _verified(outcome, end, 1)
+    verified = _verified(end, 1)
     return SectionsRun(outcome, verified, sampler.spent.by_purpose)
 
 
@@ -164,9 +131,8 @@ class _End:
     @property
     def gap(self) -> float:
         """By how much (relative) the race beats the design."""
-        if self.best.error is not None:
-            return self.best.error / self.raced.error - 1.0 if self.raced.certified else 0.0
-        return self.raced.bandwidth / self.design.bandwidth - 1.0 if self.raced.certified else 0.0
+        figure = self.asked.problem.figure
+        return figure.gain(self.raced.value, self.best.value) if self.raced.certified else 0.0
 
     @property
     def better(self) -> bool:
@@ -209,7 +175,7 @@ def _predicted(outcome: FormulationResult, sample: BandwidthSample) -> float:
     return float(outcome.surrogates[0].predict(np.array(sample.theta)[None, :])[0])
 
 
-def _verified(outcome: FormulationResult, end: _End, rounds: int) -> VerifiedSections:
+def _verified(end: _End, rounds: int) -> VerifiedSections:
     asked, best, made = end.asked, end.best, end.design
     problem = asked.problem
     assert made.controller is not None
@@ -218,24 +184,28 @@ def _verified(outcome: FormulationResult, end: _End, rounds: int) -> VerifiedSec
     with asked.spent.on("checks"):
         kkt = sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
     wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
+    with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
+        beside = full_order_beside(problem, best.theta, made)
+        bar.advance()
     return VerifiedSections(
         problem=problem,
         theta=best.theta,
-        design=made,
-        objective=objective(problem, best),
+        value=best.value,
+        objective=objective_of(problem, best),
         hardware_cost=hardware_cost(plant_of(problem), best.theta),
         kkt=kkt,
-        race_gap=float(max(end.gap, 0.0)),
+        inner_gap=float(max(end.gap, 0.0)),
+        feasible=made.certified and not unmet(problem, best.theta),
+        survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
+        damping=other_damping(problem, loops),
+        design=made,
         raced=end.raced,
         wide=wide,
         checked=checked,
         proof=proof_of(problem, best.theta, made),
         worst=worst,
-        predicted=_predicted(outcome, best),
-        value=best.value,
         rounds=rounds,
-        survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
-        damping=other_damping(problem, loops),
+        beside=beside,
     )
 
 

@@ -1,22 +1,18 @@
 """Verification of an optimum by the true synthesis, its controller, and optimality of the truth."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from ccd_casadi.codesign.closer_models import ReferenceCheck, check_references
+from ccd_casadi.codesign.closer_models import check_references
 from ccd_casadi.codesign.direct import acceptable, polish
-from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
+from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
-from ccd_casadi.codesign.robust_check import (
-    OtherDamping,
-    RobustCheck,
-    check_robust,
-    other_damping,
-    survived,
-)
-from ccd_casadi.codesign.survival import Survival, loops_of
+from ccd_casadi.codesign.robust_check import check_robust, other_damping, survived
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.inner_problem.true_function import TrueQuantities
@@ -26,35 +22,10 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import handed_out, measure
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures, synthesise
 
 POLISH_ROUNDS = 3
 INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
-
-
-@dataclass(frozen=True)
-class VerifiedDesign:
-    """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
-
-    `inner_gap`: by how much (relative) the global inner problem at θ beats the design's ω_b.
-    `unsuspended`: the same controller on the plant with its rigid-body modes free;
-    `references`: on closer models of the plant.
-    """
-
-    x: Array
-    theta: tuple[float, ...]
-    design: Design
-    objective: float
-    hardware_cost: float
-    active: tuple[str, ...]
-    kkt: KktCertificate
-    inner_gap: float
-    feasible: bool
-    unsuspended: DesignFigures
-    references: tuple[ReferenceCheck, ...] = ()
-    robust: RobustCheck | None = None
-    damping: OtherDamping | None = None
-    survival: Survival | None = None
 
 
 def verify(sampler: Sampler, x: Array) -> VerifiedDesign:
@@ -107,17 +78,18 @@ def _verified(sampler: Sampler, x: Array) -> VerifiedDesign:
     found, robust = None, check_robust(problem, loops)
     if final.figures.certified:
         found, robust = survived(problem, loops, final.figures.bandwidth)
-    cost = hardware_cost(plant_of(problem), theta)
     return VerifiedDesign(
+        problem=problem,
         x=x,
         theta=theta,
         design=final,
-        objective=problem.w1 * cost + problem.w2 * final.figures.bandwidth,
-        hardware_cost=cost,
-        active=_active(problem, quantities, x, final.figures),
+        value=final.figures.bandwidth,
+        objective=objective(problem, theta, final.figures.bandwidth),
+        hardware_cost=hardware_cost(plant_of(problem), theta),
+        binding=_active(problem, quantities, x, final.figures),
         kkt=kkt_certificate(problem, x, quantities.at(x), quantities.at),
         inner_gap=float(gap),
-        feasible=acceptable(problem, x, design),
+        feasible=final.figures.certified and acceptable(problem, x, design),
         unsuspended=unsuspended,
         references=check_references(
             problem, theta, final, workers=sampler.workers, quiet=sampler.quiet

@@ -203,8 +203,8 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
     lifted = comparison.method("lifted")
     processes = () if lifted.solution is None else lifted.solution.outcome.surrogates
     nested = comparison.method("nested").solution
-    if nested is not None and nested.sections is not None:  # its samples are of its own anchors
-        problem = nested.sections.problem
+    if nested is not None and nested.verified is not None:  # its samples may be of its own anchors
+        problem = nested.verified.problem
     truths = read_truths(folder / "samples_nested.sqlite", problem)
     land = landscape_data(problem, processes, truths)
     walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]

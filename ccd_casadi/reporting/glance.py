@@ -24,8 +24,8 @@ from ccd_casadi.synthesis.closed_loop import responses
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.sections_run import VerifiedSections
-    from ccd_casadi.codesign.verify import VerifiedDesign
+    from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+    from ccd_casadi.codesign.verified_sections import VerifiedSections
 
 HEIGHT = 3.0  # inches of a row
 

@@ -27,7 +27,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.sections_run import VerifiedSections
+    from ccd_casadi.codesign.verified_sections import VerifiedSections
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600

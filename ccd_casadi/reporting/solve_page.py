@@ -10,6 +10,8 @@ import numpy as np
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.plants.rib_stage.plant import stage_of
@@ -64,7 +66,6 @@ from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.solution import Solution
-    from ccd_casadi.codesign.verify import VerifiedDesign
 
 ELSEWHERE = ("theta", "trust")  # neither asks the plant: a process of its own solves none anew
 
@@ -104,7 +105,7 @@ def report_html(
         title,
         result,
         f"{case.path.name} · {result['formulation']} formulation · {now}",
-        sections_conclusion(result) if solution.sections is not None else conclusion(result),
+        sections_conclusion(result) if "proof" in result else conclusion(result),
     )
     work = (folder, case, problem, solution)
     parts = _parts(*work)
@@ -143,11 +144,12 @@ def _parts(
     folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution"
 ) -> dict[str, Callable[[], list[Section]]]:
     """What draws the sections, in their order."""
-    if solution.sections is not None:
+    verified = solution.verified
+    if isinstance(verified, VerifiedSections):
         return {"sections": lambda: sections_sections(problem, solution)}
-    if solution.verified is None:
+    if not isinstance(verified, VerifiedDesign):
         return {}
-    verified, truths = solution.verified, read_truths(folder / "samples.sqlite", problem)
+    truths = read_truths(folder / "samples.sqlite", problem)
     stages = {"start": problem.start, "optimum": verified.theta}
     return {
         "glance": lambda: [glance(problem, verified, float(solution.result["bandwidth_hz"]))],

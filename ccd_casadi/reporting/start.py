@@ -22,7 +22,7 @@ from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.verify import VerifiedDesign
+    from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 
 HEADING = "Start against optimum"
 SAME = 1e-6  # of the box: an optimum this close to the start is the start

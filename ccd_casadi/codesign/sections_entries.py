@@ -1,32 +1,21 @@
-"""result.json and controller.json of a co-design with a controller of fixed structure."""
+"""A controller of fixed structure as values of result.json and controller.json."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
-from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
 from ccd_casadi.codesign.full_order import Beside, FullOrder
-from ccd_casadi.codesign.result import compliance_dict, controller_dict, globality_dict, kkt_dict
-from ccd_casadi.codesign.sections_run import VerifiedSections
-from ccd_casadi.codesign.sections_verdict import sections_verdict
-from ccd_casadi.codesign.surrogate_quality import quality_dict
-from ccd_casadi.codesign.verdict import State, reason, verdict_dict
 from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
-from ccd_casadi.inner_problem.constraints import touched, unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.versions import versions
-from surrogates import Quality
 
 BINDS = {
     "S_MAX": "S_max",
@@ -47,7 +36,7 @@ def design_dict(
     judged = made.certificate
     assert judged is not None
     highest = max(judged.plants, key=lambda plant: plant.S_peak)
-    sampling = sections_of_problem(problem).sampling
+    sampling = problem.sampling
     grown = max(plant.stability for plant in judged.plants)
     if sampling is not None:  # of the spectral radius: the real part that it comes from
         grown = float(np.log1p(grown)) / sampling.period
@@ -107,8 +96,7 @@ def _loop_entry(
         return {}
     plants = [plant.plant_si() for plant in plants_of(problem, theta)]
     peak = max(plant.S_peak for plant in judged.plants)
-    sampling = sections_of_problem(problem).sampling
-    return loop_entry(plants, made.controller, sampling, made.bandwidth, peak)
+    return loop_entry(plants, made.controller, problem.sampling, made.bandwidth, peak)
 
 
 def active_of(made: SectionsDesign) -> list[str]:
@@ -144,30 +132,6 @@ def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
     return {"channel_bounds": found} if found else {}
 
 
-def wide_dict(problem: CoDesignProblem, verified: VerifiedSections) -> dict[str, Any]:
-    """`robust`: the judge on a lattice of the box, and the worst plant that was searched."""
-    wide: Certificate = verified.wide
-    stable = [plant for plant in wide.plants if plant.stable]
-    return {
-        "stable": len(stable) == len(wide.plants),
-        "plants": verified.checked,
-        "passed": wide.passed,
-        "bandwidth_hz": wide.bandwidth / HZ,
-        "worst_sensitivity_peak": max((plant.S_peak for plant in stable), default=None),
-        "worst_excess": float(np.expm1(verified.worst.value)),
-        "worst_plant": {
-            "option": verified.worst.option,
-            "point": verified.worst.point.tolist(),
-        },
-        "set": [
-            {"option": option, "point": list(point)}
-            for option, point in sections_of_problem(verified.problem).members
-        ],
-        "words": wide.words,
-        **({} if verified.damping is None else verified.damping.entry),
-    }
-
-
 def proof_dict(proof: Proof) -> dict[str, Any]:
     """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
     found: dict[str, Any] = {
@@ -185,96 +149,6 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
             "passed": [BINDS[proof.passed[0]], proof.passed[1]],
         }
     return found
-
-
-def sections_result(
-    problem: CoDesignProblem,
-    formulation: str,
-    outcome: FormulationResult,
-    verified: VerifiedSections,
-    *,
-    tolerance: float,
-    spent: Mapping[str, int],
-    seconds: float,
-    seed: int,
-    quality: tuple[Quality, ...] = (),
-) -> dict[str, Any]:
-    """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
-    made = verified.design
-    error = abs(verified.predicted / verified.value - 1.0)
-    of_error = sections_of_problem(problem).of_error
-    plant = plant_of(problem)
-    checks = {
-        "certificate": made.certified,
-        "constraints": not unmet(problem, verified.theta),
-        "prediction": bool(error <= tolerance),
-        "inner_optimum": bool(verified.race_gap <= tolerance),
-        "robust": verified.kept,
-    }
-    verdict = sections_verdict(
-        verified, constraints=checks["constraints"], error=error, tolerance=tolerance,
-        surrogate=bool(outcome.surrogates), quality=quality,
-    )  # fmt: skip
-    checks["optimality"] = verdict.optimal.state is not State.FAILED
-    failed = [name for name, passed in checks.items() if not passed]
-    words = "" if not failed else f"failed: {', '.join(failed)} ({reason(verdict)})"
-    notes = list(plant.notes(verified.theta))
-    sections = sections_of_problem(problem)
-    if sections.weighted_level is None:
-        notes.append("KS and T are not bounded: the case gives no controller.weighted_level")
-    bounds = [name for name in verified.kkt.active if name not in plant.constraint_names]
-    met = touched(problem, verified.theta)
-    result = {
-        **design_dict(verified.problem, verified.theta, made),
-        "status": "not_verified" if failed else "verified",
-        "verdict": verdict_dict(verdict),
-        "reason": "; ".join(part for part in (words, outcome.message) if part),
-        "formulation": formulation,
-        "theta": dict(zip(problem.names, verified.theta, strict=True)),
-        "units": problem.parameter_units,
-        "cost_unit": problem.cost_unit,
-        **({"fixed": problem.source.held} if problem.source.fixed else {}),
-        "objective": verified.objective,
-        "hardware_cost": verified.hardware_cost,
-        "minimise": sections.minimise,
-        "surrogate_bandwidth_hz": None if of_error else verified.predicted / HZ,
-        **(_error_entry(verified) if of_error else {}),
-        "verification_error": error,
-        "checks": checks,
-        "active": [*bounds, *active_of(made), *met],
-        "inner_gap": verified.race_gap,
-        "race": [
-            {"bandwidth_hz": value / HZ, "searches": count}
-            for value, count in verified.raced.optima
-        ],
-        "rounds": verified.rounds,
-        "anchors": [list(kappa) for kappa in sections_of_problem(verified.problem).anchors],
-        "kkt": kkt_dict(verified.kkt),
-        "globality": globality_dict(outcome.outer),
-        "robust": wide_dict(problem, verified),
-        "proof": proof_dict(verified.proof),
-        "notes": notes,
-        "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **spent_entry(spent),
-        "seconds": seconds,
-        "seed": seed,
-        "versions": versions(),
-    }
-    assert made.controller is not None
-    result |= budget_entry(verified.problem, verified.theta, made.controller)
-    result["surrogate_quality"] = quality_dict(quality)
-    return clean(result)
-
-
-def _error_entry(verified: VerifiedSections) -> dict[str, Any]:
-    """What was minimised, root mean square over the plants of the set, m; and its anchors."""
-    anchors = sections_of_problem(verified.problem).error_anchors
-    return {
-        "error_rms_of_set": verified.value,
-        "surrogate_error_rms": verified.predicted,
-        "error_rms_raced": verified.raced.error,
-        "error_anchors": [list(kappa) for kappa in anchors],
-    }
 
 
 def beside_dict(beside: Beside) -> dict[str, Any]:
@@ -302,7 +176,7 @@ def beside_dict(beside: Beside) -> dict[str, Any]:
 def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
     """controller.json: the state space in SI, the sections, and how they run."""
     assert made.controller is not None
-    sampling = sections_of_problem(problem).sampling
+    sampling = problem.sampling
     words = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
     if sampling is not None:
         words["loop"] = {
