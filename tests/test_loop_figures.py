@@ -36,7 +36,7 @@ def turned(K: StateSpace, factor: float) -> StateSpace:
 
 
 def is_stable(G: StateSpace, K: StateSpace, sampling: Sampling | None) -> bool:
-    return bool(Loop(G, K, sampling).poles().real.max() < 0.0)
+    return bool(Loop(G, K, sampling).poles.real.max() < 0.0)
 
 
 def warnings_of(found: LoopFigures, bandwidth: float) -> list[str]:
@@ -72,7 +72,7 @@ def test_responses_are_those_of_the_matrices(sampling: Sampling | None) -> None:
     omega = np.geomspace(1.0, 0.9 * np.pi / step if sampling else 2000.0, 50)
     z = np.exp(1j * omega * steps.period)
     n = len(steps.A)
-    T = (steps.C @ np.linalg.solve(z[:, None, None] * np.eye(n) - steps.A, steps.B_r + 0j))[:, 0, 0]
+    T = (steps.C_y @ np.linalg.solve(z[:, None, None] * np.eye(n) - steps.A, steps.B_r + 0j))[:, 0, 0]
     # A continuous loop's reference is held over a step here: half a step late, to first order.
     late = 1.0 if sampling else np.exp(-0.5j * omega * step) * np.sinc(0.5 * omega * step / np.pi)
     size = np.abs(T).max()
