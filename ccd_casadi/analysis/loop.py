@@ -24,7 +24,7 @@ PER_DECADE = 60
 class Loop:
     """The plant G and the controller K in SI, both continuous; `sampling` None: so is the loop.
 
-    G has no feedthrough.
+    G has no feedthrough. A controller in discrete time runs as it is, at the rate of `sampling`.
     """
 
     plant: StateSpace
@@ -36,14 +36,18 @@ class Loop:
         if self.sampling is None:
             return self.plant.swept(omega)
         if self.plant.modes is None:
-            return self._as_run[0].response(omega)
+            return self.as_run[0].response(omega)
         poles, drive, reading = self.plant.modes
         f, _ = transfer(poles, omega, self.sampling.period, self.sampling.delay)
         return np.asarray((reading * f[:, None, :]) @ drive)
 
     def controller_response(self, omega: Array) -> np.ndarray:
         """K (k, m, p) at ω (k,) in rad/s."""
-        return self._as_run[1].swept(omega)
+        return self.as_run[1].swept(omega)
+
+    def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (k, p, m) and K (k, m, p) as they run, at ω (k,) in rad/s."""
+        return self.plant_response(omega), self.controller_response(omega)
 
     def sensitivity(self, omega: Array) -> np.ndarray:
         """S = (I + GK)⁻¹ (k, p, p)."""
@@ -56,12 +60,17 @@ class Loop:
     @cached_property
     def closed(self) -> ClosedLoop:
         """The closed loop, sampled at its instants; a disturbing force is held, and not delayed."""
-        found = closed_loop(*self._as_run)
+        found = closed_loop(*self.as_run)
         if self.sampling is None:
             return found
         force = np.zeros((len(found.A), self.plant.B.shape[1]))
         force[: len(self.plant.A)] = sampled(self.plant, self.sampling.period, 0.0).B
         return replace(found, B_d=force)
+
+    @property
+    def stable(self) -> bool:
+        """Whether every pole of the loop is."""
+        return self.closed.S.stable
 
     def over_a_step(self, longest: float) -> ClosedLoop:
         """The closed loop over a sampling period, or over `longest` s where it is continuous."""
@@ -77,7 +86,7 @@ class Loop:
 
         It runs through every pole of plant, controller and loop, and their flanks.
         """
-        roots = np.concatenate([self.poles, self.plant.poles, self.controller.poles])
+        roots = np.concatenate([self.poles, self.plant.rates, self.controller.rates])
         roots = roots[np.abs(roots) > 1e-9 * np.abs(roots).max()]
         low, high = 0.1 * np.abs(roots).min(), 10.0 * np.abs(roots).max()
         if self.sampling is not None:
@@ -86,12 +95,13 @@ class Loop:
         return frequency_grid(low, high, count, around(roots))
 
     @cached_property
-    def _as_run(self) -> tuple[StateSpace, StateSpace]:
+    def as_run(self) -> tuple[StateSpace, StateSpace]:
         """Plant and controller of the loop, in discrete time where it is sampled."""
         if self.sampling is None:
             return self.plant, self.controller
-        T = self.sampling.period
-        return sampled(self.plant, T, self.sampling.delay), tustin(self.controller, T)
+        T, K = self.sampling.period, self.controller
+        K = K if K.period else tustin(K, T)
+        return sampled(self.plant, T, self.sampling.delay), replace(K, period=T)
 
 
 def over(loop: ClosedLoop, period: float) -> ClosedLoop:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
@@ -50,11 +51,8 @@ class SampledController(Protocol):
     def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
         """Stability, ω_b (rad/s), ‖S‖∞ and rate of growth (1/s) of the loop on a plant."""
 
-    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G (k, p, m) and K (k, m, p) at frequencies (k,) in rad/s."""
-
-    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
-        """Errors (k, p) and all forces (k, m) at the instants, from rest, `forces` fed forward."""
+    def loop(self, plant: ScaledPlant) -> Loop:
+        """The loop on a plant, for its responses and signals."""
 
 
 @dataclass(frozen=True)

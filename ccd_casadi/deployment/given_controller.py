@@ -20,20 +20,17 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.sampled import (
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
-from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.lti.closed_loop import closed_matrix
+from ccd_casadi.lti.hold import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.recurrence import states
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
@@ -78,22 +75,14 @@ class Sampled:
         growth = np.log(max(f.spectral_radius, 1e-300)) / self.period
         return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
 
-    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G behind hold and delay, and K."""
-        held = sampled_plant(plant.plant_si(), self.period, self.delay)
-        return held.response(omega), self.system.response(omega)
+    def loop(self, plant: ScaledPlant) -> Loop:
+        """The loop on a plant, hold and delay exact."""
+        return Loop(plant.plant_si(), self.system, Sampling(1.0 / self.period, 1e6 * self.delay))
 
-    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
-        """Errors e (N, p) and forces u (N, m) from rest.
 
-        u = K e + what is fed forward; x and z are the states of plant and controller.
-        """
-        G, K = sampled_plant(plant.plant_si(), self.period, self.delay), self.system
-        n = len(G.A)
-        driven = np.hstack([(references @ K.D.T + forces) @ G.B.T, references @ K.B.T])
-        joint = states(closed_matrix(G, K), driven)
-        errors = references - joint[:, :n] @ G.C.T
-        return errors, joint[:, n:] @ K.C.T + errors @ K.D.T + forces
+def in_discrete_time(controller: StateSpace, at: Sampling) -> Sampled:
+    """K(z) by Tustin's rule, as loops of fixed structure are designed to run."""
+    return Sampled(tustin(controller, at.period), at.delay)
 
 
 def as_it_runs(run: FinishedRun) -> FinishedRun:
@@ -104,13 +93,10 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
     sections = run.problem.sections
     if sections is None or sections.sampling is None:
         return run
-    period, delay = sections.sampling.period, sections.sampling.delay
-    tustin = Conversion(Discretisation.TUSTIN, False, run.figures.sensitivity_peak_frequency)
-    system = discretise(run.controller, tustin, period, delay)
-    sampled = Sampled(system, delay)
+    sampled = in_discrete_time(run.controller, sections.sampling)
     _, bandwidth, peak, _ = sampled.judge(run.plant)
     figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
-    return replace(run, controller=system, figures=figures, sampled=sampled)
+    return replace(run, controller=sampled.system, figures=figures, sampled=sampled)
 
 
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:

@@ -119,12 +119,3 @@ def _crossing(omega: Array, gain: Array) -> float:
     i = above[0] - 1
     return float(np.exp(x[i] - y[i] * (x[i + 1] - x[i]) / (y[i + 1] - y[i])))
 
-
-def step_errors(
-    plant: StateSpace, controller: StateSpace, direction: Array, seconds: float
-) -> tuple[Array, Array]:
-    """Times in s and errors (k, p) after a unit step of the reference in `direction` (p,)."""
-    count = max(2, round(seconds / plant.period))
-    references = np.tile(np.asarray(direction, float)[:, None], (count, 1, 1))
-    errors, _ = simulate(plant, controller, references)
-    return np.arange(count, dtype=float) * plant.period, errors[:, :, 0]

@@ -28,5 +28,5 @@ def frequency_grid(
     Ascending, each at least `apart` (relative) above the one before.
     """
     grid = np.unique(np.concatenate([np.geomspace(low, high, points), *special]))
-    grid = grid[(grid >= low) & (grid <= high)]
+    grid = grid[(grid >= low) & (grid <= high)]  # NaN compares false
     return np.asarray(grid[np.append(True, np.diff(grid) > apart * grid[1:])])
