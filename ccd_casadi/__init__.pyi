@@ -4,7 +4,6 @@ from ccd_casadi.cases.case import load_case as load_case
 from ccd_casadi.cases.case import parse_case as parse_case
 from ccd_casadi.cases.case_problem import problem_of as problem_of
 from ccd_casadi.cases.run_folder import read_run as read_run
-from ccd_casadi.codesign.comparison import compare as compare
 from ccd_casadi.codesign.direct import Direct as Direct
 from ccd_casadi.codesign.lifted import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
@@ -30,6 +29,7 @@ from ccd_casadi.plants.plant import Plant as Plant
 from ccd_casadi.plants.plant import build_plant as build_plant
 from ccd_casadi.plants.scaling import StateSpace as StateSpace
 from ccd_casadi.robust.study import robustness as robustness
+from ccd_casadi.studies.comparison import compare as compare
 from ccd_casadi.support.errors import UserError as UserError
 from ccd_casadi.support.units import HZ as HZ
 from ccd_casadi.synthesis.interchange import plant_from_control as plant_from_control

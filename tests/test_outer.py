@@ -20,10 +20,10 @@ from ccd_casadi.codesign.outer_problem import (
     nested_program,
     solve_program,
 )
-from ccd_casadi.codesign.sequential import design_hardware, first_resonance
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.studies.sequential import design_hardware, first_resonance
 
 W1, W2 = 0.0995, -0.9950
 LOWER, UPPER = np.array([55.0, 55.0]), np.array([70.0, 70.0])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ccd_casadi.codesign import peak_constraints
 from ccd_casadi.codesign.box_look import look_over_box
-from ccd_casadi.codesign.direct import objective
+from ccd_casadi.codesign.direct import true_objective as objective
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.codesign.verify import verify

@@ -21,7 +21,7 @@ from ccd_casadi.codesign.direct import acceptable
 from ccd_casadi.codesign.direct import true_objective as objective
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
-from ccd_casadi.codesign.kkt import SMOOTH, KktCertificate, kkt_certificate
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of, survival_of
@@ -29,6 +29,7 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant

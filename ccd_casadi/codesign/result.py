@@ -8,7 +8,6 @@ from typing import Any
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import (
@@ -23,10 +22,13 @@ from ccd_casadi.codesign.verdict import (
 )
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
+
+FORMAT = 1  # of result.json: raised when a key of result.schema.json goes or changes its meaning
 
 
 def result_dict(
@@ -74,17 +76,14 @@ def result_dict(
         "minimise": problem.figure.key,
         "verification_error": error,
         "checks": checks,
-        "active": list(verified.active()),
+        "active": list(verified.active),
         "inner_gap": verified.inner_gap,
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
         "box_look": _box_look(look),
         "notes": list(plant.notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
-        **spent_entry(spent, look is not None and look.moved),
-        "seconds": seconds,
-        "seed": seed,
-        "versions": versions(),
+        **run_entry(spent, seconds, seed, look is not None and look.moved),
         "surrogate_quality": quality_dict(quality),
         **verified.evidence(promised),
         **budget_entry(problem, verified.theta, verified.controller),
@@ -164,7 +163,17 @@ def infeasible_dict(
         "status": "infeasible",
         "reason": reason,
         "formulation": formulation,
-        **spent_entry(spent),
+        **run_entry(spent, seconds, seed),
+    }
+
+
+def run_entry(
+    spent: Mapping[str, int], seconds: float, seed: int, moved: bool = False
+) -> dict[str, Any]:
+    """What every result.json says of its run."""
+    return {
+        "format": FORMAT,
+        **spent_entry(spent, moved),
         "seconds": seconds,
         "seed": seed,
         "versions": versions(),

@@ -15,10 +15,10 @@ from enum import StrEnum
 from typing import Any
 
 from ccd_casadi.codesign.box_look import BoxLook
-from ccd_casadi.codesign.kkt import Kink, KktCertificate
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.optim.kkt import Kink, KktCertificate
 from ccd_casadi.support.units import metres
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature

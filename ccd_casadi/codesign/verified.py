@@ -14,12 +14,12 @@ import numpy as np
 
 from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, Line
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 
 
@@ -67,6 +67,7 @@ class Verified(ABC):
         """Where the surrogates of the formulation are asked: θ, and what else they depend on."""
         return np.array(self.theta)
 
+    @property
     @abstractmethod
     def active(self) -> tuple[str, ...]:
         """Names of the bounds and constraints that bind."""

@@ -56,6 +56,7 @@ class VerifiedDesign(Verified):
     def point(self) -> Array:
         return self.x
 
+    @property
     def active(self) -> tuple[str, ...]:
         return self.binding
 

@@ -75,6 +75,7 @@ class VerifiedSections(Verified):
         along = found is None or found.within(*ends)
         return self.wide.passed and not self.proof.refuted and along
 
+    @property
     def active(self) -> tuple[str, ...]:
         constraints = plant_of(self.problem).constraint_names
         bounds = [name for name in self.kkt.active if name not in constraints]

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ccd_casadi.codesign.published import PUBLISHED
+from ccd_casadi.studies.published import PUBLISHED
 from ccd_casadi.support.units import HZ
 
-ON_THE_SET = Path(__file__).with_name("rib_stage_on_the_set.json")
+ON_THE_SET = Path(__file__).with_suffix(".json")
 OPEN = 1e-3  # relative: past a bound by more, worst plants are left that the design does not know
 APART = " (apart)"
 ALL, NONE = 0.85, 0.15  # shares of a published gain from which it counts as kept, and as lost

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.codesign.comparison import Method
-from ccd_casadi.codesign.steepest_descent import Descent
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import cost_axis
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
@@ -13,6 +11,8 @@ from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import CYCLE, axis_label
 from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.studies.comparison import Method
+from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import HZ
 
 LABELS = {

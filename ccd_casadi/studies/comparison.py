@@ -10,15 +10,11 @@ import numpy as np
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.codesign.conclusions import conclusions
 from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.formulations import formulation_of
-from ccd_casadi.codesign.published import PUBLISHED
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
-from ccd_casadi.codesign.sequential import HardwareDesign, design_hardware, first_resonance
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.steepest_descent import Descent, Gradient, steepest_descent
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -28,6 +24,10 @@ from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.studies.conclusions import conclusions
+from ccd_casadi.studies.published import PUBLISHED
+from ccd_casadi.studies.sequential import HardwareDesign, design_hardware, first_resonance
+from ccd_casadi.studies.steepest_descent import Descent, Gradient, steepest_descent
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress

@@ -1,29 +1,34 @@
-"""The paper's figures 4 and 5 of our own syntheses; what is left of the rib stage's gain."""
+"""The paper's figures 4 and 5 by our own syntheses, as a page.
 
+    python benchmarks/paper_figures.py [CASE.toml] [--out PAGE.html]
+
+The plant at 60 kg each, and the inner optima of cases A and B there; the case's M_K is left out.
+"""
+
+import argparse
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.on_the_set import HEAD, sentences, stages_of, stored_rows, table
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import figure_bode, table_bode
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.loops import synthesised_loop, table_gains
-from ccd_casadi.reporting.page import Section, Table, figure_html, paragraph, table_html
+from ccd_casadi.reporting.page import Section, Table, figure_html, page, paragraph, table_html
 from ccd_casadi.reporting.svg import CYCLE
+from ccd_casadi.studies.published import TWO_MASS
 from ccd_casadi.synthesis.loop_responses import Loop
 
+ROOT = Path(__file__).resolve().parent.parent
 THETA = (60.0, 60.0)
 
 
-def published_sections(problem: CoDesignProblem, answer: dict[str, Any]) -> list[Section]:
-    """The two masses: the paper's figures 4 and 5. The rib stage: its gain when it has to run."""
-    published = answer["published"]
-    if published and problem.source.model == "rib_stage":
-        return [Section("What is left of the published gain on a robust set", _left(problem))]
-    if "case_A" not in published:
-        return []
+def sections(problem: CoDesignProblem, published: dict[str, Any]) -> list[Section]:
+    """Figures 4 and 5; none where the case has no feasible design."""
     loops = {
         name: loop
         for name in ("A", "B")
@@ -35,19 +40,6 @@ def published_sections(problem: CoDesignProblem, answer: dict[str, Any]) -> list
         Section("The paper's figure 4: the plant, 60 kg each", _plant(loops["A"], published)),
         Section("The paper's figure 5: cases A and B", _cases(loops, published)),
     ]
-
-
-def _left(problem: CoDesignProblem) -> str:
-    """The published, the nominal and the robust table in one; stored figures, not of this run."""
-    stages = stages_of(stored_rows(), problem.w1, problem.w2)
-    shown = table_html(Table(HEAD, tuple(table(stages))))
-    note = (
-        "Nominal: mixed sensitivity on the model alone, at stages that were kept, not those of "
-        "this run. On the set: sections on every plant of runs/rib_stage_built.toml, see "
-        "docs/rib_stage.md."
-    )
-    words = "\n".join(paragraph(text) for text in (*sentences(stages), note))
-    return f'{words}\n<div class="scroll">{shown}</div>'
 
 
 def _case(problem: CoDesignProblem, name: str, M_K: float) -> Loop | None:
@@ -117,3 +109,18 @@ def _cases(loops: dict[str, Loop], published: dict[str, Any]) -> str:
 
 def _against(label: str, ours: float, paper: float) -> tuple[str, str, str, str]:
     return (label, f"{ours:.2f}", f"{paper:g}", f"{100.0 * (ours / paper - 1.0):+.1f} %")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "case", nargs="?", type=Path, default=ROOT / "runs" / "two_mass_paper.toml"
+    )
+    parser.add_argument("--out", type=Path, default=Path("paper_figures.html"))
+    given = parser.parse_args()
+    found = sections(problem_of(load_case(given.case)), TWO_MASS)
+    given.out.write_text(page("The paper's figures 4 and 5", found, "", index=""))
+
+
+if __name__ == "__main__":
+    main()

@@ -4,23 +4,11 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.comparison import Comparison, Method
-from ccd_casadi.codesign.steepest_descent import Descent
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, synthesised_loop, table_gains
 from ccd_casadi.reporting.maps import figure_landscape
-from ccd_casadi.reporting.methods import (
-    LABELS,
-    caption_cost,
-    caption_histories,
-    figure_cost,
-    figure_histories,
-    table_cost,
-    table_histories,
-    theta_paths,
-)
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -32,13 +20,24 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
-from ccd_casadi.reporting.published_figures import published_sections
 from ccd_casadi.reporting.sections_loops import compared_html
 from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.reporting.verdict import verdict_html, worst
+from ccd_casadi.studies.comparison import Comparison, Method
+from ccd_casadi.studies.methods import (
+    LABELS,
+    caption_cost,
+    caption_histories,
+    figure_cost,
+    figure_histories,
+    table_cost,
+    table_histories,
+    theta_paths,
+)
+from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop
 from surrogates.files import write_whole
@@ -75,7 +74,6 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
             table_histories(problem, descent),
         )
         sections.append(Section(f"History: {name}", body))
-    sections += published_sections(problem, answer)
     sections.append(Section("The case", preformatted(case_to_toml(comparison.case))))
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     sections.append(Section("Versions", paragraph(f"{versions}; seed {answer['seed']}.")))
