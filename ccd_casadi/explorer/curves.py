@@ -10,6 +10,7 @@ from ccd_casadi.analysis.signals import signals_of
 from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.closed_loop import largest, responses_of
 from ccd_casadi.lti.grid import frequency_grid
@@ -73,7 +74,7 @@ def curves_of(look: Look) -> Curves | None:
         return None
     plant, K = look.plant, look.controller
     hz = grid_of(look)
-    run_at = sampling_of(look)
+    run_at = look.problem.sampling
 
     loop = Loop(plant.plant_si(), K, run_at)
     if run_at is not None:  # it was designed for hold and delay
@@ -98,12 +99,6 @@ def curves_of(look: Look) -> Curves | None:
         step=signals.step,
         move=signals.move,
     )
-
-
-def sampling_of(look: Look) -> Sampling | None:
-    """The sampled loop that a design is made for; None where that is a continuous one."""
-    sections = look.problem.sections
-    return None if sections is None else sections.sampling
 
 
 def bounds_of(look: Look, hz: Array) -> Array:
@@ -132,7 +127,7 @@ def grid_of(look: Look) -> Array:
 
 def sampled_of(look: Look) -> AsSampled | None:
     """A certified design at the rate and delay of its sliders; None where it is designed for it."""
-    if look.controller is None or look.problem.sections is not None:
+    if look.controller is None or kind_of(look.problem).as_designed:
         return None
     if look.standing is Standing.REFUSED:
         return None
