@@ -1,7 +1,7 @@
 """One controller on its plants over frequency: what pages and the explorer draw of a loop."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -25,7 +25,8 @@ NAMES = ("S", "KS", "T")
 class Bounded:
     """What a loop has to keep: S_max, S_low up to `low_hz`, and bounds of S, KS, T over Hz.
 
-    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are.
+    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are;
+    `compliance_max` (m/N) is for GS.
     """
 
     S_max: float
@@ -33,6 +34,7 @@ class Bounded:
     low_hz: float
     over: Callable[[Array], Array]
     words: tuple[str, str, str]
+    compliance_max: float | None = None
 
 
 @dataclass(frozen=True)
@@ -91,11 +93,12 @@ def loop_view(
     label: str = "",
     points: int = POINTS,
     peaks: bool = True,
+    special: Sequence[float] = (),
 ) -> LoopView:
     """The loops of one controller on plants in SI, the model first, on one grid.
 
     It reaches from below ω_low and ω_b to beyond the modes, of a sampled loop to half its rate,
-    and is fine around light poles and zeros of every plant and of K.
+    and is fine around light poles and zeros of every plant and of K, with `special` ones in Hz.
     """
     model = loops[0]
     poles, zeros = (_hz(of) for of in (model.plant.poles, model.plant.zeros(_unit(model))))
@@ -108,8 +111,8 @@ def loop_view(
     roots = [light(loop.plant.poles) for loop in loops]
     roots += [light(model.controller.rates), light(model.plant.zeros(_unit(model)))]
     near = around(np.concatenate(roots), FLANKS) / HZ
-    special = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
-    hz = frequency_grid(low, high, points, near, special, apart=SAME)
+    places = np.array([*poles, *zeros, bandwidth_hz, *special, *(hz for hz, _ in found)])
+    hz = frequency_grid(low, high, points, near, places, apart=SAME)
     sizes, opened, first = [], [], None
     for loop in loops:
         G, K = loop.responses(HZ * hz)
@@ -136,11 +139,6 @@ def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:
     found = [climbed(lambda w: float(gain(np.array([w]))[0]), grid[i - 1], grid[i + 1])
              for i in tops]  # fmt: skip
     return tuple((omega / HZ, height) for omega, height in found)
-
-
-def with_label(view: LoopView, label: str) -> LoopView:
-    """The same under another name."""
-    return replace(view, label=label)
 
 
 def _unit(loop: Loop) -> float:
