@@ -16,7 +16,7 @@ from ccd_casadi.support.units import HZ
 POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
 # In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.
 FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))
-END = 0.998  # of half the sampling rate
+END = 0.98  # of half the sampling rate
 SAME = 1e-9  # relative distance of two frequencies below which they are one
 NAMES = ("S", "KS", "T")
 
@@ -26,7 +26,7 @@ class Bounded:
     """What a loop has to keep: S_max, S_low up to `low_hz`, and bounds of S, KS, T over Hz.
 
     `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are;
-    `compliance_max` (m/N) is for GS.
+    `compliance_max` (m/N) is for GS. `asked`: the case asks for them; else they are what came out.
     """
 
     S_max: float
@@ -35,6 +35,7 @@ class Bounded:
     over: Callable[[Array], Array]
     words: tuple[str, str, str]
     compliance_max: float | None = None
+    asked: bool = True
 
 
 @dataclass(frozen=True)

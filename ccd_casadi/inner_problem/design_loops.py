@@ -48,7 +48,8 @@ def bounds_of_loop(
     else:
         over, words = partial(_of_sections, problem, bandwidth_hz), OF_SECTIONS
         most = problem.sections.compliance_max
-    return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words, most)
+    return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words, most,
+                   problem.sections is not None)  # fmt: skip
 
 
 def design_view(

@@ -39,7 +39,7 @@ def glance(
         f"The machine at this design{on}. S stays out of the shaded area: its peak, "
         f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
-        f"from -1.{_margins(view)} {move.caption}"
+        f"from -1 in the Nyquist plot.{_margins(view)} {move.caption}"
     )
     svg = figure_lines(rows, key="glance", title="At a glance", heights=(HEIGHT, HEIGHT))
     head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]

@@ -86,8 +86,9 @@ def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel
 
 
 def S_panel(view: LoopView, **more: Any) -> Panel:
-    """S of one design alone."""
-    return _gain_panel([view], 0, True, **more)
+    """S of one design with what is asked of it, its highest peak alone marked."""
+    marks = _peak_marks(_high_peaks(view)[:1], BLACK)
+    return _gain_panel([view], 0, view.bounded.asked, **{"marks": tuple(marks), **more})
 
 
 def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) -> Panel:
@@ -101,13 +102,14 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
         label = view.label or ("the model" if several else view.named(name))
         curves.append(Curve(view.hz, size[0] if alone else size.max(axis=0), label, colour))
         if bounds and np.isfinite(bound).any():
-            words, own = (view.bounded.words[i], ORANGE) if alone else ("", colour)
+            words = view.bounded.words[i] if alone else ""
+            own = ORANGE if view.bounded.asked and alone else colour
             curves.append(Curve(view.hz, bound, words, own, "--", width=0.9))
         if alone and several:
             low, high = size.min(axis=0), size.max(axis=0)
             found["bands"] = (Band(view.hz, low, high, "all plants"),)
         if i == 0:
-            marks += _peak_marks([p for p in view.peaks if p[1] > PEAK], colour)
+            marks += _peak_marks(_high_peaks(view), colour)
     at = [bandwidth_level(view.bandwidth_hz, BLACK if alone else colour)
           for view, colour in zip(views, CYCLE * len(views), strict=False)]  # fmt: skip
     low, high = (f(np.concatenate([v.sizes[i].ravel() for v in views])) for f in (np.min, np.max))
@@ -119,12 +121,10 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
         if alone:
             top = 3.5 * max(b.S_max, float(high))  # room for the words at its peak
             found["y_range"] = (0.5 * float(first.sizes[0, 0].min()), top)
-            found["forbidden"] = (
-                *forbidden(b.S_max, b.S_low, b.low_hz, *ends, top),
-                *above(first.hz, first.bounds[0], top),
-            )
+            shape = above(first.hz, first.bounds[0], top) if b.asked else ()
+            found["forbidden"] = (*forbidden(b.S_max, b.S_low, b.low_hz, *ends, top), *shape)
         return sensitivity_panel(curves, ends, b.S_max, at, label, **{**found, **more})
-    if alone:
+    if alone and first.bounded.asked:
         found["forbidden"] = above(first.hz, first.bounds[i], found["y_range"][1])
     bare = [Level(level.value, "", True, level.colour) for level in at]
     return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
@@ -193,13 +193,17 @@ def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
         (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
 
 
+def _high_peaks(view: LoopView) -> list[tuple[float, float]]:
+    """Those of S worth a word, the highest first."""
+    return sorted((p for p in view.peaks if p[1] > PEAK), key=lambda p: -p[1])
+
+
 def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
     """The highest peak labelled above it, up to three others to their far side of it."""
-    ranked = sorted(tops, key=lambda p: -p[1])[:4]
     marks = []
-    for hz, gain in ranked:
-        text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > ranked[0][0] else -7.0, 2.0)
-        if hz == ranked[0][0]:
+    for hz, gain in tops[:4]:
+        text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > tops[0][0] else -7.0, 2.0)
+        if hz == tops[0][0]:
             text, offset = f"{gain:.3g} at {text}", (0.0, 7.0)
         marks.append(Mark(hz, gain, text, colour=colour, offset=offset))
     return marks
@@ -213,7 +217,7 @@ def gains_html(view: LoopView, key: str = "gains") -> str:
 def caption_gains(view: LoopView) -> str:
     """What to see in the gains of one design, in numbers."""
     S_max, plants = view.bounded.S_max, len(view.open)
-    tops = sorted((p for p in view.peaks if p[1] > PEAK), key=lambda p: -p[1])
+    tops = _high_peaks(view)
     words = ""
     if tops:
         hz, gain = tops[0]

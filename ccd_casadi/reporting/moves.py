@@ -58,7 +58,7 @@ def move_panels(
     for name, made in zip(ways, found, strict=True):
         error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
         panels.append(_over_plants(
-            1e3 * time, error, f"error (µm), {name}", legend="upper right",
+            1e3 * time, error, f"error, {name} (µm)", legend="upper right",
             levels=(Level(1e3 * end, "end of the move", True, GREY),),
         ))  # fmt: skip
         columns += _columns(error)

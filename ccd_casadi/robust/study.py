@@ -35,6 +35,8 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics, statics
 
+NYQUIST = 0.999  # of half the sampling rate: where a grid ends
+
 
 @dataclass(frozen=True)
 class Study:
@@ -112,6 +114,8 @@ def tried(
     sampled = loop.sampling is not None
     bounded = bounds_of_loop(run.problem, run.weights, run.figures.gamma, np.nan)
     hz = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ).hz
+    if loop.sampling is not None:
+        hz = np.append(hz, NYQUIST * 0.5 / loop.sampling.period)
 
     def sizes(omega: Array) -> Array:
         return gains(*loop.responses(omega))
