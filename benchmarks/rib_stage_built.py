@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES
+from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.deployment.sampled import (
     sampled_figures,
     sampled_plant,
@@ -33,8 +35,6 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.rib_stage.geometry import NAMES
-from ccd_casadi.plants.rib_stage.plant import rib_stage
 
 RESULTS = Path(__file__).with_suffix(".json")
 DESIGN = Path(__file__).parent / "rib_stage_design"

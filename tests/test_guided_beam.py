@@ -11,8 +11,8 @@ from scipy.signal import tf2ss
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_direct import polish_sections
-from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant

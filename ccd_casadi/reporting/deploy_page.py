@@ -134,7 +134,7 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         )  # fmt: skip
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
-    crossing = bandwidth_level(bandwidth, BLACK, ", continuous")
+    crossing = bandwidth_level(bandwidth, text=", continuous")
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,))
     drawn = [
         Curve(hz, gain, "", colour, line)

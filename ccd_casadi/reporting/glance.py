@@ -10,7 +10,7 @@ from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.lines import Panel, figure_lines
 from ccd_casadi.reporting.loops import S_panel, marked
-from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, stage_modes_html
+from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, surface_modes_html
 from ccd_casadi.reporting.moves import MovePanels
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
 from ccd_casadi.reporting.page import Section, figure_html, number
@@ -72,8 +72,8 @@ def _margins(view: LoopView) -> str:
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> str:
-    """Masses and springs with their modes, the first modes of a rib stage, or a table of modes."""
-    stage = stage_modes_html(problem, theta)
+    """Masses and springs with their modes, the first modes of a surface, or a table of modes."""
+    stage = surface_modes_html(problem, theta)
     if stage:
         return stage
     system = mechanics(plant_of(problem), theta)

@@ -62,7 +62,7 @@ def over_hz(
     return Panel("frequency (Hz)", label, tuple(curves), log_x=True, x_range=ends, **kept)
 
 
-def bandwidth_level(hz: float, colour: str = BLACK, text: str = "") -> Level:
+def bandwidth_level(hz: float, colour: str = GREY, text: str = "") -> Level:
     """ω_b on the axis of frequency."""
     return Level(hz, f"ω_b {number(hz, 4)} Hz{text}", True, colour)
 
@@ -110,10 +110,12 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
             found["bands"] = (Band(view.hz, low, high, "all plants"),)
         if i == 0:
             marks += _peak_marks(_high_peaks(view), colour)
-    at = [bandwidth_level(view.bandwidth_hz, BLACK if alone else colour)
+    at = [bandwidth_level(view.bandwidth_hz, GREY if alone else colour)
           for view, colour in zip(views, CYCLE * len(views), strict=False)]  # fmt: skip
     low, high = (f(np.concatenate([v.sizes[i].ravel() for v in views])) for f in (np.min, np.max))
     found |= {"marks": tuple(marks), "y_range": (max(low / 1.5, 1e-6 * high), 4.0 * high)}
+    if len(curves) == 1 and not found.get("bands"):
+        found["legend"] = None
     first, ends = views[0], views[0].ends
     label = f"{first.named(name)} ({UNITS[name]})"
     if i == 0:
