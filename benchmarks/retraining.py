@@ -21,11 +21,11 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.retraining import CoDesignTruth
 from ccd_casadi.reporting.retrained_run import open_run
-from surrogates import sobol
-from surrogates.acquisition import objective_and_violation
-from surrogates.iteration import STARTS, fit_all
-from surrogates.optimum import predicted_optimum
-from surrogates.retraining import Settings, retrain, thinned
+from surrogates import GaussianProcess, fit_outputs, sobol
+from surrogates.acquisition import Posterior, objective_and_violation, predicted_optimum
+from surrogates.retraining import STARTS, Settings, retrain, thinned
+from surrogates.truth import Truth
+from surrogates.versions import load_version, version_names
 
 ROOT = Path(__file__).parent.parent
 CASES = ("two_mass", "two_mass_paper")
@@ -54,29 +54,36 @@ def retrained(folder: Path, case: str, seed: int) -> dict[str, float | str | Non
         outcome = retrain(folder, truth, Settings(seed=seed))
         seconds = perf_counter() - began
     result = json.loads((folder / "result.json").read_text())
-    lines = [json.loads(line) for line in (folder / "retrain.jsonl").read_text().splitlines()]
-    rounds = [line for line in lines if line["event"] == "round"]
+    counts = [len(load_version(folder, name)[0].X) for name in version_names(folder)]
     return {
         "status": outcome.status,
         "reason": outcome.reason,
         "objective": result["objective"],
-        "designs": FIRST + sum(len(line["batch"]) for line in rounds),
+        "fitted": counts,
         "syntheses": FIRST + outcome.spent,
-        "rounds": len(rounds),
+        "rounds": outcome.rounds,
         "seconds": seconds,
-        "lines": rounds,
     }
 
 
-def count_until(folder: Path, case: str, rounds: list[dict], optimum: float) -> int | None:
-    """Designs sampled before the first round whose prediction was the optimum."""
-    with opened(folder, case) as truth:
-        sampled = FIRST
-        for line in rounds:
-            x = np.array(line["batch"][0])  # the predicted optimum comes first
-            if line["predicted"] is not None and reached(truth, x, line["predicted"], optimum):
-                return sampled
-            sampled += len(line["batch"])
+def predicts(truth: Truth, surrogates: tuple[GaussianProcess, ...], optimum: float) -> bool:
+    """Whether the optimum of surrogates of a truth is the true one."""
+    width = truth.upper - truth.lower
+    samples = truth.evaluate(truth.lower + width * surrogates[0].X)
+    posterior = Posterior(truth, surrogates, samples, np.empty((0, len(width))))
+    best = samples.X[posterior.incumbent() or 0]
+    starts = np.vstack([best, sobol(truth.lower, truth.upper, STARTS, 0)])
+    found = predicted_optimum(posterior, starts)
+    return found is not None and reached(truth, *found, optimum)
+
+
+def count_until(folder: Path, copy: Path, case: str, optimum: float) -> int | None:
+    """Designs that the first version was fitted to whose predicted optimum is the true one."""
+    with opened(copy, case) as truth:
+        for name in version_names(folder):
+            surrogates = load_version(folder, name)
+            if predicts(truth, surrogates, optimum):
+                return len(surrogates[0].X)
     return None
 
 
@@ -85,13 +92,11 @@ def fixed(folder: Path, case: str, seed: int, optimum: float) -> int | None:
     while n <= LARGEST:
         with opened(folder / str(n), case) as truth:
             truth.evaluate(sobol(truth.lower, truth.upper, n, seed))
-            observed, failed = thinned(truth, truth.samples())
-            surrogates = fit_all(truth, observed, seed)
-            J, violation = objective_and_violation(truth, observed.X, observed.Y)
-            first = observed.X[np.argmin(np.where(violation <= 0.0, J, np.inf))]
-            starts = np.vstack([first, sobol(truth.lower, truth.upper, STARTS, seed)])
-            found = predicted_optimum(truth, surrogates, starts, failed)
-            if found is not None and reached(truth, found.x, found.objective, optimum):
+            observed, _ = thinned(truth, truth.samples())
+            surrogates = fit_outputs(
+                observed.X, observed.Y, observed.dY, lower=truth.lower, upper=truth.upper, starts=2
+            )
+            if predicts(truth, surrogates, optimum):
                 return n
         n *= 2
     return None
@@ -111,10 +116,10 @@ def main() -> None:
             optimum = min(run["objective"] for run in runs)
             for seed, run in enumerate(runs):
                 place = Path(name) / case
-                rounds = run.pop("lines")
                 row = {"case": case, "seed": seed, **run, "optimum": optimum}
                 row["loss"] = run["objective"] / optimum - 1.0
-                row["retrained_until"] = count_until(place / f"c{seed}", case, rounds, optimum)
+                known = place / f"r{seed}"
+                row["retrained_until"] = count_until(known, place / f"c{seed}", case, optimum)
                 row["fixed_until"] = fixed(place / f"f{seed}", case, seed, optimum)
                 table.append(row)
                 print(json.dumps(row), flush=True)

@@ -2,7 +2,7 @@
 
     python benchmarks/rib_stage_conclusions.py [--write]
 
-Prints what `ccd_casadi/codesign/on_the_set.py` says of the rows that `rib_stage_front.py --write`
+Prints what `rib_stage_on_the_set.py` says of the rows that `rib_stage_front.py --write`
 keeps; `--write` puts it between the marks of the page.
 """
 
@@ -11,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rib_stage_on_the_set import HEAD, sentences, stages_of, stored_rows, table
+
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.on_the_set import HEAD, sentences, stages_of, stored_rows, table
 
 ROOT = Path(__file__).resolve().parent.parent
 CASE, PAGE = ROOT / "runs" / "rib_stage.toml", ROOT / "docs" / "rib_stage.md"

@@ -10,7 +10,7 @@ climbed from too. A minute of a core for each θ.
 
 With `--whole` the whole loop climbs from there on all three models, the worst plants of the box
 are searched and added, and the judge sees the plants that it ends with: some minutes for each θ.
-`--write` keeps what was found in ccd_casadi/codesign/rib_stage_on_the_set.json (`--whole` then
+`--write` keeps what was found in benchmarks/rib_stage_on_the_set.json (`--whole` then
 begins at the channels kept there), from which `benchmarks/rib_stage_conclusions.py` writes the
 tables and sentences of docs/rib_stage.md.
 """
@@ -24,11 +24,10 @@ from typing import Any
 
 import numpy as np
 from rib_stage_built import DESIGN, HZ, theta_of
+from rib_stage_on_the_set import ON_THE_SET
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.on_the_set import ON_THE_SET
-from ccd_casadi.codesign.sequential import first_resonance
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
@@ -46,6 +45,7 @@ from ccd_casadi.inner_problem.sections_robustness import worst_members
 from ccd_casadi.inner_problem.sections_warm import moved
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.studies.sequential import first_resonance
 
 RUNS = Path(__file__).parent.parent / "runs"
 CASE, NOMINAL = RUNS / "rib_stage_built.toml", RUNS / "rib_stage.toml"

@@ -4,11 +4,11 @@ import json
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
+from ccd_casadi.support.package_text import package_text
 from surrogates.interrupts import begun
 from surrogates.options import one_line
 
@@ -32,7 +32,7 @@ SCHEMA = "case.schema.json"
 OWN = {
     "new": "a plant and a case to begin with, in a folder of that name",
     "keys": "every table and key of a case file, as Markdown",
-    "schema": "the same as JSON Schema, for an editor",
+    "schema": "the same as JSON Schema, for an editor; with --result that of result.json",
 }
 
 
@@ -56,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return ExitCode.DONE
     if words == ["schema"]:
         print(json.dumps(_schema().case_schema(), indent=1))
+        return ExitCode.DONE
+    if words == ["schema", "--result"]:
+        print(package_text("templates/result.schema.json"), end="")
         return ExitCode.DONE
     if words[0] == "new" and len(words) == 2 and not words[1].startswith("-"):
         return new(Path(words[1]))
@@ -83,8 +86,7 @@ def new(folder: Path) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in TEMPLATE:
-            text = (files("ccd_casadi") / "templates" / name).read_text(encoding="utf-8")
-            (folder / name).write_text(text, encoding="utf-8")
+            (folder / name).write_text(package_text(f"templates/{name}"), encoding="utf-8")
         schema = json.dumps(_schema().case_schema(), indent=1)
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:

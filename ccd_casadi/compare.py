@@ -8,7 +8,7 @@ from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run
 from ccd_casadi.support.process_pool import PATIENCE
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
-    from ccd_casadi.codesign.comparison import Comparison
+    from ccd_casadi.studies.comparison import Comparison
 
 
 def table(comparison: "Comparison") -> str:
@@ -36,10 +36,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import load_case
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.toml_writer import case_to_toml
-    from ccd_casadi.codesign.comparison import compare, comparison_dict
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.studies.comparison import compare, comparison_dict
     from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.json_files import write_json
 
@@ -61,7 +61,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(table(comparison))
         print("\n".join(answer["conclusions"]["sentences"]))
         print(f"run folder    {folder}")
-    from ccd_casadi.reporting.compare_page import (
+    from ccd_casadi.studies.compare_page import (
         write_comparison_report,  # matplotlib is slow to import
     )
 
@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = parser("ccd_casadi.compare", "Every method on one case.")
     add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.comparison"])
+    return run(command, arguments, argv, needs=["ccd_casadi.studies.comparison"])
 
 
 if __name__ == "__main__":

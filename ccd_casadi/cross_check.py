@@ -125,7 +125,7 @@ def _json(
     point: tuple[float, float],
     found: "Sequence[Verdict]",
 ) -> dict[str, Any]:
-    from ccd_casadi.codesign.result import figures_dict
+    from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.support.json_files import clean
     from ccd_casadi.support.versions import versions
 

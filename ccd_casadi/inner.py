@@ -88,7 +88,7 @@ def _progress(options: argparse.Namespace) -> Callable[[str], None] | None:
 
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
     """Print the answer, after controller.json is written: the folder may be refused."""
-    from ccd_casadi.codesign.result import figures_dict
+    from ccd_casadi.codesign.design_entries import figures_dict
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.versions import versions
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.units import counted
 from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -22,38 +23,83 @@ def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.budget_result import budget_lines
+    from ccd_casadi.inner_problem.sections_words import channel_words
     from ccd_casadi.reporting.verdict import terminal_lines
     from ccd_casadi.sampling.spent import cost_words
 
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
-    if solution.sections is not None:
-        return sections_summary(solution.result)
+    certificate, controller = result["certificate"], result.get("controller")
+    peak = f"peak {result['sensitivity_peak']:.5f} at {result['sensitivity_peak_hz']:.4g} Hz"
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *terminal_lines(result),
         f"theta         {_theta(result)}",
         f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
-        f"bandwidth     {result['bandwidth_hz']:.4f} Hz   predicted "
-        f"{result['surrogate_bandwidth_hz']:.4f} Hz (error {result['verification_error']:.1e})",
-        f"weights       omega_S = {result['omega_S_hz']:.5g} Hz, "
-        f"omega_T = {result['omega_T_hz']:.5g} Hz",
-        f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
-        f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
+        *inner_value_lines(result),
+        *_weights_lines(result),
+        *([] if controller is None else controller_lines(controller)),
+        f"sensitivity   {peak}, |S| {result['sensitivity_low']:.4g} at omega_low",
+        *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
         f"compliance    {result.get('compliance_words', 'not known')}",
         *loop_lines(result),
-        f"certificate   {'passed' if result['certificate']['passed'] else 'FAILED'}: norm "
-        f"{result['certificate']['norm']:.6g} <= {result['certificate']['norm_bound']:.6g}, "
-        f"poles left of {result['certificate']['max_real_pole']:.4g} 1/s",
+        f"certificate   {'passed' if certificate['passed'] else 'FAILED'}: {_norm(certificate)}, "
+        f"poles left of {certificate['max_real_pole']:.4g} 1/s",
+        *_robust_lines(result.get("robust", {})),
         *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
-        f"optimality    KKT residual {result['kkt']['stationarity']:.1e} on the true problem",
+        f"optimality    {_optimality(result)}",
         f"cost          {cost_words(result)}",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
+
+
+def controller_lines(controller: Mapping[str, Any]) -> list[str]:
+    """A controller of fixed structure: its order and gain, its sections in Hz."""
+    from ccd_casadi.inner_problem.sections_words import SectionWords
+
+    return [
+        f"controller    order {controller['order']}, gain {_gains(controller)}",
+        *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
+    ]
+
+
+def _weights_lines(result: Mapping[str, Any]) -> list[str]:
+    if result["omega_S_hz"] is None:
+        return []
+    at = (f"omega_{name} = {result[f'omega_{name}_hz']:.5g} Hz" for name in "ST")
+    return [f"weights       {', '.join(at)}"]
+
+
+def _norm(certificate: Mapping[str, Any]) -> str:
+    """Of the stacked loop, or of the worst figure over its bound on the plants of a set."""
+    if "plants" not in certificate:
+        return f"norm {certificate['norm']:.6g} <= {certificate['norm_bound']:.6g}"
+    on = counted(certificate["plants"], "plant")
+    return f"{certificate['norm']:.7g} of a bound at most on {on}"
+
+
+def _robust_lines(robust: Mapping[str, Any]) -> list[str]:
+    """Of a box of plants that was judged."""
+    if "worst_excess" not in robust:
+        return []
+    how = f"{'passed' if robust['passed'] else 'FAILED'} on {counted(robust['plants'], 'plant')}"
+    worst = f"{100.0 * robust['worst_excess']:+.3g} % of a bound"
+    return [f"robust        {how} of the box; the worst that was searched: {worst}"]
+
+
+def _optimality(result: Mapping[str, Any]) -> str:
+    residual, kink = result["kkt"]["stationarity"], result["kkt"].get("kink")
+    words = f"KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over theta"
+    words += "" if kink is None else " and controller, at a kink of J"
+    if "race" in result:
+        ends = ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"])
+        off = result["controller"]["kkt_residual"]
+        words += f", {off:.1e} over the controller; a full race there: {ends}"
+    return words
 
 
 def _cost(result: Mapping[str, Any]) -> str:
@@ -87,52 +133,11 @@ def _gains(controller: Mapping[str, Any]) -> str:
     return ", ".join(f"{item['name']}: {item['gain']:.4g} N/m" for item in channels)
 
 
-def sections_summary(result: Mapping[str, Any]) -> str:
-    """The same of a controller of fixed structure, its sections as notches and leads in Hz."""
-    from ccd_casadi.analysis.loop_figures import loop_lines
-    from ccd_casadi.codesign.budget_result import budget_lines
-    from ccd_casadi.inner_problem.sections_words import SectionWords, channel_words
-    from ccd_casadi.reporting.verdict import terminal_lines
-    from ccd_casadi.sampling.spent import cost_words
-    from ccd_casadi.support.units import counted
-
-    residual = result["kkt"]["stationarity"]
-    certificate, robust, controller = (result[k] for k in ("certificate", "robust", "controller"))
-    lines = [
-        f"status        {result['status']}  {result['reason']}".rstrip(),
-        *terminal_lines(result),
-        f"theta         {_theta(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
-        *inner_value_lines(result),
-        f"controller    order {controller['order']}, gain {_gains(controller)}",
-        *(f"              {SectionWords(**item).text}" for item in controller["sections"]),
-        f"sensitivity   peak {result['sensitivity_peak']:.5f} at "
-        f"{result['sensitivity_peak_hz']:.4g} Hz, |S| {result['sensitivity_low']:.4g} at omega_low",
-        *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
-        f"compliance    {result['compliance_words']}",
-        *loop_lines(result),
-        f"certificate   {'passed' if certificate['passed'] else 'FAILED'} on "
-        f"{counted(certificate['plants'], 'plant')}: {certificate['norm']:.7g} of a bound at most, "
-        f"poles left of {certificate['max_real_pole']:.4g} 1/s",
-        f"robust        {'passed' if robust['passed'] else 'FAILED'} on "
-        f"{counted(robust['plants'], 'plant')} of the box; the worst that was searched: "
-        f"{100.0 * robust['worst_excess']:+.3g} % of a bound",
-        *budget_lines(result),
-        f"binding       {', '.join(result['active']) or 'nothing'}",
-        f"optimality    KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over "
-        f"theta{'' if result['kkt'].get('kink') is None else ' and controller, at a kink of J'}, "
-        f"{controller['kkt_residual']:.1e} over the controller; a full race there: "
-        + ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"]),
-        f"cost          {cost_words(result)}",
-    ]
-    lines += [f"note          {words}" for words in result.get("notes", ())]
-    return "\n".join(lines)
-
-
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
     """What J counts of the controller, and what was predicted of it."""
     error = f"(error {result['verification_error']:.1e})"
-    bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz on every plant"
+    where = " on every plant" if "plants" in result["certificate"] else ""
+    bandwidth = f"bandwidth     {result['bandwidth_hz']:.4f} Hz{where}"
     if result.get("minimise") != "rms_error":
         return [f"{bandwidth}   predicted {result['surrogate_bandwidth_hz']:.4f} Hz {error}"]
     nm = [1e9 * result[key] for key in ("error_rms_of_set", "surrogate_error_rms")]
@@ -149,9 +154,10 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     from ccd_casadi.cases.plant_report import size_words
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
-    from ccd_casadi.plants.registry import SHIPPED
+    from ccd_casadi.plants.registry import model_named
 
-    if case.plant.model in SHIPPED:
+    model = model_named(case.plant.model)
+    if model is not None and model.sound:
         for words in peak_words(problem.inner.S_max):
             print(f"warning: {words}", file=sys.stderr)
         return

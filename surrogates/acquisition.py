@@ -1,4 +1,4 @@
-"""Where new truth helps most: constrained expected improvement, and exploration, q at a time.
+"""Where new truth helps most: the predicted optimum, expected improvement, and exploration.
 
 With y ~ N(μ(x), diag σ²(x)), J and g are linearised in y,
 
@@ -11,7 +11,6 @@ Source: Schonlau, Welch and Jones (1998); batches by the kriging believer of Gin
 Le Riche and Carraro (2010).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -20,6 +19,7 @@ import numpy as np
 from surrogates.casadi_export import to_casadi
 from surrogates.gaussian_process import GaussianProcess, condition
 from surrogates.interface import Array
+from surrogates.ipopt import end_points
 from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth
 
@@ -72,27 +72,18 @@ class Posterior:
 
     def with_prediction_at(self, x: Array) -> "Posterior":
         """The same with its own prediction at x (d,) taken for an observation."""
-        truth, old = self.truth, self.observed
-        mean = to_casadi(list(self.surrogates), std=False)
-        y = np.array(mean(x)).ravel()
-        dY = None
-        if old.dY is not None:
-            symbol = ca.MX.sym("x", len(x))
-            slope = ca.Function("slope", [symbol], [ca.jacobian(mean(symbol), symbol)])(x)
-            dY = np.concatenate([old.dY, np.array(slope)[None]])
-        new = Observations(np.vstack([old.X, x]), np.vstack([old.Y, y]), dY)
+        truth, old, symbol = self.truth, self.observed, ca.MX.sym("x", len(x))
+        mean = to_casadi(list(self.surrogates), std=False)(symbol)
+        y, slope = map(np.array, ca.Function("y", [symbol], [mean, ca.jacobian(mean, symbol)])(x))
+        dY = None if old.dY is None else np.concatenate([old.dY, slope[None]])
+        new = Observations(np.vstack([old.X, x]), np.vstack([old.Y, y.ravel()]), dY)
         surrogates = tuple(
             condition(
-                process.hyperparameters,
-                new.X,
-                new.Y[:, i],
-                lower=truth.lower,
-                upper=truth.upper,
-                kernel=process.kernel,
-                dY=None if dY is None else dY[:, i],
+                process.hyperparameters, new.X, new.Y[:, i], lower=truth.lower, upper=truth.upper,
+                kernel=process.kernel, dY=None if dY is None else dY[:, i],
             )
             for i, process in enumerate(self.surrogates)
-        )
+        )  # fmt: skip
         return replace(self, surrogates=surrogates, observed=new)
 
 
@@ -119,10 +110,9 @@ def expected_improvement(posterior: Posterior, X: Array, best: float | None) -> 
     """
     from scipy.special import ndtr
 
-    truth = posterior.truth
     pairs = [process.predict(X, return_std=True) for process in posterior.surrogates]
     mean, std = (np.array(part).T for part in zip(*pairs, strict=True))
-    J, J_std, g, g_std = _linearised(truth, X, mean, std)
+    J, J_std, g, g_std = _linearised(posterior.truth, X, mean, std)
     certain = g_std <= EXACT
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         each = np.where(certain, g <= EXACT, ndtr(-g / np.where(certain, 1.0, g_std)))
@@ -130,8 +120,7 @@ def expected_improvement(posterior: Posterior, X: Array, best: float | None) -> 
         if best is None:
             return feasible * float(np.ptp(posterior.values()[0]))
         u = (best - J) / J_std
-        density = np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
-        gain = J_std * (u * ndtr(u) + density)
+        gain = J_std * (u * ndtr(u) + np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi))
     gain = np.where(J_std > 0.0, gain, np.maximum(best - J, 0.0))
     return np.nan_to_num(gain * feasible, nan=0.0)
 
@@ -144,8 +133,8 @@ def _linearised(truth: Truth, X: Array, mean: Array, std: Array) -> tuple[Array,
     outputs = [np.array(o) for o in ca.Function("j", [x, y], [J, g, *slopes])(X.T, mean.T)]
     variance = (std**2).T
     J_std = np.sqrt((outputs[2] ** 2 * variance).sum(axis=0))
-    count, k = g.numel(), len(variance)
-    to_y = outputs[3].reshape(k, count, len(X))  # column-major: the constraints run fastest
+    # column-major: the constraints run fastest
+    to_y = outputs[3].reshape(len(variance), g.numel(), len(X))
     return outputs[0].ravel(), J_std, outputs[1], np.sqrt((to_y**2 * variance[:, None]).sum(axis=0))
 
 
@@ -160,25 +149,22 @@ def scaled_deviation(posterior: Posterior, X: Array) -> Array:
 
 
 def maximiser(
-    posterior: Posterior, explore: bool, near: Sequence[Array], seed: int
+    posterior: Posterior, explore: bool, near: list[Array], seed: int
 ) -> tuple[Array, float]:
     """The point (d,) of largest merit that is not known yet, and its merit; 0 where none helps.
 
     Merit is the expected improvement, or the deviation to `explore`. Seeded candidates over the
     box and around `near`, then ever closer around the best of them.
     """
-    truth = posterior.truth
-    lower, upper = truth.lower, truth.upper
+    lower, upper = posterior.truth.lower, posterior.truth.upper
     rng = np.random.default_rng(seed)
-    J, _ = posterior.values()
     at = posterior.incumbent()
-    best = None if at is None else float(J[at])
+    best = None if at is None else float(posterior.values()[0][at])
 
     def merit(X: Array) -> Array:
-        if explore:
-            found = scaled_deviation(posterior, X)
-        else:
-            found = expected_improvement(posterior, X, best)
+        found = (
+            scaled_deviation(posterior, X) if explore else expected_improvement(posterior, X, best)
+        )
         return np.where(posterior.distance(X) > NEAR, found * posterior.chance_of_value(X), 0.0)
 
     def cloud(centre: Array, scale: float) -> Array:
@@ -195,32 +181,42 @@ def maximiser(
 
 
 def choose(
-    posterior: Posterior,
-    first: Array | None,
-    count: int,
-    explore: int,
-    near: Sequence[Array],
-    seed: int,
+    posterior: Posterior, near: list[Array], count: int, explore: int, seed: int
 ) -> Array:
-    """A batch (<= count, d): `first`, then by improvement, the last `explore` by deviation.
+    """A batch (<= count, d): the first of `near` if it is new, then by improvement.
 
-    The prediction at each counts as true before the next is sought (kriging believer); `first`
-    is left out where it is known already.
+    The last `explore` are by deviation. The prediction at each counts as true before the next is
+    sought (kriging believer).
     """
-    chosen: list[Array] = []
+    chosen = [x for x in near[:1] if posterior.distance(x[None])[0] > NEAR]
+    for number in range(count):
+        if number >= len(chosen):
+            x, merit = maximiser(posterior, number >= count - explore, near, seed + number)
+            if merit <= 0.0:  # nothing to be gained: then to be learnt
+                x, merit = maximiser(posterior, True, near, seed + number)
+            if merit <= 0.0:
+                break
+            chosen.append(x)
+        posterior = posterior.with_prediction_at(chosen[number])
+    return np.array(chosen[:count]).reshape(-1, len(posterior.truth.lower))
 
-    def take(x: Array) -> None:
-        nonlocal posterior
-        chosen.append(x)
-        posterior = posterior.with_prediction_at(x)
 
-    if first is not None and posterior.distance(first[None])[0] > NEAR:
-        take(first)
-    room = count - len(chosen)
-    for number in range(room):
-        x, merit = maximiser(posterior, number >= room - explore, near, seed + number)
-        if merit <= 0.0:  # nothing to be gained: then to be learnt
-            x, merit = maximiser(posterior, True, near, seed + number)
-        if merit > 0.0:
-            take(x)
-    return np.array(chosen).reshape(-1, len(posterior.truth.lower))
+def predicted_optimum(posterior: Posterior, starts: Array) -> tuple[Array, float] | None:
+    """The best local optimum of the means and its J, by IPOPT from `starts` (m, d); None without.
+
+    min J(x, s(x))  s.t.  g(x, s(x)) <= 0,  lower <= x <= upper,  ‖x̂ - x̂_f‖ >= AVOID
+
+    with s the means, x̂ in the unit box and x_f the points where the truth had no value.
+    """
+    truth = posterior.truth
+    lower, width = truth.lower, truth.upper - truth.lower
+    z = ca.MX.sym("z", len(lower))
+    x = lower + width * z
+    y = to_casadi(list(posterior.surrogates), std=False)(x)
+    free = [AVOID**2 - ca.sumsqr(z - point) for point in (posterior.failed - lower) / width]
+    program = {
+        "x": z, "f": truth.objective(x, y), "g": ca.vertcat(truth.constraints(x, y), *free)
+    }  # fmt: skip
+    ends = [end for end in end_points(program, (starts - lower) / width) if end.converged]
+    best = min(ends, key=lambda end: end.objective, default=None)
+    return None if best is None else (lower + width * best.z, best.objective)

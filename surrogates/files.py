@@ -7,9 +7,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from surrogates.pending_points import FOLDER
-
-LOCAL = (FOLDER, "*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # of one place, or copied otherwise
+LOCAL = ("*.sqlite", "*.sqlite-wal", "*.sqlite-shm")  # copied otherwise
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

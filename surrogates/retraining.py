@@ -1,33 +1,40 @@
 """The loop of a retraining job: fit, predict the optimum, ask the truth where it helps most.
 
-What to do next follows from the samples alone, so that a job that was killed, or that runs beside
-another, goes on from what is known, and one that has nothing left to do does nothing.
+What to do next follows from the samples alone: a job that was killed goes on from what is known,
+and one that has nothing left to do does nothing.
 """
 
 import math
-import os
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from time import perf_counter, sleep
 
 import numpy as np
 
-from surrogates.acquisition import NEAR, choose, distances, objective_and_violation
+from surrogates.acquisition import (
+    NEAR,
+    Posterior,
+    choose,
+    distances,
+    maximiser,
+    objective_and_violation,
+    predicted_optimum,
+)
+from surrogates.fitting import fit_outputs
+from surrogates.gaussian_process import loo_errors
 from surrogates.interface import Array
-from surrogates.iteration import Iteration, converged, iterate
-from surrogates.journal import Journal
-from surrogates.pending_points import PendingPoints
 from surrogates.sampling_plan import sobol
 from surrogates.truth import Observations, Truth, TruthError
-from surrogates.versions import Versions
+from surrogates.versions import keep_version, load_version, only_job, publish, version_names
 
-JOURNAL = "retrain.jsonl"
 PER_INPUT = 3  # samples an input that a first fit is worth
 DOUBLINGS = 4  # of the first design, where the truth has no value at most points
 PASSES = 4  # fits after a verification, which itself yields samples
+STARTS = 16  # of IPOPT, besides the best sample
+SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
+SAME = 1e-9  # of the box: samples that a version was fitted to
 CONVERGED = "converged"
-WAIT = 0.2  # s between two looks at what other jobs are about to finish
 
 
 @dataclass(frozen=True)
@@ -55,12 +62,19 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """A batch (q, d) to evaluate, none to wait for other jobs; or the reason to end."""
+class Iteration:
+    """The surrogates, the version that keeps them, and how far their optimum is from the truth.
 
-    iteration: Iteration | None
-    batch: Array
-    reason: str
+    near: the predicted optimum if there is one, then the best sample. x: the design to verify if
+    nothing more is asked (None: there is none).
+    """
+
+    posterior: Posterior
+    version: str
+    near: list[Array]
+    x: Array | None
+    converged: bool
+    words: str
 
 
 def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) -> Outcome:
@@ -68,38 +82,29 @@ def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) 
 
     Raises TruthError, TruthInterrupted and KeyboardInterrupt; all may be resumed.
     """
-    journal, versions = Journal(folder / JOURNAL), Versions(folder)
-    pending = PendingPoints(folder, len(truth.lower))
-    begun = [entry["spent"] for entry in journal.entries() if entry.get("event") == "start"]
-    base = begun[0] if begun else truth.spent
-    journal.append(event="start", spent=truth.spent, pid=os.getpid(), **vars(settings))
-    rounds = passes = 0
-    while True:
-        began, reservation = perf_counter(), None
-        with pending.deciding():
-            plan = decide(truth, pending.others(), versions, settings, base)
-            if plan.reason:
-                before = truth.spent
-                status, version = _finish(truth, plan.iteration, versions)
+    with only_job(folder, truth.spent) as base:
+        rounds = passes = 0
+        while True:
+            before = truth.spent
+            iteration, batch, reason = decide(folder, truth, settings, base)
+            if reason:
+                status, name = _finish(folder, truth, iteration)
                 passes += 1
-                if truth.spent > before and passes < PASSES and plan.reason == CONVERGED:
+                if truth.spent > before and passes < PASSES and reason == CONVERGED:
                     continue  # the verification found samples: fit those too
-                outcome = Outcome(status, plan.reason, rounds, truth.spent - base, version)
-                journal.append(event="end", **vars(outcome))
-                return outcome
-            if len(plan.batch):
-                reservation = pending.reserve(plan.batch)
-        if reservation is None:
-            sleep(WAIT)  # the points that count are in flight elsewhere
-            continue
-        with reservation:
-            found = truth.evaluate(plan.batch)
-        rounds += 1
-        _log(journal, rounds, truth, plan.iteration, found, perf_counter() - began, quiet)
+                return Outcome(status, reason, rounds, truth.spent - base, name)
+            truth.evaluate(batch)
+            rounds += 1
+            if not quiet:
+                first = f"first design, {len(batch)} points"
+                words = first if iteration is None else iteration.words
+                print(f"round {rounds}: {words}", file=sys.stderr, flush=True)
 
 
-def decide(truth: Truth, pending: Array, versions: Versions, settings: Settings, base: int) -> Plan:
-    """What the samples, and the points (m, d) that other jobs have in flight, leave to be done.
+def decide(
+    folder: Path, truth: Truth, settings: Settings, base: int
+) -> tuple[Iteration | None, Array, str]:
+    """What the samples leave to be done: a batch (q, d) to evaluate, or the reason to end.
 
     `base`: evaluations before the first job. Raises TruthError where the budget is too small
     for a first fit.
@@ -107,40 +112,32 @@ def decide(truth: Truth, pending: Array, versions: Versions, settings: Settings,
     seen = truth.samples()
     observed, failed = thinned(truth, seen)
     cost = truth.spent / max(len(seen.X), 1) or 1.0
-    left = settings.budget - (truth.spent - base) - len(pending) * cost
+    left = settings.budget - (truth.spent - base)
     room = min(settings.batch, max(math.ceil(left / cost), 0))
-    exhausted = not room and not len(pending)
     missing = first_design(truth, seen, observed, settings.seed)
     if len(missing):
-        if exhausted:
+        if not room:
             raise TruthError(
                 f"--budget {settings.budget} leaves {len(observed.X)} samples, too few for a "
                 "first fit; give a larger one"
             )
-        closed = np.vstack([failed, pending])
-        return Plan(None, missing[distances(truth, missing, closed) > NEAR][:room], "")
-    none = np.empty((0, len(truth.lower)))
+        return None, missing[:room], ""
     if len(observed.X) < len(truth.lower) + 2:
-        return Plan(None, none, "too few points where the truth has a value")
-    iteration = iterate(truth, observed, failed, versions, settings.seed)
-    if converged(iteration):
-        return Plan(iteration, none, CONVERGED)
-    if exhausted:
-        return Plan(iteration, none, "budget")
-    batch = next_batch(iteration, pending, room, settings) if room else none
-    stuck = not len(batch) and not len(pending)
-    return Plan(iteration, batch, "nothing is left to ask" if stuck else "")
+        return None, missing, "too few points where the truth has a value"
+    iteration = iterate(folder, truth, observed, failed, settings.seed)
+    if iteration.converged or not room:
+        return iteration, missing, CONVERGED if iteration.converged else "budget"
+    explore, seed = round(settings.explore * room), settings.seed + len(observed.X)
+    batch = choose(iteration.posterior, iteration.near, room, explore, seed)
+    return iteration, batch, "" if len(batch) else "nothing is left to ask"
 
 
-def _finish(
-    truth: Truth, iteration: Iteration | None, versions: Versions
-) -> tuple[str, str | None]:
+def _finish(folder: Path, truth: Truth, iteration: Iteration | None) -> tuple[str, str | None]:
     if iteration is None:
         return truth.finish(None, (), None), None
-    name = iteration.version.version
-    status = truth.finish(iteration.x, iteration.posterior.surrogates, name)
-    versions.publish()
-    return status, name
+    status = truth.finish(iteration.x, iteration.posterior.surrogates, iteration.version)
+    publish(folder)
+    return status, iteration.version
 
 
 def thinned(truth: Truth, seen: Observations) -> tuple[Observations, Array]:
@@ -160,58 +157,77 @@ def thinned(truth: Truth, seen: Observations) -> tuple[Observations, Array]:
 
 def first_design(truth: Truth, seen: Observations, observed: Observations, seed: int) -> Array:
     """Points (m, d) that a first fit still misses: of a Sobol set, doubled while most fail."""
-    d = len(truth.lower)
-    least = PER_INPUT * d
-    for doubling in range(DOUBLINGS):
-        if len(observed.X) >= least:
-            break
+    least = PER_INPUT * len(truth.lower)
+    for doubling in range(DOUBLINGS if len(observed.X) < least else 0):
         points = sobol(truth.lower, truth.upper, least << doubling, seed)
         missing = points[distances(truth, points, seen.X) > NEAR]
         if len(missing):
             return missing
-    return np.empty((0, d))
+    return np.empty((0, len(truth.lower)))
 
 
-def next_batch(iteration: Iteration, pending: Array, room: int, settings: Settings) -> Array:
-    """The predicted optimum, what promises most, and the share to explore."""
-    posterior = iteration.posterior
-    for x in pending:
-        posterior = posterior.with_prediction_at(x)
-    first = None if iteration.optimum is None else iteration.optimum.x
-    explore = min(round(settings.explore * room), room)
-    seed = settings.seed + len(posterior.observed.X)
-    return choose(posterior, first, room, explore, iteration.near, seed)
+def iterate(
+    folder: Path, truth: Truth, observed: Observations, failed: Array, seed: int
+) -> Iteration:
+    """Fit all that is observed (the newest version where it was fitted to that), and optimise.
 
-
-def _log(
-    journal: Journal,
-    number: int,
-    truth: Truth,
-    iteration: Iteration | None,
-    found: Observations,
-    seconds: float,
-    quiet: bool,
-) -> None:
-    J = objective_and_violation(truth, found.X, found.Y)[0]
-    entry = {"event": "round", "round": number, "spent": truth.spent, "batch": found.X, "true": J}
-    words = f"round {number}: first design, {len(found.X)} points"
-    if iteration is not None:
-        version, optimum = iteration.version, iteration.optimum
-        entry |= {
-            "samples": version.samples,
-            "version": version.version,
-            "errors": version.errors,
-            "predicted": None if optimum is None else optimum.objective,
-            "error": iteration.error,
-            "step": iteration.step,
-            "improvement": iteration.gain,
-        }
-        predicted = "none" if optimum is None else f"{optimum.objective:.6g}"
-        words = (
-            f"round {number}: {version.samples} samples, predicted J {predicted}, "
-            f"best true {iteration.true:.6g}, error {iteration.error:.1e}, "
-            f"improvement {iteration.gain:.1e}"
+    Converged: prediction and truth agree at an optimum that nothing promises to better.
+    """
+    lower, upper, tolerance = truth.lower, truth.upper, truth.tolerance
+    unit = (observed.X - lower) / (upper - lower)
+    name = next(reversed(version_names(folder)), None)
+    surrogates = () if name is None else load_version(folder, name)
+    if name is None or not _fitted_to(surrogates[0].X, unit):
+        name, surrogates = None, fit_outputs(
+            observed.X, observed.Y, observed.dY, lower=lower, upper=upper, seed=seed, starts=2
+        )  # fmt: skip
+    posterior = Posterior(truth, surrogates, observed, failed)
+    J, violation = posterior.values()
+    best = posterior.incumbent()
+    first = observed.X[int(np.argmin(violation)) if best is None else best]
+    optimum = predicted_optimum(posterior, np.vstack([first, sobol(lower, upper, STARTS, seed)]))
+    settled, at, x = False, best, None if best is None else first
+    if optimum is not None:
+        away = np.abs((observed.X - optimum[0]) / (upper - lower)).max(axis=1)
+        settled = bool(away.min() <= NEAR)
+        if settled or best is None:
+            at, x = int(np.argmin(away)), optimum[0]
+        if best is not None:
+            settled = settled or bool(abs(optimum[1] / J[best] - 1.0) <= SETTLED * tolerance)
+    true, error = (np.nan, np.inf) if at is None else (float(J[at]), _error_at(posterior, at))
+    near = [first] if optimum is None else [optimum[0], first]
+    gain = maximiser(posterior, False, near, seed)[1]
+    predicted = None if optimum is None else optimum[1]
+    shown = "none" if predicted is None else f"{predicted:.6g}"
+    if name is None:
+        name = keep_version(
+            folder,
+            surrogates,
+            truth.describe,
+            samples=len(observed.X),
+            errors={n: asdict(p.loo) for n, p in zip(truth.outputs, surrogates, strict=True)},
+            at_optimum=error if np.isfinite(error) else None,
+            objective=predicted,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
-    journal.append(**entry, seconds=seconds)
-    if not quiet:
-        print(words, file=sys.stderr, flush=True)
+    words = (
+        f"{len(observed.X)} samples, predicted J {shown}, "
+        f"best true {true:.6g}, error {error:.1e}, improvement {gain:.1e}"
+    )
+    converged = settled and error <= tolerance and gain <= SETTLED * tolerance * abs(true)
+    return Iteration(posterior, name, near, x, bool(converged), words)
+
+
+def _fitted_to(X: Array, unit: Array) -> bool:
+    return X.shape == unit.shape and bool(np.abs(X - unit).max() <= SAME)
+
+
+def _error_at(posterior: Posterior, row: int) -> float:
+    """The larger of |ΔJ| / |J| and |Δg| between an observation and its prediction without it."""
+    seen = posterior.observed.rows(np.array([row]))
+    residuals = [loo_errors(process)[0][row] for process in posterior.surrogates]
+    left_out = replace(seen, Y=seen.Y - np.array(residuals))
+    J, g = objective_and_violation(posterior.truth, seen.X, seen.Y)
+    J_out, g_out = objective_and_violation(posterior.truth, seen.X, left_out.Y)
+    off = float(abs(J_out[0] - J[0]) / max(abs(J[0]), 1e-300))
+    return max(off, float(abs(g_out[0] - g[0])) if np.isfinite(g[0]) else 0.0)

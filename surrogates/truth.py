@@ -8,7 +8,7 @@ never names a file or an import path.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -92,25 +92,11 @@ class Truth(Protocol):
         """
 
 
-class Opener(Protocol):
-    """What an entry point of the group names; raises TruthError.
-
-    With `user_code` False nothing may run that the folder or a file that it names holds.
-    `scheduler` is the address of a cluster to evaluate on, None for `workers` processes here; a
-    truth that knows no clusters raises TruthError where one is given.
-    """
-
-    def __call__(
-        self,
-        folder: Path,
-        *,
-        tolerance: float | None,
-        workers: int,
-        scheduler: str | None,
-        seed: int,
-        quiet: bool,
-        user_code: bool,
-    ) -> AbstractContextManager[Truth]: ...
+# What an entry point of the group names: opener(folder, tolerance=, workers=, scheduler=, seed=,
+# quiet=, user_code=), which raises TruthError. With `user_code` False nothing may run that the
+# folder or a file that it names holds; `scheduler` is the address of a cluster to evaluate on, None
+# for `workers` processes here, and a truth that knows no clusters raises TruthError for one.
+Opener = Callable[..., AbstractContextManager[Truth]]
 
 
 def opener_of(folder: Path) -> Opener:
@@ -134,9 +120,9 @@ def opener_of(folder: Path) -> Opener:
                 f"{path}: is missing, and there is not one truth installed but: {known}"
             ) from None
         name = next(iter(installed))
-    except TruthError:
-        raise
     except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, TruthError):
+            raise
         raise TruthError(f"{path}: is no readable JSON ({error}); solve again") from None
     if name not in installed:
         shown = ascii(name[:60])

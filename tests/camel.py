@@ -75,10 +75,6 @@ class Camel:
         return Observations(X, Y)
 
 
-def entries(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "retrain.jsonl").read_text().splitlines()]
-
-
 def true_cost(truth: Any, x: Array) -> float:
     return float(truth._at(x[None]).Y[0, 0])
 

@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ccd_casadi.codesign.verdict import KKT_LEVEL, LEAST_SHIFT
+from ccd_casadi.codesign.verdict import LEAST_SHIFT
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_robustness import LOOSE
 
@@ -40,7 +41,8 @@ def _claims(r: Mapping[str, Any], problem: CoDesignProblem) -> Iterator[tuple[bo
     sure = checks["optimality"] and checks["inner_optimum"]
     yield failed["optimal"] == (not sure), "optimal line and checks"
     if not sections:
-        yield checks["optimality"] == (kkt is not None and kkt <= KKT_LEVEL), "optimal and kkt"
+        stationary = kkt is not None and kkt <= VerifiedDesign.kkt_level
+        yield checks["optimality"] == stationary, "optimal and kkt"
     yield lines["optimal"].get("kkt_residual") == kkt, "two residuals"
     yield failed["predicted"] == (not checks["prediction"]), "predicted line and check"
     yield from _survives(r, problem, lines["survives"], failed["survives"])

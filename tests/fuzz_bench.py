@@ -36,7 +36,7 @@ from ccd_casadi.support.errors import UserError
 from surrogates import SurrogateFileError, load
 from surrogates.retrain import main as retrain
 from surrogates.truth import TruthError, opener_of
-from surrogates.versions import Versions
+from surrogates.versions import keep_version, load_version, only_job
 
 COMMANDS = {"solve": solve, "inner": inner, "retrain": retrain, "insight": insight}
 
@@ -53,10 +53,9 @@ class Bench:
         self.base.parent.mkdir()
         if run is not None:
             shutil.copytree(run, self.base)
-            versions = Versions(self.base)
-            facts = {"samples": 1, "errors": {}, "at_optimum": None, "objective": None}
-            versions.add(load(run / "surrogate.json")[0], {}, **facts, created="")  # type: ignore[arg-type]
-            (self.base / "retrain.jsonl").write_text('{"event": "start", "spent": 1}\n')
+            keep_version(self.base, load(run / "surrogate.json")[0], {}, samples=1)  # type: ignore[arg-type]
+            with only_job(self.base, 1):
+                pass
             return
         case = self.base.parent / "case.toml"
         case.write_text(toml(case_data()))
@@ -227,7 +226,7 @@ def read(argv: list[str]) -> int:
     readers: list[tuple[Any, tuple[type[Exception], ...]]] = [
         (lambda: read_run(folder), (UserError,)),
         (lambda: load(folder / "surrogate.json"), (SurrogateFileError, OSError)),
-        (lambda: Versions(folder).newest(), (SurrogateFileError, OSError)),
+        (lambda: load_version(folder, "0001"), (SurrogateFileError, OSError)),
         (store, (UserError,)),
         (lambda: opener_of(folder), (TruthError,)),
     ]

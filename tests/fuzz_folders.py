@@ -145,8 +145,7 @@ def spoil_folder(rng: random.Random, folder: Path) -> str:
         "case.toml",
         "truth.json",
         "surrogates/0001.json",
-        "surrogates/index.json",
-        "retrain.jsonl",
+        "retrain.lock",
     ]
     name = rng.choice(files)
     path = folder / name

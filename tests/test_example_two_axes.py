@@ -12,8 +12,8 @@ import pytest
 
 from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.codesign.sections_kkt import sections_kkt
-from ccd_casadi.codesign.sections_result import active_of, design_dict
 from ccd_casadi.deployment.as_designed import _require_own_bounds
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign

@@ -11,16 +11,16 @@ from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.kkt import KktCertificate
 from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_kkt import joint_residual, sections_kkt
-from ccd_casadi.codesign.sections_truth import TrueBandwidth
-from ccd_casadi.codesign.sections_verdict import KKT_LEVEL, _optimal
-from ccd_casadi.codesign.verdict import State
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.verdict import State, optimal
+from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.optim.pieces import Local, descend
 from ccd_casadi.sampling.samples import BandwidthSample
 
@@ -190,9 +190,8 @@ def case() -> CoDesignProblem:
 
 def line(kkt: KktCertificate) -> Any:
     """The verdict's."""
-    raced = SimpleNamespace(optima=(), error=np.nan)
-    return _optimal(
-        cast(Any, SimpleNamespace(kkt=kkt, race_gap=0.0, raced=raced, problem=case())), 1e-3
+    return optimal(
+        kkt, level=VerifiedSections.kkt_level, gap=0.0, tolerance=1e-3, better="", known=""
     )
 
 
@@ -261,7 +260,7 @@ def test_where_one_gradient_is_enough_there_is_no_kink() -> None:
     assert found.stationarity == pytest.approx(1.0)
     smooth = certificate(told, of.minimiser, np.zeros((2, 2)))
     assert smooth.kink is None
-    assert smooth.stationarity <= KKT_LEVEL
+    assert smooth.stationarity <= VerifiedSections.kkt_level
 
 
 class TwoControllers(SimpleNamespace):

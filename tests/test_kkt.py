@@ -6,7 +6,7 @@ from helpers import HZ, few, problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.kkt import KktCertificate, kkt_certificate
+from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.outer_problem import (
     OuterSolution,
     active_bounds,
@@ -16,6 +16,7 @@ from ccd_casadi.codesign.outer_problem import (
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
 
 
 def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:

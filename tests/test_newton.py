@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from scipy.linalg import null_space
 from test_kkt import MODEL, point
 
-from ccd_casadi.codesign.direct import acceptable, objective, polish
-from ccd_casadi.codesign.kkt import active_set, kkt_certificate
+from ccd_casadi.codesign.direct import acceptable, polish
+from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.kkt import active_at, kkt_certificate
 from ccd_casadi.codesign.newton import NEAR, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.plant_source import PlantSource
@@ -34,7 +35,7 @@ def inside_the_box(tmp_path_factory):
         sampler = Sampler(case, store, Workers(1))
         x = polish(sampler, point(62.0, 62.0, 600.0, 60.0))[0]
         quantities = TrueQuantities(case)
-        here = active_set(case, x, quantities.at(x))
+        here = active_at(case, x, quantities.at(x))
         mu = kkt_certificate(case, x, quantities.at(x)).multipliers
         strong = here.rows[[mu[name] > 0.0 for name in here.labels]]
         free = null_space(strong)[:, 0]

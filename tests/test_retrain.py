@@ -1,6 +1,5 @@
-"""Retraining jobs: to the optimum in few evaluations, resumed, repeated, side by side."""
+"""Retraining jobs: to the optimum in few evaluations, resumed, repeated, one at a time."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camel import Camel, entries, true_cost
+from camel import Camel, true_cost
 
 from surrogates import SurrogateFileError, load, sobol
 from surrogates.acquisition import NEAR
-from surrogates.journal import Journal
-from surrogates.pending_points import PendingPoints
 from surrogates.retraining import Outcome, Settings, retrain, thinned
 from surrogates.truth import Observations, TruthError
-from surrogates.versions import Versions
+from surrogates.versions import FOLDER, LOCK, load_version, only_job, version_names
 
 ROOT = Path(__file__).parent.parent
 
@@ -37,24 +34,11 @@ def test_few_evaluations_reach_the_optimum(camel_run: tuple[Path, Any, Outcome])
     assert version == outcome.version
 
 
-def test_the_log_tells_every_round(camel_run: tuple[Path, Any, Outcome]) -> None:
-    start, *rounds, end = entries(camel_run[0])
-    assert (start["event"], end["event"], end["status"]) == ("start", "end", "verified")
-    assert [line["round"] for line in rounds] == list(range(1, len(rounds) + 1))
-    for line in rounds:
-        assert 1 <= len(line["batch"]) == len(line["true"]) <= 3
-        assert line["seconds"] > 0.0
-    for line in rounds[2:]:  # after the first design
-        assert set(line["errors"]) == {"cost", "limit"}
-        assert {"samples", "version", "predicted", "error", "step", "improvement"} <= set(line)
-    assert rounds[-1]["spent"] == end["spent"]
-
-
 def test_a_repeated_job_does_nothing(camel_copy: Path) -> None:
-    before = {p: p.read_bytes() for p in camel_copy.rglob("*.json*") if p.name != "retrain.jsonl"}
+    before = {p: p.read_bytes() for p in camel_copy.rglob("*") if p.is_file()}
     again = retrain(camel_copy, Camel(camel_copy), Settings(batch=3))
     assert (again.status, again.rounds) == ("verified", 0)
-    after = {p: p.read_bytes() for p in camel_copy.rglob("*.json*") if p.name != "retrain.jsonl"}
+    after = {p: p.read_bytes() for p in camel_copy.rglob("*") if p.is_file()}
     assert after == before
 
 
@@ -125,16 +109,15 @@ def test_near_duplicates_are_fitted_once(tmp_path: Path) -> None:
     np.testing.assert_array_equal(turned.X, observed.X)
 
 
-# ---- versions, pending points, the journal -------------------------------------------------------
+# ---- versions, and one job at a time -------------------------------------------------------------
 
 
 def test_every_surrogate_is_kept_with_its_error_and_parent(
     camel_run: tuple[Path, Any, Outcome],
 ) -> None:
     tmp_path, _, outcome = camel_run
-    versions = Versions(tmp_path)
-    names = versions.names()
-    index = json.loads((tmp_path / "surrogates" / "index.json").read_text())["versions"]
+    names = version_names(tmp_path)
+    index = [load(tmp_path / FOLDER / f"{name}.json")[1]["version"] for name in names]
     assert [record["version"] for record in index] == names
     assert names == [f"{i + 1:04d}" for i in range(len(names))]
     assert [record["parent"] for record in index] == [None, *names[:-1]]
@@ -149,70 +132,32 @@ def test_every_surrogate_is_kept_with_its_error_and_parent(
     assert extra["about"] == "a camel"
     assert len(newest[0].X) == index[-1]["samples"]
     with pytest.raises(SurrogateFileError, match="no such version; known are 0001 to"):
-        versions.load("../surrogate")
+        load_version(tmp_path, "../surrogate")
 
 
-def test_numbers_are_never_shared(camel_copy: Path) -> None:
-    versions = Versions(camel_copy)
-    processes, record = versions.load("0001")
-    facts = {k: v for k, v in vars(record).items() if k not in ("version", "parent")}
-    count = len(versions.names())
-    script = (
-        "import sys; from surrogates.versions import Versions\n"
-        "v = Versions(__import__('pathlib').Path(sys.argv[1]))\n"
-        "p, r = v.load('0001')\n"
-        "facts = {k: x for k, x in vars(r).items() if k not in ('version', 'parent')}\n"
-        "v.publish = lambda: None\n"
-        "for _ in range(15): v.add(p, {}, **facts)\n"
-    )
-    other = subprocess.Popen([sys.executable, "-c", script, str(camel_copy)], cwd=ROOT)
-    for _ in range(15):
-        versions.add(processes, {}, **facts)
-    assert other.wait(60) == 0
-    versions.publish()
-    names = versions.names()
-    assert len(names) == count + 30
-    assert [int(name) for name in names] == list(range(1, len(names) + 1))
-    index = json.loads((camel_copy / "surrogates" / "index.json").read_text())["versions"]
-    assert [item["version"] for item in index] == names
-
-
-CLAIM = """
-import sys, time
-import numpy as np
+JOB = """
+import sys
 from pathlib import Path
-from surrogates.pending_points import PendingPoints
-pending = PendingPoints(Path(sys.argv[1]), 2)
-with pending.deciding():
-    reservation = pending.reserve(np.array([[0.1, 0.2]]))
-print("reserved", flush=True)
-time.sleep(60)
+from surrogates.versions import only_job
+with only_job(Path(sys.argv[1]), 7):
+    print("held", flush=True)
+    sys.stdin.read()
 """
 
 
-def test_points_in_flight_elsewhere_are_known_until_their_job_dies(tmp_path: Path) -> None:
-    pending = PendingPoints(tmp_path, 2)
+def test_a_second_job_is_refused_until_the_first_one_dies(tmp_path: Path) -> None:
     other = subprocess.Popen(
-        [sys.executable, "-c", CLAIM, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
+        [sys.executable, "-c", JOB, str(tmp_path)],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
     assert other.stdout is not None
-    assert other.stdout.readline() == "reserved\n"
-    with pending.deciding():
-        np.testing.assert_array_equal(pending.others(), [[0.1, 0.2]])
-        with pending.reserve(np.array([[0.5, 0.5]])):
-            assert len(list(pending.folder.glob("*.json"))) == 2
+    assert other.stdout.readline() == "held\n"
+    with pytest.raises(TruthError, match="wait for the job"):
+        retrain(tmp_path, Camel(tmp_path), Settings(budget=9))
     other.kill()
     other.communicate()
-    with pending.deciding():
-        assert len(pending.others()) == 0
-    assert list(pending.folder.glob("*.json")) == []
-
-
-def test_a_spoilt_log_line_spoils_no_other(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "log.jsonl")
-    journal.append(event="start", value=np.float64("nan"), X=np.eye(2))
-    with journal.path.open("a") as stream:
-        stream.write('{"event": "rou')
-    journal.append(event="end")
-    assert [entry["event"] for entry in journal.entries()] == ["start", "end"]
-    assert journal.entries()[0] == {"event": "start", "value": None, "X": [[1, 0], [0, 1]]}
+    with only_job(tmp_path, 9) as base:
+        assert base == 7, "what the first job found"
+    (tmp_path / LOCK).write_text("no database " * 100)
+    with pytest.raises(TruthError, match="not a database"):
+        retrain(tmp_path, Camel(tmp_path), Settings(budget=9))

@@ -180,7 +180,7 @@ def test_a_design_is_worth_its_objective_where_the_hardware_is_allowed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, violated: bool
 ) -> None:
     monkeypatch.setattr(module, "unmet", lambda *_: ("least mass",) * violated)
-    monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
+    monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=-3.0), store, Workers(1))
         sampler._spend("a", 5, (60.0, 60.0), 10.0)
@@ -207,7 +207,7 @@ def test_a_trace_tells_bandwidths_where_j_counts_an_error(
         return [], (key, theta, payload)
 
     monkeypatch.setattr(module, "inner_unit", unit)
-    monkeypatch.setattr(module, "hardware_cost", lambda *_: 100.0)
+    monkeypatch.setattr(module, "objective", lambda problem, _, v: 200.0 + problem.w2 * v)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(w1=2.0, w2=1e9), store, Workers(1))
         sampler.bandwidths(THETAS[:1])

@@ -17,8 +17,8 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.sections_races import seeded_and_prepared
-from ccd_casadi.codesign.sections_truth import objective
 from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
 from ccd_casadi.inner_problem.sections_problem import Uncertainty
@@ -102,7 +102,7 @@ def test_j_counts_the_error_where_a_sample_has_one() -> None:
     case = least()
     sample = BandwidthSample((60.0, 61.0), 50.0, (0.0, 0.0), np.nan, np.nan, (), "", 0.0, 1)
     assert sample.value == 50.0
-    assert objective(case, replace(sample, error=2e-7)) == pytest.approx(0.01 * 121.0 + 0.2)
+    assert objective_of(case, replace(sample, error=2e-7)) == pytest.approx(0.01 * 121.0 + 0.2)
 
 
 def written(folder: Path, w2: str, inner: str = 'minimise = "rms_error"') -> Path:

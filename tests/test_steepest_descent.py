@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign import steepest_descent as module
-from ccd_casadi.codesign.steepest_descent import steepest_descent
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.studies import steepest_descent as module
+from ccd_casadi.studies.steepest_descent import steepest_descent
 
 
 @pytest.mark.parametrize("of_error", [False, True])

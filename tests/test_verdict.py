@@ -16,17 +16,21 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign import verdict as v
-from ccd_casadi.codesign.box_look import BoxLook, _starts
-from ccd_casadi.codesign.direct import acceptable, objective
+from ccd_casadi.codesign.box_look import _starts
+from ccd_casadi.codesign.direct import acceptable
+from ccd_casadi.codesign.direct import true_objective as objective
+from ccd_casadi.codesign.formulation import BoxLook
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.kinked import BASIN, descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of, survival_of
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
@@ -39,6 +43,7 @@ from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
 from surrogates import design
 
 ROOT = Path(__file__).parent.parent
+KKT_LEVEL = VerifiedDesign.kkt_level
 CORNER = (55.0, 55.0)
 WEIGHTS = (1800.0 * HZ, 26.066 * HZ)  # of the verified design of case study 1
 SOUND = Survival(
@@ -55,16 +60,15 @@ SOUND = Survival(
 
 
 def optimal_line(residual: float, gap: float = 0.0, look: BoxLook | None = None) -> v.Line:
-    return v.optimal(
-        residual=residual, second_order=None, inner_gap=gap, tolerance=1e-3, starts=16, optima=2,
-        look=look,
-    )  # fmt: skip
+    kkt = KktCertificate(residual, 0.0, 0.0, {}, (), None, ())
+    known, _ = v.look_words(16, 2, look)
+    return v.optimal(kkt, level=KKT_LEVEL, gap=gap, tolerance=1e-3, better="", known=known)
 
 
 @given(st.floats(0.0, 10.0))
 def test_what_is_not_stationary_is_not_optimal(residual: float) -> None:
     line = optimal_line(residual)
-    assert (line.state is v.State.FAILED) == (residual > v.KKT_LEVEL)
+    assert (line.state is v.State.FAILED) == (residual > KKT_LEVEL)
     assert ("not optimal" in line.words) == (line.state is v.State.FAILED)
     assert "gap not known" in line.words
 
@@ -274,7 +278,7 @@ def test_descents_along_a_shelf_reach_its_end(chain_problem) -> None:
         kkt = kkt_certificate(case, end, quantities.at(end))
         assert acceptable(case, end, quantities.at(end))
         assert any(name.startswith("-3 dB") for name in kkt.active)
-        assert kkt.stationarity <= v.KKT_LEVEL
+        assert kkt.stationarity <= KKT_LEVEL
         ends.append(objective(case, end, quantities.at(end)))
     assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
@@ -287,7 +291,8 @@ def test_local_solves_start_from_more_than_what_beats_its_neighbours() -> None:
         for theta in thetas
     ]  # fmt: skip
     values = ((thetas - np.array(case.lower)) ** 2).sum(axis=1)  # one basin, one lowest point
-    starts = _starts(case, samples, values, np.array(case.upper))
+    lowest, others = _starts(case, samples, values, np.array(case.upper))
+    starts = [*lowest, *others]
     assert [samples.index(start) for start in starts] == list(np.argsort(values))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import LABELS, missed_by
 from ccd_casadi.plants.plant import theta_words
@@ -70,11 +71,12 @@ def best_over_design_plants(
     sampler: Sampler,
     solve: Callable[[Sampler], Solution],
     conclude: Callable[[Sampler, FormulationResult], Solution],
+    explain: Callable[[Sampler, Solution, float | None], str],
 ) -> Solution:
     """The best of a problem's solutions over its design plants, by `solve` and continuation.
 
-    `conclude` verifies what a continuation ended with. A problem with one design plant, or none,
-    is solved as it is.
+    `conclude` verifies what a continuation ended with, `explain` says why there is no better one.
+    A problem with one design plant, or none, is solved as it is.
     """
     began = perf_counter()
     problem = sampler.problem
@@ -87,7 +89,7 @@ def best_over_design_plants(
         alone = solve(sampler.of(replace(problem, robust=None), traced=False))
         if alone.verified is not None:
             for i, each in enumerate(samplers):
-                outcome, held = continued(each, alone.verified.x)
+                outcome, held = continued(each, alone.verified.point)
                 share = max(share, held)
                 if outcome is not None:
                     found[i] = min(found[i], conclude(each, outcome), key=order)
@@ -101,7 +103,8 @@ def best_over_design_plants(
         names = [_at(choice) for choice in choices]
         tried = {name: _tried(item.result) for name, item in zip(names, found, strict=True)}
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
-    result["reason"] = _reason(samplers[best], problem, found[best], share)
+    sampler.nearest = samplers[best].nearest
+    result["reason"] = explain(sampler, found[best], share)
     return replace(found[best], result=result, problem=choices[best])
 
 
@@ -130,12 +133,12 @@ def _tried(result: dict[str, Any]) -> dict[str, Any]:
     return {key: result[key] for key in keys if key in result}
 
 
-def _reason(sampler: Sampler, problem: CoDesignProblem, best: Solution, share: float | None) -> str:
+def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Why a search failed: where it looked, how near it came, what may be tried."""
-    words = str(best.result["reason"])
+    problem, words = sampler.problem, str(best.result["reason"])
     if _verified(best):
         return words
-    if best.verified is not None:
+    if isinstance(best.verified, VerifiedDesign):
         missed = missed_words(problem, best.verified.design.figures)
         parts = [words, missed, remedies(problem, share) if missed else ""]
         return "; ".join(part for part in parts if part)

@@ -21,9 +21,9 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.peak_constraints import other_peaks
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.objective import objective, objective_terms
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -130,7 +130,7 @@ def _settled(
         if end is None or found is None or not acceptable(problem, end, found):
             break
         after = kkt_certificate(problem, end, found)
-        rise = objective(problem, end, found) - objective(problem, x, design)
+        rise = true_objective(problem, end, found) - true_objective(problem, x, design)
         if after.stationarity >= kkt.stationarity or rise > _level(problem, x, design):
             break
         x, design, kkt = end, found, after
@@ -147,7 +147,7 @@ def _past_kinks(
         return x, design
     if not acceptable(problem, x, design):
         return end, found
-    before, after = (objective(problem, *item) for item in ((x, design), (end, found)))
+    before, after = (true_objective(problem, *item) for item in ((x, design), (end, found)))
     margin = _level(problem, x, design)
     if after < before - margin:
         return end, found
@@ -156,15 +156,9 @@ def _past_kinks(
     return (end, found) if level and better else (x, design)
 
 
-def objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
-    """J of a true design at x."""
-    return sum(_terms(problem, x, design))
-
-
-def _terms(problem: CoDesignProblem, x: Array, design: Sensitivities) -> tuple[float, float]:
-    """w1 f and w2 ω_b."""
-    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
-    return problem.w1 * cost, problem.w2 * design.figures.bandwidth
+def true_objective(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
+    """J of a true design at x = (θ, ln ω_S, ln ω_T)."""
+    return objective(problem, x[: len(problem.names)], design.figures.bandwidth)
 
 
 def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
@@ -185,10 +179,11 @@ def _residual(problem: CoDesignProblem, x: Array, design: Sensitivities) -> floa
 def _no_worse(
     problem: CoDesignProblem, candidate: LocalOptimum, x: Array, start: Sensitivities
 ) -> bool:
-    before = objective(problem, x, start)
+    before = true_objective(problem, x, start)
     return candidate.objective <= before + _level(problem, x, start)
 
 
 def _level(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
     """What J may differ by and still be the same."""
-    return LEVEL * sum(map(abs, _terms(problem, x, design)))
+    terms = objective_terms(problem, x[: len(problem.names)], design.figures.bandwidth)
+    return LEVEL * sum(map(abs, terms))

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.result import (
+from ccd_casadi.codesign.design_entries import (
     compliance_dict,
     controller_dict,
     figures_dict,
     loop_of_design,
 )
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     best_choice,
@@ -71,8 +72,7 @@ def mixed_answer(
         head["design_at"] = problem.robust.design_at
     certified, figures, controller = _design(problem, theta, point)
     figures = head | figures | {"syntheses": syntheses}
-    cost, bandwidth = head["hardware_cost"], HZ * (figures["bandwidth_hz"] or 0.0)
-    figures["objective"] = problem.w1 * cost + problem.w2 * bandwidth
+    figures["objective"] = objective(problem, theta, HZ * (figures["bandwidth_hz"] or 0.0))
     return InnerAnswer("verified" if certified else "not_verified", figures, controller, rows)
 
 

@@ -20,8 +20,8 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.constraints import constraint_shares
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.support.arrays import Array
@@ -173,9 +173,7 @@ def update_quantities(
 
 
 def _objective(problem: CoDesignProblem, sample: QuantitySample) -> float:
-    count = len(problem.names)
-    cost = hardware_cost(plant_of(problem), sample.x[:count])
-    return problem.w1 * cost + problem.w2 * float(sample.values[0])
+    return objective(problem, sample.x[: len(problem.names)], sample.values[0])
 
 
 def _violation(problem: CoDesignProblem, sample: QuantitySample) -> float:
@@ -206,8 +204,7 @@ def _iterate(
 ) -> Iterate:
     """Error: the largest of ω_b (relative) and of ln of the bounded figures (absolute)."""
     lower, upper = lifted_bounds(problem)
-    count = len(problem.names)
-    cost = problem.w1 * hardware_cost(plant_of(problem), sample.x[:count])
+    theta = sample.x[: len(problem.names)]
     error = np.inf
     if sample.certified:
         errors = np.abs(sample.values[:-1] - predicted)
@@ -217,11 +214,11 @@ def _iterate(
     if incumbent is not None:
         step = float(np.abs((np.array(sample.x) - incumbent.x) / (upper - lower)).max())
     return Iterate(
-        theta=sample.x[:count],
+        theta=theta,
         predicted=float(predicted[0]),
         truth=float(sample.values[0]),
-        predicted_objective=cost + problem.w2 * float(predicted[0]),
-        objective=cost + problem.w2 * float(sample.values[0]),
+        predicted_objective=objective(problem, theta, predicted[0]),
+        objective=_objective(problem, sample),
         error=error,
         step=step,
         radius=1.0,

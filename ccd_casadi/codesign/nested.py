@@ -19,8 +19,8 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -77,6 +77,10 @@ def solve_nested(
     if not any(sample.feasible for sample in samples):
         return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
     iterates: list[Iterate] = []
+
+    def value_of(sample: BandwidthSample) -> float:
+        return objective(problem, sample.theta, sample.value)
+
     radius, agreed = 1.0, False
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
@@ -101,9 +105,9 @@ def solve_nested(
         iterate = _iterate(problem, best, sample, predicted, radius)
         iterates.append(iterate)
         samples.append(sample)
-        improved = iterate.objective < _objective(problem, best)
+        improved = iterate.objective < value_of(best)
         agreed = iterate.error <= options.tolerance
-        settled = abs(iterate.objective - _objective(problem, best)) <= options.tolerance * abs(
+        settled = abs(iterate.objective - value_of(best)) <= options.tolerance * abs(
             iterate.objective
         )
         if agreed and (iterate.step <= STEP or settled):
@@ -162,15 +166,10 @@ def _allowed(problem: CoDesignProblem, thetas: Array) -> Array:
     return thetas[keep] if any(keep) else thetas
 
 
-def _objective(problem: CoDesignProblem, sample: BandwidthSample) -> float:
-    cost = hardware_cost(plant_of(problem), sample.theta)
-    return problem.w1 * cost + problem.w2 * sample.value
-
-
 def _best(problem: CoDesignProblem, samples: list[BandwidthSample]) -> BandwidthSample:
     feasible = [sample for sample in samples if sample.feasible]
     inside = [s for s in feasible if not unmet(problem, s.theta)]
-    return min(inside or feasible, key=lambda sample: _objective(problem, sample))
+    return min(inside or feasible, key=lambda s: objective(problem, s.theta, s.value))
 
 
 def _region(problem: CoDesignProblem, best: BandwidthSample, radius: float) -> tuple[Array, Array]:
@@ -218,15 +217,14 @@ def _iterate(
     radius: float,
 ) -> Iterate:
     lower, upper = box(problem)
-    cost = problem.w1 * hardware_cost(plant_of(problem), sample.theta)
     error = abs(predicted / sample.value - 1.0) if sample.feasible else np.inf
     step = np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max()
     return Iterate(
         theta=sample.theta,
         predicted=predicted,
         truth=sample.value,
-        predicted_objective=cost + problem.w2 * predicted,
-        objective=cost + problem.w2 * sample.value if sample.feasible else np.inf,
+        predicted_objective=objective(problem, sample.theta, predicted),
+        objective=objective(problem, sample.theta, sample.value) if sample.feasible else np.inf,
         error=float(error),
         step=float(step),
         radius=radius,

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.kinked import INSIDE
-from ccd_casadi.codesign.kkt import KktCertificate, active_set, lagrangian_hessian
+from ccd_casadi.codesign.kkt import active_at, lagrangian_hessian
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
 
 NEAR = 1e-3  # of the box: a longer step is not of the basin that the residual spoke of
@@ -27,7 +28,7 @@ def newton_step(
     x = (θ, ln ω_S, ln ω_T) with its certificate `kkt` of the plain conditions. The Hessian takes
     two true designs per free direction. Nocedal and Wright, Numerical Optimization, 18.1.
     """
-    here = active_set(problem, x, quantities.at(x))
+    here = active_at(problem, x, quantities.at(x))
     held = np.array([kkt.multipliers[name] > 0.0 for name in here.labels], bool)
     A = here.rows[held]
     inside = np.array([INSIDE * (name in problem.inner.bounds) for name in here.labels])

@@ -20,17 +20,12 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import null_space
 
-from ccd_casadi.codesign.kkt import (
-    ACTIVE,
-    KktCertificate,
-    kkt_certificate,
-    lagrangian_hessian,
-    lagrangian_parts,
-)
+from ccd_casadi.codesign.kkt import kkt_certificate, lagrangian_hessian, lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import ACTIVE, KktCertificate
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.derivatives import Sensitivities

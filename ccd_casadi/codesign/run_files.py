@@ -6,8 +6,6 @@ from pathlib import Path
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.lifted import OUTPUTS
-from ccd_casadi.codesign.result import controller_dict
-from ccd_casadi.codesign.sections_result import sections_controller
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.support.json_files import write_json
 from surrogates import save
@@ -41,11 +39,7 @@ def write_run(folder: Path, case: Case, solution: Solution) -> None:
     formulation = solution.result["formulation"]
     write_json(folder / "truth.json", {"truth": "ccd_casadi", "formulation": formulation})
     if solution.verified is not None:
-        write_json(folder / "controller.json", controller_dict(solution.verified.design.controller))
-    if solution.sections is not None:
-        made = solution.sections
-        words = sections_controller(made.problem, made.design)
-        write_json(folder / "controller.json", words)
+        write_json(folder / "controller.json", solution.verified.controller_entry())
     if solution.outcome.surrogates:
         save(
             solution.outcome.surrogates,

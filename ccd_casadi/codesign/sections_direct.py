@@ -11,12 +11,8 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
 )
 from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
-from ccd_casadi.codesign.sections_truth import (
-    TrueBandwidth,
-    hardware_at,
-    objective,
-    objective_gradient,
-)
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
 from ccd_casadi.optim.pieces import Local, descend, jumps
@@ -50,11 +46,11 @@ def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> Formul
     try:
         solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
     except OuterFailure as error:
-        best = min((truth.at(p) for p in good), key=lambda s: objective(problem, s))
-        if not np.isfinite(objective(problem, best)):
+        best = min((truth.at(p) for p in good), key=lambda s: objective_of(problem, s))
+        if not np.isfinite(objective_of(problem, best)):
             return FormulationResult(None, None, (), (), None, False, str(error))
         return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
-    best = min(truth.known.values(), key=lambda s: objective(problem, s))
+    best = min(truth.known.values(), key=lambda s: objective_of(problem, s))
     return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")
 
 
@@ -71,7 +67,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
     truth = TrueBandwidth(sampler, "polishing")
     candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
-    best = min(candidates, key=lambda s: objective(problem, s))
+    best = min(candidates, key=lambda s: objective_of(problem, s))
     if sections_kkt(problem, best).stationarity > STATIONARY:
         truth, best = by_pieces(truth, best)
     sampler, problem = truth.sampler, truth.sampler.problem
@@ -81,7 +77,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     program = type(program)(**{**vars(program), "exact_hessian": False})
     with suppress(OuterFailure):  # what it has asked for on its way counts
         solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
-    return sampler, min(truth.known.values(), key=lambda s: objective(problem, s))
+    return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))
 
 
 def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
@@ -100,7 +96,7 @@ def by_pieces(
     one becomes an anchor, and the search goes on.
     """
     for _ in range(FOLLOWED):
-        best, jumped = _by_pieces(truth, best, settled)
+        best, jumped = pieces_from(truth, best, settled)
         if not jumped:
             break
         problem = joined(truth.sampler.problem, np.array(best.kappa), ())
@@ -109,7 +105,7 @@ def by_pieces(
     return truth, best
 
 
-def _by_pieces(
+def pieces_from(
     truth: TrueBandwidth, best: BandwidthSample, settled: float
 ) -> tuple[BandwidthSample, bool]:
     """The best sample of one function ω_b*, and whether that jumps beside it."""
@@ -121,7 +117,7 @@ def _by_pieces(
         return local(truth.at(np.clip(lower + width * z, lower, upper)))
 
     def local(sample: BandwidthSample) -> Local | None:
-        J, gradient = objective(problem, sample), objective_gradient(problem, sample)
+        J, gradient = objective_of(problem, sample), objective_gradient(problem, sample)
         if not (np.isfinite(J) and np.isfinite(gradient).all()):
             return None
         return Local((np.array(sample.theta) - lower) / width, J, gradient)
@@ -137,4 +133,4 @@ def _by_pieces(
     end = descend(at, start, others, constraints, steps=STEPS * len(lower), settled=settled)
     met = (found for found in map(local, truth.known.values()) if found is not None)
     jumped = any(found.value > end.value and jumps(end, found) for found in met)
-    return min(truth.known.values(), key=lambda sample: objective(problem, sample)), jumped
+    return min(truth.known.values(), key=lambda sample: objective_of(problem, sample)), jumped

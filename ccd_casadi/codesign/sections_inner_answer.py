@@ -9,12 +9,13 @@ import numpy as np
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.inner_answer import InnerAnswer, head_of
-from ccd_casadi.codesign.sections_result import (
+from ccd_casadi.codesign.sections_entries import (
     active_of,
     design_dict,
     proof_dict,
     sections_controller,
 )
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
 from ccd_casadi.inner_problem.sections_error import least_error_at
@@ -70,7 +71,7 @@ def sections_answer(
         **design_dict(asked, theta, made),
         "active": active_of(made),
         "feasible": True,
-        "objective": problem.w1 * head["hardware_cost"] + problem.w2 * value,
+        "objective": objective(problem, theta, value),
         "robust": {
             "plants": checked,
             "passed": wide.passed,

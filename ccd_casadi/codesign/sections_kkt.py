@@ -17,15 +17,22 @@ direction left its two sides are all that there is, of several directions some a
 """
 
 import numpy as np
-from scipy.linalg import null_space, qr
+from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from ccd_casadi.codesign.kkt import ACTIVE, STEP, Kink, KktCertificate
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, hardware_at, objective_gradient
+from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.constraints import constraint_sizes
+from ccd_casadi.inner_problem.objective import hardware_at, objective, objective_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.optim.kkt import (
+    STEP,
+    Kink,
+    KktCertificate,
+    active_set,
+    hessian_products,
+    reduced_curvature,
+)
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 
@@ -44,67 +51,39 @@ def sections_kkt(
 ) -> KktCertificate:
     """Residuals of optimality at a sample.
 
-    With `envelope`, of the design there, also where ω_b* has a kink; where `truth` may be asked
+    With `envelope`, of the design there, also where ω_b* has a kink; where `truth` may be evaluated
     with slopes to its sides, or the second-order check where it has none.
     """
     lower, upper = box(problem)
     width = upper - lower
-    theta = np.array(sample.theta)
+    theta, sizes = np.array(sample.theta), constraint_sizes(problem)
     own = hardware_at(problem, theta)
-    gradient = objective_gradient(problem, sample)
-    rows, labels, slack = [], [], []
-    names = plant_of(problem).constraint_names
-    size_of = dict(zip(names, constraint_sizes(problem), strict=True))
-    for value, row, name in zip(own.constraints, own.slopes, names, strict=True):
-        if value >= -ACTIVE:
-            rows.append(row)
-            labels.append(name)
-            slack.append(value)
-    for i, name in enumerate(problem.names):
-        gaps = ((theta[i] - lower[i]) / width[i], (upper[i] - theta[i]) / width[i])
-        for end, gap, sign in zip(("lower", "upper"), gaps, (-1.0, 1.0), strict=True):
-            if gap <= ACTIVE:
-                rows.append(sign * np.eye(theta.size)[i])
-                labels.append(f"{name} {end}")
-                slack.append(-gap)
-    if not np.isfinite(gradient).all():
-        return KktCertificate(np.inf, 0.0, np.inf, {}, tuple(labels), None, tuple(gradient))
-    size = max(float(np.abs(gradient).max()), 1e-300)
-    A = np.array(rows).reshape(-1, theta.size)
-    nu = nnls(A.T, -gradient)[0] if rows else np.zeros(0)
-    residual = float(np.abs(gradient + A.T @ nu).max()) / size
+    at = active_set(
+        (theta - lower) / width, objective_gradient(problem, sample), own.constraints * sizes,
+        own.slopes * sizes[:, None], sizes, plant_of(problem).constraint_names, problem.names,
+    )  # fmt: skip
+    if not np.isfinite(at.gradient).all():
+        return at.certificate(np.zeros(len(at.labels)), np.inf, None)
+    nu = at.multipliers()
+    residual = at.residual(nu)
     kink: Kink | None = None
     if residual > SMOOTH and envelope is not None:
         direct = own.cost_gradient + problem.w2 * envelope.direct * width
-        joint, mu, pair = joint_residual(
-            envelope, direct, problem.w2 * envelope.to_theta * width, A, size
-        )
+        to_theta = problem.w2 * envelope.to_theta * width
+        joint, mu, pair = joint_residual(envelope, direct, to_theta, at.rows, at.size)
         if joint < 0.5 * residual:
             multipliers = dict.fromkeys(envelope.names, 0.0)
             for word, value in zip(envelope.names, mu, strict=False):
                 multipliers[word] += float(value)
             kink, residual, nu = Kink(residual, (), multipliers), joint, pair
-    Z = _free(A[nu > 0.0], gradient)
-    second: float | None = np.inf if Z.shape[1] == 0 else None
+    Z = _steepest_first(at.free(nu), at.gradient)
+    second = np.inf if Z.shape[1] == 0 else None
     if Z.shape[1] and truth is not None and kink is not None:
-        slopes = tuple(_slopes(problem, truth, sample, z, size) for z in Z.T)
+        slopes = tuple(_slopes(problem, truth, sample, z, at.size) for z in Z.T)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers)
     elif Z.shape[1] and truth is not None:
-        second = _second(problem, truth, theta, Z, size)
-    primal = max(0.0, *(-np.minimum(theta - lower, upper - theta) / width), *own.constraints)
-    return KktCertificate(
-        stationarity=residual,
-        primal=float(primal),
-        complementarity=float(np.abs(nu * np.array(slack)).max(initial=0.0)) / size,
-        multipliers={
-            name: float(value) / size_of.get(name, 1.0)
-            for name, value in zip(labels, nu, strict=True)
-        },
-        active=tuple(labels),
-        second_order=second,
-        objective_gradient=tuple(map(float, gradient)),
-        kink=kink,
-    )
+        second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
+    return at.certificate(nu, residual, second, kink)
 
 
 def joint_residual(
@@ -132,10 +111,8 @@ def joint_residual(
     return max(float(np.abs(part).max()) for part in off), found[:count], found[count:]
 
 
-def _free(strong: Array, gradient: Array) -> Array:
-    """Orthonormal directions (n, k) that the strongly active bounds leave; the first is the one in
-    which J falls by this gradient."""
-    Z = null_space(strong) if len(strong) else np.eye(gradient.size)
+def _steepest_first(Z: Array, gradient: Array) -> Array:
+    """The same directions (n, k), turned so that J falls along the first by this gradient."""
     if Z.shape[1] == 0:
         return Z
     turned = qr(np.column_stack([Z.T @ gradient, np.eye(Z.shape[1])]), mode="economic")[0]
@@ -150,7 +127,7 @@ def _slopes(
     theta = np.array(sample.theta)
 
     def value(at: BandwidthSample) -> float:
-        return problem.w1 * hardware_cost(plant_of(problem), at.theta) + problem.w2 * at.value
+        return objective(problem, at.theta, at.value)
 
     found = []
     for sign in (-1.0, 1.0):
@@ -163,22 +140,14 @@ def _slopes(
     return found[0], found[1]
 
 
-def _second(
-    problem: CoDesignProblem, truth: TrueBandwidth, theta: Array, Z: Array, size: float
-) -> float | None:
-    """Least eigenvalue of Zᵀ∇²J Z by differences of true gradients; λ's own curvature is left out.
-
-    None where a neighbour is outside the box or has no gradient.
-    """
+def _hessian(
+    problem: CoDesignProblem, truth: TrueBandwidth, sample: BandwidthSample, Z: Array
+) -> Array | None:
+    """∇²J Z (n, k) by differences of true gradients; λ's own curvature is left out."""
     lower, upper = box(problem)
-    columns = []
-    for direction in Z.T:
-        ends = [theta + sign * BESIDE * direction * (upper - lower) for sign in (1.0, -1.0)]
-        if any((end < lower).any() or (end > upper).any() for end in ends):
-            return None
-        slopes = [objective_gradient(problem, truth.at(end)) for end in ends]
-        columns.append((slopes[0] - slopes[1]) / (2.0 * BESIDE))
-    H = Z.T @ np.array(columns).T
-    if not np.isfinite(H).all():
-        return None
-    return float(np.linalg.eigvalsh(0.5 * (H + H.T)).min()) / size
+
+    def slope(z: Array) -> Array:
+        return objective_gradient(problem, truth.at(lower + (upper - lower) * z))
+
+    z = (np.array(sample.theta) - lower) / (upper - lower)
+    return hessian_products(slope, z, Z, BESIDE)

@@ -20,10 +20,13 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
+from ccd_casadi.codesign.outer_sections import SectionsEnd, SectionsOuter
+from ccd_casadi.codesign.search import searched
 from ccd_casadi.codesign.sections_direct import by_pieces
-from ccd_casadi.codesign.sections_run import search_sections
-from ccd_casadi.codesign.sections_truth import TrueBandwidth, objective
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
@@ -67,8 +70,9 @@ class ListedSections:
         return self._anew(sampler) if found is None else found
 
     def _anew(self, sampler: Sampler) -> Solution:
-        first = search_sections(sampler, self.formulation, self.seed)
-        if first.end is None:
+        quick = replace(self.formulation, box_points=0)  # a bound needs no look at the box
+        first = searched(SectionsOuter(sampler), quick, self.seed)
+        if not isinstance(first.end, SectionsEnd):
             return _nothing(first.outcome.message)
         more = sections_of_problem(first.end.asked.problem).members
         self.members = tuple(dict.fromkeys((*self.members, *more)))
@@ -90,8 +94,8 @@ class ListedSections:
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
         solution = self.solve(sampler.of(carried(_start(found), sampler.problem, self.members)))
-        if solution.sections is not None:
-            self.members = sections_of_problem(solution.sections.problem).members
+        if solution.verified is not None:
+            self.members = sections_of_problem(solution.verified.problem).members
         return solution
 
 
@@ -112,10 +116,11 @@ def carried(
 
 def _start(found: Solution) -> CoDesignProblem:
     """The problem of a solution with its θ as the start and its controller as the anchor."""
-    made = found.sections
+    made = found.verified
     if made is None:
         assert found.problem is not None
         return found.problem
+    assert isinstance(made, VerifiedSections)
     return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
 
 
@@ -128,7 +133,7 @@ def _at(
 
 
 def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
-    J = objective(problem, best)
+    J = objective_of(problem, best)
     if not np.isfinite(J):
         return _nothing(best.shortfall)
     result = {

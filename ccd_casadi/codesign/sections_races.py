@@ -24,14 +24,15 @@ from ccd_casadi.support.process_pool import Pool
 class Raced:
     """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count).
 
-    With `error` (m) the least RMS error from there, and κ that of its controller.
+    `value` is what J counts: that bandwidth, or the least RMS error (m) from there, and κ that of
+    its controller.
     """
 
     certified: bool
     bandwidth: float
     kappa: tuple[float, ...]
     optima: tuple[tuple[float, int], ...]
-    error: float = float("nan")
+    value: float
 
 
 def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
@@ -106,8 +107,9 @@ def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> Raced:
     try:
         optima = tuple((float(value), int(count)) for value, count in stored["optima"])
         kappa = tuple(map(float, stored["kappa"]))
-        error = float("nan") if stored.get("error") is None else float(stored["error"])
-        return Raced(bool(stored["certified"]), float(stored["bandwidth"]), kappa, optima, error)
+        certified, bandwidth = bool(stored["certified"]), float(stored["bandwidth"])
+        value = bandwidth if stored.get("error") is None else float(stored["error"])
+        return Raced(certified, bandwidth, kappa, optima, value)
     except (KeyError, TypeError, ValueError) as error:
         raise store.damaged() from error
 

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.sections_run import VerifiedSections
-from ccd_casadi.codesign.verify import VerifiedDesign
+from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.notebook import Shown
 from surrogates import Quality
@@ -20,7 +19,6 @@ class Solution(Shown):
 
     result: dict[str, Any]
     outcome: FormulationResult
-    verified: VerifiedDesign | None
+    verified: Verified | None
     quality: tuple[Quality, ...] = ()
     problem: CoDesignProblem | None = None
-    sections: VerifiedSections | None = None  # instead of `verified`, of a fixed structure

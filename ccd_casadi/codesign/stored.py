@@ -14,7 +14,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, SurrogateFileError
-from surrogates.versions import Versions
+from surrogates.versions import load_version
 
 SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
 
@@ -36,7 +36,7 @@ def named_surrogate(
     Raises UserError where there is none of that name, or it is of something else.
     """
     try:
-        processes, _ = Versions(folder).load(name)
+        processes = load_version(folder, name)
     except (SurrogateFileError, OSError) as error:
         raise UserError(f"--surrogate {name}: {error}") from error
     lower, upper = box(problem) if formulation == "nested" else lifted_bounds(problem)

@@ -4,44 +4,33 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.units import HZ
 from surrogates import GaussianProcess, Quality, quality_of
 from surrogates.quality import Roughness
 
 # Name, unit of its errors, the number that turns the surrogate's unit into it, whether what is
 # fitted is a logarithm.
-OUTPUTS = (
-    ("bandwidth", "Hz", 1.0 / HZ, False),
+BOUNDED = (
     ("sensitivity_peak", "%", 100.0, True),
     ("sensitivity_low", "%", 100.0, True),
     ("compliance", "%", 100.0, True),
 )
 ROUGH = (Roughness.KINKED, Roughness.JUMPS)  # as `Quality.samples_look` has it
-ERROR = ("rms_error", "nm", 1e9, False)
 
 
 def surrogate_quality(
-    processes: Sequence[GaussianProcess],
-    x: Array,
-    seed: int = 0,
-    *,
-    of_error: bool = False,
-    quiet: bool = True,
+    processes: Sequence[GaussianProcess], at: Verified, seed: int = 0, *, quiet: bool = True
 ) -> tuple[Quality, ...]:
-    """Judge the processes of ω_b, or of ω_b and ln of each bounded figure, at the design x.
-
-    `of_error`: the one process is of the RMS error.
-    """
+    """Judge the processes of what J counts, and of ln of each bounded figure, at a design."""
+    figure = at.problem.figure
+    outputs = ((figure.key, figure.unit, figure.factor, False), *BOUNDED)
     found = []
     with Progress(len(processes), "judging the surrogates", quiet) as bar:
-        for process, (name, unit, factor, logarithm) in zip(
-            processes, (ERROR,) if of_error else OUTPUTS, strict=False
-        ):
+        for process, (name, unit, factor, logarithm) in zip(processes, outputs, strict=False):
             quality = quality_of(
                 process,
-                x[: process.lower.size],
+                at.point[: process.lower.size],
                 name=name,
                 unit=unit,
                 factor=factor,

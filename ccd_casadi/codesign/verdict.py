@@ -14,11 +14,13 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.box_look import BoxLook
+from ccd_casadi.codesign.formulation import BoxLook
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.optim.kkt import Kink, KktCertificate
 from ccd_casadi.support.units import metres
 
-KKT_LEVEL = 1e-4  # scaled residual of the true optimality conditions; the polish reaches 1e-6
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
 LEAST_FACTORS = (0.5, 2.0)  # of their damping, which is known no better
@@ -100,60 +102,92 @@ def certified(
 
 
 def optimal(
+    kkt: KktCertificate,
     *,
-    residual: float,
-    second_order: float | None,
-    inner_gap: float,
+    level: float,
+    gap: float,
     tolerance: float,
-    starts: int,
-    optima: int,
-    look: BoxLook | None,
+    better: str,
+    known: str,
+    unknown: str = "",
+    saddle: float = SADDLE,
 ) -> Line:
-    """KKT residual, the global inner problem at θ, and what was looked at in the box."""
-    figures: dict[str, Any] = {
-        "kkt_residual": residual,
-        "kkt_level": KKT_LEVEL,
-        "inner_gap": inner_gap,
-        "starts": starts,
-        "distinct_optima": optima,
-    }
+    """KKT residual over θ up to `level`, and the whole inner problem at θ, `better` by `gap`.
+
+    `known`: where something better was looked for; `unknown`: why there may be no gradient; in
+    words.
+    """
+    residual, kink = kkt.stationarity, kkt.kink
+    figures: dict[str, Any] = {"kkt_residual": residual, "kkt_level": level, "inner_gap": gap}
+    if not gap <= tolerance:
+        return Line(State.FAILED, f"not optimal: {better}; {known}", figures)
+    if unknown and not math.isfinite(residual):
+        return Line(State.WARNED, f"{unknown}: a limit of ours; {known}", figures)
+    if not residual <= level:
+        words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
+        return Line(State.FAILED, words, figures)
+    if kink is None:
+        words = f"KKT residual {residual:.1e} over theta; {known}"
+        if kkt.second_order is not None and kkt.second_order < saddle:
+            figures["least_curvature"] = kkt.second_order
+            words = f"a stationary point that curves downwards ({kkt.second_order:.2g}): {words}"
+            return Line(State.WARNED, words, figures)
+        return Line(State.PASSED, words, figures)
+    figures |= {"kkt_residual_one_gradient": kink.one_gradient, "slopes": kink.slopes}
+    if kink.least_slope < -level:
+        words = f"not optimal: J has a kink and falls on a side of it ({_sides(kink)})"
+        return Line(State.FAILED, f"{words}; {known}", figures)
+    words = (
+        f"first-order optimal at a kink of J: KKT residual {residual:.1e} over theta and the "
+        f"controller together, {kink.one_gradient:.2g} with one side's gradient alone; true J "
+        f"{_sides(kink)}; {known}"
+    )
+    known_all = all(math.isfinite(slope) for pair in kink.slopes for slope in pair)
+    return Line(State.PASSED if known_all else State.WARNED, words, figures)
+
+
+def _sides(kink: Kink) -> str:
+    """What true values beside a kink say, in words."""
+    if not kink.slopes:
+        return "was not evaluated beside it: bounds alone hold theta"
+    found = [slope for pair in kink.slopes for slope in pair]
+    known = sum(map(math.isfinite, found))
+    if not known:
+        return "is not known beside it"
+    if len(found) == 2 and known == 2:
+        words = f"grows by {found[0]:.2g} and {found[1]:.2g} of its gradient on the two sides"
+        return f"{words} of the one direction that is left"
+    return (
+        f"grows by at least {kink.least_slope:.2g} of its gradient on {known} of {len(found)} "
+        f"sides of {len(kink.slopes)} directions"
+    )
+
+
+def look_words(starts: int, optima: int, look: BoxLook | None) -> tuple[str, dict[str, Any]]:
+    """What IPOPT's starts and the look over the box say, in words and figures."""
+    figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     known = f"best of {_count(starts, 'start')}" if starts else ""
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        known = ", ".join(part for part in (known, "gap not known: no look at the box") if part)
-    else:
-        figures |= {
-            "box_points": look.points,
-            "box_solved": look.solved,
-            "box_feasible": look.feasible,
-            "box_better": look.better,
-            "box_starts": look.starts,
-            "box_seed": look.seed,
-            "objective_before": look.before,
-        }
-        how = f"{look.points} spread theta"
-        if look.solved < look.points:
-            how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
-        said = f"none better at {how}"
-        if look.moved:
-            said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
-        known = ", ".join(part for part in (known, said, "gap not known") if part)
-    if not residual <= KKT_LEVEL:
-        words = f"not optimal: KKT residual {residual:.1e} above {KKT_LEVEL:.0e}; {known}"
-        return Line(State.FAILED, words, figures)
-    if not inner_gap <= tolerance:
-        words = (
-            f"not optimal: other weights at the same theta give {100 * inner_gap:.2g} % more "
-            f"bandwidth; {known}"
-        )
-        return Line(State.FAILED, words, figures)
-    words = f"KKT residual {residual:.1e}; {known}"
-    if second_order is not None and second_order < SADDLE:
-        figures["least_curvature"] = second_order
-        words = f"a stationary point that curves downwards ({second_order:.2g}): {words}"
-        return Line(State.WARNED, words, figures)
-    return Line(State.PASSED, words, figures)
+        said = "gap not known: no look at the box"
+        return ", ".join(part for part in (known, said) if part), figures
+    figures |= {
+        "box_points": look.points,
+        "box_solved": look.solved,
+        "box_feasible": look.feasible,
+        "box_better": look.better,
+        "box_starts": look.starts,
+        "box_seed": look.seed,
+        "objective_before": look.before,
+    }
+    how = f"{look.points} spread theta"
+    if look.solved < look.points:
+        how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
+    said = f"none better at {how}"
+    if look.moved:
+        said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
+    return ", ".join(part for part in (known, said, "gap not known") if part), figures
 
 
 def predicted(
@@ -165,15 +199,15 @@ def predicted(
     sigmas: float | None = None,
     extrapolates: Sequence[str] = (),
     surrogate: bool = True,
-    of: tuple[str, str] = ("bandwidth", "Hz"),
+    of: Figure = BANDWIDTH,
 ) -> Line:
     """Surrogate against truth at the design.
 
     Where the design is itself one of the samples the surrogate reproduces it and `error` shows
     nothing: `left_out` (relative) is the error there without it, `left_out_size` the same in the
-    unit of what is predicted, `of`, and `sigmas` in deviations.
+    unit of what is predicted, `of`, for the eye, and `sigmas` in deviations.
     """
-    what, unit = of
+    what, unit = of.words, of.unit
     figures: dict[str, Any] = {"error": error, "tolerance": tolerance}
     if not surrogate:
         return Line(State.PASSED, "nothing was predicted: IPOPT worked on the truth", figures)
@@ -270,16 +304,24 @@ def survives(
     return Line(state, "; ".join(said), figures)
 
 
-def deployable(found: Survival | None) -> Line:
-    """Before `deploy`: what delay the margins leave, and the rate below which it is used up."""
+def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line:
+    """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
+    figures = margin_figures(found)
+    if sampling is not None:
+        words = (
+            f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
+            "and delay exact at the instants; run deploy for the code"
+        )
+        figures |= {"rate_hz": sampling.rate_hz, "delay_us": sampling.delay_us}
+        return Line(State.PASSED, words, figures)
     if found is None or not math.isfinite(found.delay):
-        return Line(State.UNKNOWN, "run deploy", {})
+        return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
         f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
         f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
     )
-    return Line(State.UNKNOWN, words, margin_figures(found) | {"unstable_below_rate_hz": rate})
+    return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
 
 
 def margin_figures(found: Survival | None) -> dict[str, float]:

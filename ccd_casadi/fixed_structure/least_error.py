@@ -22,13 +22,11 @@ from scipy.optimize import nnls
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
 from ccd_casadi.budget.frequency import Loop
-from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.design import Progress, problem_for
 from ccd_casadi.fixed_structure.figures import to_theta
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.local_search import LoopModel, all_rows, descend
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope
@@ -38,8 +36,10 @@ from ccd_casadi.fixed_structure.sections_design import (
     in_problem_units,
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -58,7 +58,7 @@ class RmsError:
     plants: tuple[StateSpace, ...]
     structure: Structure
     budget: ErrorBudget
-    hold: Hold | None
+    hold: Sampling | None
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
@@ -134,9 +134,8 @@ def least_error(
     if not isinstance(structure, Structure):
         raise ValueError("the least RMS error is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
-    hold = None if sampling is None else Hold(sampling.period, sampling.delay)
     goal = RmsError(
-        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), hold
+        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), sampling
     )
     w0, force = problem.plants.omega_0, problem.plants.force
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))

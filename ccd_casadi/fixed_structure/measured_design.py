@@ -34,8 +34,8 @@ from ccd_casadi.fixed_structure.structure import (
     second_slopes,
     state_space,
 )
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate, Model, Rows
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
+from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
@@ -83,6 +85,16 @@ class CoDesignProblem(Shown):
             "gamma_backoff": self.inner.gamma_backoff,
             **perturbed,
         }
+
+    @property
+    def figure(self) -> Figure:
+        """What J counts of the controller."""
+        return BANDWIDTH if self.sections is None else self.sections.figure
+
+    @property
+    def sampling(self) -> Sampling | None:
+        """Rate and delay that the controller is designed for; None: continuous."""
+        return None if self.sections is None else self.sections.sampling
 
     @property
     def parameter_units(self) -> dict[str, str]:

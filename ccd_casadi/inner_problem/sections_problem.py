@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR, Figure
 
 Options = tuple[tuple[str, object], ...]
 Member = tuple[int, tuple[float, ...]]
@@ -86,6 +87,11 @@ class SectionsProblem:
     bandwidth_least: float = 0.0
     channels: tuple[ChannelProblem, ...] = ()
     error_anchors: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def figure(self) -> Figure:
+        """What J counts of the controller."""
+        return RMS_ERROR if self.of_error else BANDWIDTH
 
     @property
     def of_error(self) -> bool:

@@ -9,12 +9,15 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.facts import conclusion, theta_table
 from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
 from ccd_casadi.reporting.page import (
@@ -60,17 +63,16 @@ def _cell(*parts: str) -> str:
 
 @html_of.register
 def _(item: Solution) -> str:
-    result, problem = item.result, item.problem
+    result, own = item.result, item.verified
     parts = [_result_head(result)]
-    if item.sections is not None:
-        own = item.sections
+    if isinstance(own, VerifiedSections):
         loops = loops_of(own.problem, own.theta, own.design)
         parts += [_theta(own.problem, result), controller_html(result)]
         parts += [gains_html(own.problem, own, loops, key=f"notebook-{next(_figures)}")]
-    elif item.verified is not None and problem is not None:
-        made, plant = item.verified.design, scaled_plant(problem, item.verified.theta)
-        loop = _loop(problem, plant, made.controller, made.weights, made.figures)
-        parts += [_theta(problem, result), loop]
+    elif isinstance(own, VerifiedDesign):
+        made, plant = own.design, scaled_plant(own.problem, own.theta)
+        loop = _loop(own.problem, plant, made.controller, made.weights, made.figures)
+        parts += [_theta(own.problem, result), loop]
     return _cell(*parts)
 
 
@@ -91,22 +93,22 @@ def _(item: Case) -> str:
 
 @html_of.register
 def _(item: CoDesignProblem) -> str:
-    inner, of_error = item.inner, item.sections is not None and item.sections.of_error
-    J = f"min {item.w1:g} f(θ) + ({item.w2:g}) {'e' if of_error else 'ω_b'}"
+    inner, figure = item.inner, item.figure
+    J = f"min {item.w1:g} f(θ) + ({item.w2:g}) {figure.symbol}"
     rows = []
     for i, name in enumerate(item.names):
         unit, factor = shown_unit(item.units[i], item.upper[i])
         numbers = (factor * value for value in (item.lower[i], item.upper[i], item.start[i]))
         rows.append((name, unit or "–", *numbers))
     facts = [
-        ("Objective", J, "e in m" if of_error else "ω_b in rad/s"),
+        ("Objective", J, f"{figure.symbol} in {figure.si_unit}"),
         ("Peak of S", f"≤ {inner.S_max:g}", ""),
         (f"|S| at {number(inner.omega_low / HZ)} Hz", f"≤ {inner.S_low:g}", ""),
     ]
     if inner.compliance_max is not None:
         facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
     if item.sections is not None:
-        sampling = item.sections.sampling
+        sampling = item.sampling
         runs = "in continuous time" if sampling is None else f"at {number(sampling.rate_hz)} Hz"
         facts.append(("Controller", "of fixed structure", runs))
     else:

@@ -25,7 +25,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.sections_run import VerifiedSections
+    from ccd_casadi.codesign.verified_sections import VerifiedSections
 
 POINTS = 700
 BOUNDS = {"S": "its shape", "KS": "weighted_level/|W_KS|", "T": "weighted_level/|W_T|"}

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
@@ -32,7 +33,6 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.sections_run import VerifiedSections
     from ccd_casadi.codesign.solution import Solution
 
 
@@ -57,8 +57,8 @@ def _plants(result: dict[str, Any]) -> str:
 
 def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Section]:
     """What the page shows between its head and its provenance."""
-    verified = solution.sections
-    assert verified is not None
+    verified = solution.verified
+    assert isinstance(verified, VerifiedSections)
     assert verified.design.controller is not None
     loops = loops_of(verified.problem, verified.theta, verified.design)
     moves = move_panels(verified) if len(loops.L) else None  # of one channel

@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import (
@@ -169,11 +169,10 @@ class Sampler:
         """
         if not self.spent.once(key, count):
             return
-        objective, value = np.nan, bandwidth if value is None else value
+        J, value = np.nan, bandwidth if value is None else value
         if np.isfinite(value) and not unmet(self.problem, theta):
-            cost = hardware_cost(plant_of(self.problem), theta)
-            objective = self.problem.w1 * cost + self.problem.w2 * value
-        self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(objective)))
+            J = objective(self.problem, theta, value)
+        self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(J)))
 
     def _meets(self, sample: Sample) -> bool:
         return sample.certified and self.problem.inner.excess(sample) <= 0.0

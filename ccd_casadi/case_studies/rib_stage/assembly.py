@@ -1,0 +1,199 @@
+"""K(θ) and M(θ) of one symmetry in a fixed sparsity pattern, and bilinear forms of their slopes.
+
+K(θ) = Σ c_q(θ) K_q with c = l_x l_y l_z/(l_p l_q) of each box, and M likewise with l_x l_y l_z:
+exact, since the edges are affine in θ. Boxes off the diagonal have a mirror image with the same
+matrix, so only half of them are formed. Matrices are those of the whole stage (four quarters).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from ccd_casadi.case_studies.rib_stage.geometry import Material
+from ccd_casadi.case_studies.rib_stage.mesh import Block, Mesh
+from ccd_casadi.case_studies.rib_stage.reference import PAIRS, cube_mass, cube_stiffness
+from ccd_casadi.case_studies.rib_stage.symmetry import Fold, Symmetry, fold, swap_displacements
+from ccd_casadi.support.arrays import Array
+
+# exponents of (l_x, l_y, l_z) in the coefficients: the six of K, then that of M
+EXPONENTS = np.array([[1 - (d == p) - (d == q) for d in range(3)] for p, q in PAIRS] + [[1, 1, 1]])
+COPIES = 4  # quarters in the stage
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Rows and columns of a CSR matrix, and which entries of the boxes its data are sums of."""
+
+    indices: np.ndarray
+    indptr: np.ndarray
+    sums: sparse.csr_matrix  # (data, entries of the concatenated matrices of the boxes)
+
+    def fill(self, values: Array) -> sparse.csr_matrix:
+        """The symmetric matrix with these box entries."""
+        size = len(self.indptr) - 1
+        return sparse.csr_matrix(
+            (self.sums @ values, self.indices, self.indptr), shape=(size, size)
+        )
+
+
+@dataclass(frozen=True)
+class Sector:
+    """One symmetry on one mesh: its fold, and patterns for the stiffness and the mass."""
+
+    symmetry: Symmetry
+    fold: Fold
+    stiffness: Pattern
+    mass: Pattern
+    maps: tuple[tuple[int, np.ndarray, Array, int], ...]  # box, displacements, weights, copies
+
+
+@dataclass(frozen=True)
+class Assembler:
+    """The boxes on or below the diagonal of a mesh, and its symmetries."""
+
+    mesh: Mesh
+    material: Material
+    blocks: tuple[Block, ...]
+
+    def lengths(self, theta: Array) -> tuple[Array, Array]:
+        """(blocks, 3) edges in m and their slopes (blocks, 3, θ)."""
+        plan, height = self.mesh.plan, self.mesh.height
+        cells = np.array([block.cells for block in self.blocks])
+        in_plan, in_height = plan.lengths(theta), height.lengths(theta)
+        edges = np.stack([in_plan[cells[:, 0]], in_plan[cells[:, 1]], in_height[cells[:, 2]]], 1)
+        slopes = [plan.slope[cells[:, 0]], plan.slope[cells[:, 1]], height.slope[cells[:, 2]]]
+        return edges, np.stack(slopes, 1)
+
+    def coefficients(self, theta: Array) -> tuple[Array, Array]:
+        """c (blocks, 7) and dc (θ, blocks, 7): six of K and that of M, for the whole stage."""
+        edges, slopes = self.lengths(theta)
+        c = COPIES * np.prod(edges[:, None, :] ** EXPONENTS[None], axis=2)
+        c[:, 6] *= self.material.density
+        relative = slopes / edges[:, :, None]
+        return c, np.einsum("bq,qd,bdt->tbq", c, EXPONENTS, relative)
+
+    def box_matrices(self, theta: Array, shift: float) -> tuple[Array, Array]:
+        """Entries of K_e + shift M_e and of the scalar mass matrices, boxes concatenated."""
+        c, _ = self.coefficients(theta)
+        stiff, mass = [], []
+        for block, factors in zip(self.blocks, c, strict=True):
+            M = factors[6] * cube_mass(block.orders)
+            K = np.tensordot(factors[:6], cube_stiffness(block.orders, self.material), 1)
+            n = len(M)
+            view = K.reshape(n, 3, n, 3)
+            for component in range(3):
+                view[:, component, :, component] += shift * M
+            stiff.append(K.ravel())
+            mass.append(M.ravel())
+        return np.concatenate(stiff), np.concatenate(mass)
+
+    def matrices(
+        self, sector: Sector, theta: Array, shift: float = 0.0
+    ) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+        """K + shift M and M of the elastic body in this sector, N/m and kg."""
+        stiff, mass = self.box_matrices(theta, shift)
+        return sector.stiffness.fill(stiff), sector.mass.fill(mass)
+
+    def bilinear(self, sector: Sector, left: Array, right: Array) -> Array:
+        """leftᵀ K_q right and leftᵀ M_q right of every box: (blocks, 7, a, b), reduced vectors."""
+        out = np.zeros((len(self.blocks), 7, left.shape[1], right.shape[1]))
+        pad = [np.vstack([v, np.zeros((1, v.shape[1]))]) for v in (left, right)]
+        for box, places, weight, copies in sector.maps:
+            block = self.blocks[box]
+            a, b = (weight[:, None] * v[sector.fold.index[places]] for v in pad)
+            K = cube_stiffness(block.orders, self.material)
+            out[box, :6] += copies * (a.T @ (K @ b))
+            n, M = len(block.nodes), cube_mass(block.orders)
+            wide = (M @ b.reshape(n, -1)).reshape(b.shape)
+            out[box, 6] += copies * (a.T @ wide)
+        return out
+
+    def slopes(self, sector: Sector, theta: Array, left: Array, right: Array) -> tuple[Array, ...]:
+        """leftᵀ ∂K right and leftᵀ ∂M right, each (θ, a, b)."""
+        _, dc = self.coefficients(theta)
+        forms = self.bilinear(sector, left, right)
+        return (
+            np.einsum("tbq,bqij->tij", dc[:, :, :6], forms[:, :6]),
+            np.einsum("tb,bij->tij", dc[:, :, 6], forms[:, 6]),
+        )
+
+
+def build_assembler(mesh: Mesh, material: Material) -> Assembler:
+    """The assembler of a mesh; a box and its mirror image about x = y are one."""
+    half = tuple(block for block in mesh.blocks if block.cells[0] <= block.cells[1])
+    return Assembler(mesh, material, half)
+
+
+def build_sector(assembler: Assembler, symmetry: Symmetry) -> Sector:
+    """Fold and patterns of a symmetry; θ does not enter."""
+    folded = fold(assembler.mesh, symmetry)
+    swap = swap_displacements(assembler.mesh)
+    maps = []
+    for box, block in enumerate(assembler.blocks):
+        places = (3 * block.nodes[:, None] + np.arange(3)).ravel()
+        weight = folded.weight[places]
+        on_diagonal = block.cells[0] == block.cells[1]
+        if on_diagonal:
+            maps.append((box, places, weight, 1))
+        elif symmetry.diagonal:
+            maps.append((box, places, weight, 2))
+        else:
+            maps.append((box, places, weight, 1))
+            image = swap[places]
+            maps.append((box, image, folded.weight[image], 1))
+    sizes = [3 * len(block.nodes) for block in assembler.blocks]
+    stiffness = _pattern(maps, folded, sizes, 1)
+    mass = _pattern(maps, folded, sizes, 3)
+    return Sector(symmetry, folded, stiffness, mass, tuple(maps))
+
+
+def _pattern(
+    maps: list[tuple[int, np.ndarray, Array, int]], folded: Fold, sizes: list[int], stride: int
+) -> Pattern:
+    """Stride 1: every pair of displacements; 3: pairs of one component, boxes being scalar."""
+    starts = np.concatenate([[0], np.cumsum([(size // stride) ** 2 for size in sizes])])
+    rows, columns, boxes, weights = [], [], [], []
+    for box, places, weight, copies in maps:
+        for part in range(stride):
+            # a mirror image swaps components within a node: part still names one of the box's
+            index, w = folded.index[places[part::stride]], weight[part::stride]
+            live = np.flatnonzero(index >= 0)
+            n = len(index)
+            i, j = np.repeat(live, len(live)), np.tile(live, len(live))
+            rows.append(index[i].astype(np.int32))
+            columns.append(index[j].astype(np.int32))
+            boxes.append((starts[box] + i * n + j).astype(np.int32))
+            weights.append(_exact(copies * np.outer(w[live], w[live])).ravel())
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    order = _sorted_by(column, folded.size)
+    order = order[_sorted_by(row[order], folded.size)]
+    row, column = row[order], column[order]
+    first = np.flatnonzero((np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0))
+    sums = sparse.csr_matrix(
+        (
+            np.concatenate(weights)[order],
+            np.concatenate(boxes)[order],
+            np.append(first, len(order)).astype(np.int32),
+        ),
+        shape=(len(first), int(starts[-1])),
+    )
+    counts = np.bincount(row[first], minlength=folded.size)
+    indptr = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    return Pattern(column[first], indptr, sums)
+
+
+def _sorted_by(key: np.ndarray, size: int) -> np.ndarray:
+    """The stable order of whole numbers below `size`, in linear time: a transposed CSR matrix."""
+    count = len(key)
+    bins = sparse.csr_matrix(
+        (np.ones(count, dtype=bool), key, np.arange(count + 1, dtype=np.int32)),
+        shape=(count, size),
+    )
+    return bins.tocsc().indices
+
+
+def _exact(products: Array) -> Array:
+    """Products of ±1, ±√½ and 2 without their rounding: their squares are powers of 2."""
+    powers = np.round(2.0 * np.log2(np.abs(products)))
+    return np.sign(products) * np.sqrt(np.exp2(powers))

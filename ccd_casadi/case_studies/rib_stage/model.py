@@ -1,0 +1,231 @@
+"""The stage as a plant: θ in, modal matrices and their exact derivatives out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ccd_casadi.case_studies.rib_stage import geometry as shape
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point
+from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
+from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, functionals, slopes
+from ccd_casadi.case_studies.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
+from ccd_casadi.case_studies.rib_stage.truncation import Mode, ModeCount, ModeSet, solve_modes
+from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.threads import side_by_side
+
+OUTPUTS = ("corners", "rigid", "modal4")
+
+
+@dataclass(frozen=True)
+class RibStage:
+    """The rib-reinforced levitated stage, θ = (h, t_o, t_i, t_c, H, x_i) in m.
+
+    `actuators` and `sensors` are points (x, y) of the lower face in m; None means the four
+    corners. `outputs`: "corners" keeps forces (N) and displacements (m) as they are, "rigid"
+    decouples to z, tip and tilt by orthonormal rigid-body directions, "modal4" adds the twist.
+    `truncation`: "symmetry" keeps `modes` of each symmetry, so that crossing frequencies do not
+    make the model jump; "frequency" keeps as many of the lowest of all. A stage whose point
+    masses break the square has no symmetries and is truncated by frequency.
+    """
+
+    geometry: Geometry = field(default_factory=Geometry)
+    order: MeshOrder = field(default_factory=MeshOrder)
+    actuators: tuple[Point, ...] | None = None
+    sensors: tuple[Point, ...] | None = None
+    outputs: str = "corners"
+    modes: ModeCount = field(default_factory=ModeCount)
+    truncation: str = "symmetry"
+    damping_ratio: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.outputs not in OUTPUTS:
+            raise StageError(f"outputs is {self.outputs!r}; give one of {', '.join(OUTPUTS)}")
+        if self.truncation not in ("symmetry", "frequency"):
+            raise StageError(f"truncation is {self.truncation!r}; give symmetry or frequency")
+        for points in (self.actuator_points, self.sensor_points):
+            if max(abs(v) for p in points for v in p) > 0.5 * self.geometry.side * (1 + 1e-12):
+                raise StageError("an actuator or a sensor is off the stage; move it inside")
+            if self.outputs == "modal4" and len(points) != 4:
+                raise StageError("modal4 needs four actuators and four sensors")
+            if self.outputs != "corners":
+                orthonormal_directions(points, 3)
+
+    @property
+    def actuator_points(self) -> tuple[Point, ...]:
+        """Where the forces act."""
+        return shape.corners(self.geometry) if self.actuators is None else self.actuators
+
+    @property
+    def sensor_points(self) -> tuple[Point, ...]:
+        """Where displacements are read."""
+        return shape.corners(self.geometry) if self.sensors is None else self.sensors
+
+    def mechanics(self, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
+        """M = I, D = 0, K = diag(ω²), B and C of 3 rigid and the flexible modes, and ∂/∂θ.
+
+        Rows: z, tip, tilt, then flexible modes; M (n, n), B (n, m) in 1/√kg, C (p, n), SI.
+        Derivatives are those of these matrices themselves: M stays I, K stays diagonal (but for
+        entries between modes of equal frequency in a stage without symmetry). Cached; read-only.
+        Without derivatives, a quarter of the work, they are those to no parameter.
+        """
+        return _mechanics(self, _checked(self, theta), derivatives)
+
+    def frequencies(self, theta: Sequence[float]) -> tuple[Mode, ...]:
+        """The modes of the model in the order of its rows, three rigid ones first, Hz."""
+        rigid = tuple(Mode(name, "rigid", 0.0) for name in RIGID_NAMES)
+        return (*rigid, *modes_at(self, _checked(self, theta)).flexible)
+
+    def hardware(self, theta: Any) -> tuple[Any, dict[str, Any]]:
+        """Mass in kg and λ(θ) <= 0 (no unit) for floats or CasADi symbols, in closed form."""
+        return shape.mass(self.geometry, theta), shape.constraints(self.geometry, theta)
+
+
+def orthonormal_directions(points: Sequence[Point], count: int) -> Array:
+    """(count, points): z, tip, tilt as orthonormal rows, fourth what is left of four points.
+
+    Gram-Schmidt of 1, y, x at the points, in this order; at the corners of a square the rows
+    are (1, 1, 1, 1)/2, (1, 1, -1, -1)/2, (1, -1, -1, 1)/2 and (1, -1, 1, -1)/2.
+
+    >>> orthonormal_directions(((1, 1), (-1, 1), (-1, -1), (1, -1)), 4)[3].round(6).tolist()
+    [0.5, -0.5, 0.5, -0.5]
+    """
+    x, y = np.array(points, float).T
+    columns = np.stack([np.ones_like(x), y, x], axis=1)
+    if len(points) < 3 or np.linalg.matrix_rank(columns) < 3:
+        raise StageError("actuators and sensors must not lie on one line; move one")
+    full = np.linalg.qr(np.hstack([columns, (x * y)[:, None]]), mode="complete")[0]
+    rows = full.T[:count]
+    wanted = np.vstack([columns.T, x * y])[:count]
+    return rows * np.where(np.einsum("ij,ij->i", rows, wanted) < 0.0, -1.0, 1.0)[:, None]
+
+
+def _checked(stage: RibStage, theta: Sequence[float]) -> tuple[float, ...]:
+    values = tuple(float(v) for v in theta)
+    if len(values) != len(shape.NAMES) or not all(np.isfinite(v) and v > 0.0 for v in values):
+        raise StageError(f"theta must be six lengths in m: {', '.join(shape.NAMES)}")
+    if min(shape.bays(stage.geometry, values)) <= 0.0:
+        raise StageError("the ribs overlap at this theta; keep the bays open")
+    return values
+
+
+def discretisation(stage: RibStage) -> Discretisation:
+    """Mesh and sparsity patterns of a stage, shared by all of its θ."""
+    return discretise(stage.order, stage.geometry.side, stage.geometry.material)
+
+
+def modes_at(stage: RibStage, theta: tuple[float, ...]) -> ModeSet:
+    """The spectra at θ, whatever actuators, sensors and outputs the stage has."""
+    return _spectra(stage.order, stage.geometry, stage.modes, stage.truncation, theta)
+
+
+@lru_cache(maxsize=2)  # factorisations are large
+def _spectra(
+    order: MeshOrder,
+    geometry: Geometry,
+    count: ModeCount,
+    truncation: str,
+    theta: tuple[float, ...],
+) -> ModeSet:
+    disc = discretise(order, geometry.side, geometry.material)
+    return solve_modes(disc, geometry, np.array(theta), count, truncation == "frequency")
+
+
+@lru_cache(maxsize=16)
+def _rigid_function(geometry: Geometry, points: tuple[Point, ...]) -> ca.Function:
+    return rigid_fields(geometry, points)
+
+
+@lru_cache(maxsize=256)
+def _mechanics(stage: RibStage, theta: tuple[float, ...], derivatives: bool) -> Mechanics:
+    found, here = modes_at(stage, theta), np.array(theta)
+    u, du, dK = _displacements(stage, found, here, points_of(stage), derivatives)
+    lam = np.array([(2.0 * np.pi * mode.frequency) ** 2 for mode in found.flexible])
+    return assembled(stage, lam, u, du, dK)
+
+
+def points_of(stage: RibStage) -> tuple[Point, ...]:
+    """Actuators and sensors, each point once."""
+    return tuple(dict.fromkeys((*stage.actuator_points, *stage.sensor_points)))
+
+
+def assembled(
+    stage: RibStage, lam: Array, u: Array, du: Array | None = None, dK: Array | None = None
+) -> Mechanics:
+    """The stage's matrices from λ of the flexible modes and u_z of all at the points (n, p).
+
+    The points are its actuators and sensors, each once; `du` (θ, n, p) and `dK` (θ, n, n) are the
+    slopes of u and of K, if there are any. Read-only.
+    """
+    n, points = len(u), points_of(stage)
+    du = np.zeros((0, *u.shape)) if du is None else du
+    dK = np.zeros((0, n, n)) if dK is None else dK
+    act = [points.index(p) for p in stage.actuator_points]
+    sens = [points.index(p) for p in stage.sensor_points]
+    B, dB, C, dC = u[:, act], du[:, :, act], u[:, sens].T, du[:, :, sens].transpose(0, 2, 1)
+    if stage.outputs != "corners":
+        rows = 3 if stage.outputs == "rigid" else 4
+        drive = orthonormal_directions(stage.actuator_points, rows).T
+        read = orthonormal_directions(stage.sensor_points, rows)
+        B, dB, C, dC = B @ drive, dB @ drive, read @ C, read @ dC
+    zero = np.zeros((len(du), n, n))
+    result = Mechanics(
+        M=np.eye(n),
+        D=np.zeros((n, n)),
+        K=np.diag([0.0, 0.0, 0.0, *lam]),
+        B=B,
+        C=C,
+        damping_ratio=stage.damping_ratio,
+        derivatives=(zero, zero.copy(), dK, dB, dC),
+    )
+    for array in (result.M, result.D, result.K, result.B, result.C, *result.derivatives):
+        array.flags.writeable = False  # shared by everyone who asks for this θ
+    return result
+
+
+def rigid_part(stage: RibStage, theta: Array) -> Array:
+    """(3, points) u_z of z, tip and tilt."""
+    return rigid_values(_rigid_function(stage.geometry, points_of(stage)), theta)[0]
+
+
+def _displacements(
+    stage: RibStage, found: ModeSet, theta: Array, points: tuple[Point, ...], derivatives: bool
+) -> tuple[Array, Array, Array]:
+    """u_z of every mode at the points (n, p), its slopes (θ, n, p), and ∂K (θ, n, n).
+
+    Without derivatives the last two have no entry along θ.
+    """
+    disc, n = discretisation(stage), 3 + len(found.flexible)
+    count = len(theta) if derivatives else 0
+    u, du = np.zeros((n, len(points))), np.zeros((count, n, len(points)))
+    dK = np.zeros((count, n, n))
+    u[:3], slope = rigid_values(_rigid_function(stage.geometry, points), theta)
+    du[:, :3] = slope[:count]
+
+    def fill(index: int) -> None:
+        """The rows of one group: no two write the same."""
+        item, keep = found.spectra[index], found.kept(index)
+        made = [functionals(disc, image, theta, points) for image in item.group.images]
+        F = np.hstack([values[:, 2] for values, _ in made])
+        own = [(3 + r, m) for r, m in enumerate(found.flexible) if m.group == index]
+        seen = [slice(k * len(points), (k + 1) * len(points)) for k in range(len(made))]
+        for row, mode in own:
+            u[row] = F[:, seen[mode.image]].T @ item.vectors[:, mode.place]
+        if not derivatives:
+            return
+        dF = np.concatenate([steps[:, :, 2] for _, steps in made], axis=2)
+        change = slopes(disc, stage.geometry, item, keep, F, dF)
+        for row, mode in own:
+            du[:, row] = change.dU[:, seen[mode.image], mode.place]
+            for column, other in own:
+                if other.image == mode.image:
+                    dK[:, row, column] = change.dK[:, mode.place, other.place]
+
+    kept = [index for index in range(len(found.spectra)) if found.kept(index)]
+    side_by_side(fill, kept[::-1])  # the last one, of the tilts, takes longest
+    return u, du, dK

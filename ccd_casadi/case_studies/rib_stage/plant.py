@@ -1,0 +1,173 @@
+"""Case study 2 as the case file names it: the options of `rib_stage`, and the plant they make."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import casadi as ca
+
+from ccd_casadi.case_studies.rib_stage import nearby
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
+from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
+from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
+from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
+from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.pictures import Drawing
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.plants.registry import Model
+from ccd_casadi.support.process_pool import Pool
+
+MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
+MODES = {10: ModeCount(), 20: TWENTY}
+Points = Sequence[Sequence[float]]
+
+
+def rib_stage(
+    names: Sequence[str],
+    zeta: float = 0.01,
+    outputs: str = "corners",
+    mesh: str = "shipped",
+    modes: int = 10,
+    side: float = 0.3,
+    young: float = 68.9e9,
+    poisson: float = 0.33,
+    density: float = 2700.0,
+    least_bay: float = 8e-3,
+    actuators: Points = (),
+    sensors: Points = (),
+    point_masses: Points = (),
+) -> Plant:
+    """The rib-reinforced stage, θ in m named as in `geometry.NAMES`, in any order.
+
+    `actuators` and `sensors` are points [x, y] of the lower face in m (none: the corners),
+    `point_masses` are [x, y, mass] in m and kg. Hardware cost: mass in kg; λ: the bays.
+    `modes` flexible ones are kept, 10 or 20. References: the same stage on a finer mesh and
+    with 20 flexible modes, so far as it is not that itself.
+    """
+    if sorted(names) != sorted(NAMES):
+        raise StageError(f"rib_stage has the parameters {', '.join(NAMES)}; give all of them")
+    if mesh not in MESHES:
+        raise StageError(f"mesh is {mesh!r}; choose one of {', '.join(MESHES)}")
+    if modes not in MODES:
+        raise StageError(f"modes is {modes!r}; choose 10 or 20")
+    geometry = Geometry(
+        side=side,
+        material=Material(young, poisson, density),
+        point_masses=tuple(_point_mass(x, y, mass, side) for x, y, mass in point_masses),
+        least_bay=least_bay,
+    )
+    stage = RibStage(
+        geometry=geometry,
+        order=MESHES[mesh],
+        actuators=_points(actuators),
+        sensors=_points(sensors),
+        outputs=outputs,
+        modes=MODES[modes],
+        damping_ratio=zeta,
+    )
+    return plant_of_stage(stage, names)
+
+
+def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
+    """Any RibStage as the plant that the design loop asks for."""
+    place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
+    back = [NAMES.index(name) for name in names]
+
+    def evaluator(variant: RibStage, derivatives: bool = True) -> "StageEvaluator":
+        return StageEvaluator(variant, tuple(place), tuple(back), derivatives)
+
+    theta = ca.SX.sym("theta", len(NAMES))
+    mass, constraints = stage.hardware([theta[i] for i in place])
+    count = {"rigid": 3, "modal4": 4}.get(stage.outputs)
+    references = {}
+    if stage.modes != TWENTY:
+        references["20 flexible modes"] = replace(stage, modes=TWENTY)
+    if stage.order != FINE:
+        references["a finer mesh"] = replace(stage, order=FINE)
+    return Plant(
+        names=tuple(names),
+        constraint_names=tuple(constraints),
+        evaluate=evaluator(stage),
+        hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
+        outputs=count or len(stage.sensor_points),
+        inputs=count or len(stage.actuator_points),
+        references={name: evaluator(variant, False) for name, variant in references.items()},
+        values=evaluator(stage, False),
+        nearby=partial(_nearby, evaluator(stage, False)) if nearby.applies(stage) else None,
+        shapes=lambda theta, count: mode_shapes(stage, [theta[i] for i in place], count),
+        drawing=partial(_drawing, stage, place),
+    )
+
+
+def _drawing(
+    stage: RibStage, place: Sequence[int], thetas: Mapping[str, Sequence[float]]
+) -> Drawing:
+    from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
+
+    stages = {name: [theta[i] for i in place] for name, theta in thetas.items()}
+    return drawing(stage.geometry, stages)
+
+
+class StageEvaluator:
+    """θ in the case's order -> Mechanics, derivatives (if they are wanted) in that order too."""
+
+    def __init__(
+        self,
+        stage: RibStage,
+        place: tuple[int, ...],
+        back: tuple[int, ...],
+        derivatives: bool = True,
+    ) -> None:
+        self.stage, self.place, self.back = stage, place, back
+        self.derivatives = derivatives
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        here = [float(theta[i]) for i in self.place]
+        found = self.stage.mechanics(here, derivatives=self.derivatives)
+        if not self.derivatives or self.back == tuple(range(len(NAMES))):
+            return found
+        M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
+        return replace(found, derivatives=(M, D, K, B, C))
+
+
+def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+    """A reduced basis of the stage within ± reach of θ, its snapshots solved by the pool."""
+    stage, here = own.stage, [float(theta[i]) for i in own.place]
+    tasks = [(stage, place) for place in nearby.places(here, reach)]
+    made = dict(pool.map_unordered(nearby.numbered_snapshot, list(enumerate(tasks))))
+    evaluate = nearby.reduced(stage, here, [made[i] for i in range(len(tasks))])
+    return lambda values: evaluate([float(values[i]) for i in own.place])
+
+
+def _points(points: Points) -> tuple[Point, ...] | None:
+    return tuple((float(x), float(y)) for x, y in points) or None
+
+
+def _point_mass(x: float, y: float, mass: float, side: float) -> PointMass:
+    if not mass > 0.0:
+        raise StageError(f"point_masses: {mass:g} kg is no mass; give a number above 0")
+    if max(abs(x), abs(y)) > 0.5 * side * (1.0 + 1e-12):
+        raise StageError(f"point_masses: ({x:g}, {y:g}) is off the stage; move it inside")
+    return PointMass(float(x), float(y), float(mass))
+
+
+MODEL = Model(
+    rib_stage,
+    theta=NAMES,
+    checks={
+        "zeta": FRACTION,
+        "outputs": choice(*OUTPUTS),
+        "mesh": choice(*MESHES),
+        "side": POSITIVE,
+        "young": POSITIVE,
+        "poisson": number(0.0, 0.5, "give a number between 0 and 0.5"),
+        "density": POSITIVE,
+        "least_bay": POSITIVE,
+        "actuators": rows(2),
+        "sensors": rows(2),
+        "point_masses": rows(3),
+    },
+    sound=True,
+)

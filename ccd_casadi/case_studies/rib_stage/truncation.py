@@ -1,0 +1,118 @@
+"""Which flexible modes the plant keeps: a fixed number of each symmetry, or the lowest of all."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.modes import (
+    EXTRA,
+    SHIFT,
+    SQUARE_GROUPS,
+    WHOLE,
+    Discretisation,
+    Group,
+    Spectrum,
+    spectrum,
+)
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.threads import side_by_side
+
+
+@dataclass(frozen=True)
+class ModeCount:
+    """How many flexible modes of each symmetry are kept; `tilt` counts pairs SA, AS.
+
+    The default are the ten lowest of the stage of 0.59 kg and 110.5 Hz, and the cut leaves a gap
+    of a tenth to the next mode of each symmetry; a third A1 mode would meet the fourth there
+    (1782 and 1802 Hz). B1 and A2 rest on the diagonals of the square, so that actuators and
+    sensors at the corners neither drive nor see them.
+    """
+
+    A1: int = 2
+    B1: int = 1
+    B2: int = 2
+    A2: int = 1
+    tilt: int = 2
+
+    @property
+    def total(self) -> int:
+        """Flexible modes in all."""
+        return self.A1 + self.B1 + self.B2 + self.A2 + 2 * self.tilt
+
+    def of(self, group: Group) -> int:
+        """Modes solved of a group of symmetries."""
+        if group is WHOLE:
+            return self.total
+        name = group.solved[0].name
+        return int(getattr(self, "tilt" if name == "SA" else name))
+
+
+TWENTY = ModeCount(A1=4, B1=2, B2=4, A2=2, tilt=4)  # to see spill-over
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Where a column of the model comes from: group, place in it, image; frequency in Hz."""
+
+    name: str  # symmetry: z, tip, tilt, A1, B1, B2, A2, SA, AS, or "-" without symmetry
+    sector: str  # SS, SA, AS, AA, or "-"
+    frequency: float
+    group: int = -1
+    place: int = -1
+    image: int = -1
+
+
+@dataclass(frozen=True)
+class ModeSet:
+    """The spectra solved at one θ and the flexible modes kept of them, in the model's order."""
+
+    spectra: tuple[Spectrum, ...]
+    flexible: tuple[Mode, ...]
+
+    def kept(self, group: int) -> int:
+        """How many of the lowest modes of a spectrum are in the model."""
+        return 1 + max((m.place for m in self.flexible if m.group == group), default=-1)
+
+
+def solve_modes(
+    disc: Discretisation, geometry: Geometry, theta: Array, count: ModeCount, by_frequency: bool
+) -> ModeSet:
+    """Solve every symmetry (or their direct sum) at θ and choose the modes of the model.
+
+    By symmetry the order is A1, B1, B2, A2, then SA and AS in turns, lowest first in each: it
+    does not change where frequencies of different symmetries cross.
+    """
+    square = has_square_symmetry(geometry)
+    wanted = {}
+    for group in SQUARE_GROUPS if square else (WHOLE,):
+        number = count.of(group)
+        if square and by_frequency:
+            number = max(count.total // 2, 1)  # no symmetry has more than half of the lowest
+        if number:
+            wanted[group] = number
+    boxes = disc.assembler.box_matrices(theta, SHIFT)
+
+    def solved(group: Group) -> Spectrum:
+        return spectrum(disc, geometry, theta, group, wanted[group] + EXTRA, boxes)
+
+    largest_first = list(wanted)[::-1]  # the tilts have twice as many displacements as the others
+    found = dict(zip(largest_first, side_by_side(solved, largest_first), strict=True))
+    spectra = tuple(found[group] for group in wanted)
+    flexible = [
+        _mode(item, index, place, image)
+        for index, (item, number) in enumerate(zip(spectra, wanted.values(), strict=True))
+        for place in range(number)
+        for image in range(len(item.group.images))
+    ]
+    if by_frequency:
+        flexible = sorted(flexible, key=lambda mode: mode.frequency)[: count.total]
+    return ModeSet(spectra, tuple(flexible))
+
+
+def _mode(item: Spectrum, group: int, place: int, image: int) -> Mode:
+    symmetries = item.group.images[image]
+    known = len(symmetries) == 1
+    hertz = float(np.sqrt(item.values[place]) / (2.0 * np.pi))
+    name, sector = (symmetries[0].name, symmetries[0].sector) if known else ("-", "-")
+    return Mode(name, sector, hertz, group, place, image)

@@ -1,0 +1,187 @@
+"""A controller of fixed structure as values of result.json and controller.json."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.analysis.loop_figures import loop_entry
+from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
+from ccd_casadi.codesign.full_order import Beside, FullOrder
+from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of
+from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.units import HZ
+
+BINDS = {
+    "S_MAX": "S_max",
+    "SHAPE": "shape",
+    "LEVEL": "-3 dB below omega_b",
+    "S_LOW": "S_low",
+    "KS": "weighted_level of KS",
+    "T": "weighted_level of T",
+    "GS": "compliance_max",
+}
+WORST = 1.0 + 1e-5  # figure over bound up to which the judge counts a bound as met
+
+
+def design_dict(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+) -> dict[str, Any]:
+    """A certified design's figures under the contract's keys, the worst of its plants."""
+    judged = made.certificate
+    assert judged is not None
+    highest = max(judged.plants, key=lambda plant: plant.S_peak)
+    sampling = problem.sampling
+    grown = max(plant.stability for plant in judged.plants)
+    if sampling is not None:  # of the spectral radius: the real part that it comes from
+        grown = float(np.log1p(grown)) / sampling.period
+    ratios = judged.worst
+    return {
+        "omega_S_hz": None,
+        "omega_T_hz": None,
+        "outcome": made.outcome.name.lower(),
+        "reason": "" if made.certified else made.words,
+        "bandwidth_hz": made.bandwidth / HZ,
+        "gamma_opt": None,
+        "gamma": None,
+        "gamma_lower_bound": None,
+        "sensitivity_peak": highest.S_peak,
+        "sensitivity_peak_hz": highest.S_peak_frequency / HZ,
+        "sensitivity_low": max(plant.S_low for plant in judged.plants),
+        **compliance_dict(
+            max(plant.GS for plant in judged.plants),
+            max(plant.static_compliance for plant in judged.plants),
+            max(plant.low_compliance for plant in judged.plants),
+            problem.inner.omega_low / HZ,
+        ),
+        "KS_max": max(plant.KS for plant in judged.plants),
+        **_loop_entry(problem, theta, made),
+        **_channel_entry(bounds_of(problem), judged),
+        "certificate": {
+            "stable": all(plant.stable for plant in judged.plants),
+            "max_real_pole": grown,
+            "norm": max(ratios.values()),
+            "norm_bound": WORST,
+            "passed": judged.passed,
+            "plants": len(judged.plants),
+            "figures_over_bounds": ratios,
+        },
+        "controller": sections_dict(made.structure, made.kappa)
+        | {
+            "kappa": made.kappa.tolist(),
+            "local_optima": [
+                {"bandwidth_hz": item.bandwidth / HZ, "searches": item.count}
+                for item in made.local_optima
+            ],
+            "multipliers": made.multipliers,
+            "at_range": [f"{name} {end}" for name, end, _ in made.at_box],
+            "kkt_residual": made.kkt_residual,
+        },
+    }
+
+
+def _loop_entry(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign
+) -> dict[str, Any]:
+    """Margins and steps on the plants of the set; nothing of an unstable loop."""
+    judged = made.certificate
+    assert judged is not None
+    assert made.controller is not None
+    if not all(plant.stable for plant in judged.plants):
+        return {}
+    plants = [plant.plant_si() for plant in plants_of(problem, theta)]
+    peak = max(plant.S_peak for plant in judged.plants)
+    return loop_entry(plants, made.controller, problem.sampling, made.bandwidth, peak)
+
+
+def active_of(made: SectionsDesign) -> list[str]:
+    """What binds the controller."""
+    order = list(BINDS)
+    names = [kind_and_channel(name) for name, mu in made.multipliers.items() if mu > 1e-6]
+    bounds = [(order.index(kind), channel) for kind, channel in names if kind in BINDS]
+    return [
+        BINDS[order[kind]] + (f" of channel {channel}" if channel else "")
+        for kind, channel in sorted(bounds)
+    ]
+
+
+def _channel_entry(bounds: Bounds, judged: Certificate) -> dict[str, Any]:
+    """`channel_bounds`: what channels keep for themselves, the worst of the judge's plants."""
+    found = []
+    for i, own in enumerate(bounds.channels):
+        rows = [plant.channels[i] for plant in judged.plants if plant.channels]
+        if not own.given or not rows:
+            continue
+        top = max(rows, key=lambda row: row.S_peak)
+        entry = {
+            "name": own.name,
+            "sensitivity_peak": top.S_peak,
+            "sensitivity_peak_hz": top.S_peak_frequency / HZ,
+            "S_max": own.S_max,
+            "bandwidth_hz": min(row.bandwidth for row in rows) / HZ,
+            "bandwidth_ratio": own.bandwidth_ratio,
+        }
+        if own.M_K is not None:
+            entry |= {"M_K": own.M_K, "weighted_KS": max(row.weighted_KS for row in rows)}
+        found.append(entry)
+    return {"channel_bounds": found} if found else {}
+
+
+def proof_dict(proof: Proof) -> dict[str, Any]:
+    """`proof`: what holds on the whole box; `levels` are figures over bounds by kind."""
+    found: dict[str, Any] = {
+        "outcome": proof.outcome.name.lower(),
+        "words": proof.words,
+        "slack": proof.slack,
+        "parameters": list(proof.parameters),
+        "levels": {BINDS[name]: level for name, level in proof.levels.items()},
+        "boxes": proof.boxes,
+    }
+    if proof.refuted:
+        found |= {
+            "option": proof.option,
+            "point": list(proof.point),
+            "passed": [BINDS[proof.passed[0]], proof.passed[1]],
+        }
+    return found
+
+
+def beside_dict(beside: Beside) -> dict[str, Any]:
+    """`full_order`: what mixed sensitivity reaches beside the sections, and the stacked norm."""
+
+    def one(found: FullOrder | None) -> dict[str, Any] | None:
+        if found is None:
+            return None
+        return {"bandwidth_hz": found.bandwidth / HZ} | {
+            key: value for key, value in vars(found).items() if key != "bandwidth"
+        }
+
+    return clean(
+        {
+            "on_model": one(beside.on_model),
+            "on_set": one(beside.on_set),
+            "sections_on_model_hz": beside.sections_on_model / HZ,
+            "sections_continuous_hz": beside.sections_continuous / HZ,
+            "stacked_norm": beside.stacked_norm,
+            "gamma_opt": beside.gamma_opt,
+        }
+    )
+
+
+def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:
+    """controller.json: the state space in SI, the sections, and how they run."""
+    assert made.controller is not None
+    sampling = problem.sampling
+    words = sections_dict(made.structure, made.kappa) | {"kappa": made.kappa.tolist()}
+    if sampling is not None:
+        words["loop"] = {
+            "rate_hz": sampling.rate_hz,
+            "delay_us": sampling.delay_us,
+            "method": "tustin",
+        }
+    return controller_dict(made.controller) | {"sections": words}

@@ -1,0 +1,110 @@
+"""The design that a run ends with, and what was found out about it: alike for every controller.
+
+Each kind of controller says what only it knows (`figures`, `evidence`, some lines of the verdict);
+what the outer problem is judged by stands here, and results, verdicts and pages ask for nothing
+else.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.robust_check import OtherDamping
+from ccd_casadi.codesign.survival import Survival
+from ccd_casadi.codesign.verdict import SADDLE, Line
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.optim.kkt import KktCertificate
+from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verified(ABC):
+    """A design at θ, judged on the truth.
+
+    `value` is what J counts of the controller, in SI. `inner_gap`: by how much (relative) a search
+    of the whole inner problem at θ beats it. `feasible`: certified, within its bounds, and
+    λ(θ) <= 0. `survival` and `damping`: off the model; None where the loop is not stable.
+    `problem` has what a search has added to the case's: a plant set, controllers to start from.
+    """
+
+    problem: CoDesignProblem
+    theta: tuple[float, ...]
+    value: float
+    objective: float
+    hardware_cost: float
+    kkt: KktCertificate
+    inner_gap: float
+    feasible: bool
+    survival: Survival | None
+    damping: OtherDamping | None
+
+    kkt_level: ClassVar[float]  # scaled residual up to which a design counts as stationary
+    saddle: ClassVar[float] = SADDLE  # least curvature that is none downwards
+
+    @property
+    @abstractmethod
+    def controller(self) -> StateSpace:
+        """The controller, SI."""
+
+    @property
+    @abstractmethod
+    def certified(self) -> bool:
+        """Whether the closed loop is, apart from θ."""
+
+    @property
+    @abstractmethod
+    def bandwidth(self) -> float:
+        """ω_b in rad/s, whatever J counts."""
+
+    @property
+    def point(self) -> Array:
+        """Where the surrogates of the formulation are asked: θ, and what else they depend on."""
+        return np.array(self.theta)
+
+    @property
+    @abstractmethod
+    def active(self) -> tuple[str, ...]:
+        """Names of the bounds and constraints that bind."""
+
+    @abstractmethod
+    def figures(self) -> dict[str, Any]:
+        """The design's figures, by keys of result.json."""
+
+    @abstractmethod
+    def evidence(self, predicted: float) -> dict[str, Any]:
+        """What else its kind has to show, by keys of result.json; `predicted` is of its value."""
+
+    @abstractmethod
+    def checks(self) -> dict[str, bool]:
+        """Checks besides those that every design passes."""
+
+    @abstractmethod
+    def controller_entry(self) -> dict[str, Any]:
+        """controller.json."""
+
+    @abstractmethod
+    def certified_line(self) -> Line:
+        """What its certificate rests on."""
+
+    @abstractmethod
+    def survives_line(self) -> Line:
+        """Whether the case's own set of plants is kept, and closer models."""
+
+    @abstractmethod
+    def gap_words(self) -> str:
+        """What the whole inner problem has found better at θ."""
+
+    def no_gradient_words(self) -> str:
+        """Why J may have no gradient at θ; nothing where it always has one."""
+        return ""
+
+    @abstractmethod
+    def searched(
+        self, outcome: FormulationResult, look: BoxLook | None
+    ) -> tuple[str, Mapping[str, Any]]:
+        """Where something better was looked for and not found, in words and figures."""

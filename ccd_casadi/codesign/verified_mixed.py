@@ -1,0 +1,147 @@
+"""A verified design with a mixed-sensitivity controller: its figures, checks and lines."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, ClassVar
+
+from ccd_casadi.codesign.closer_models import ReferenceCheck
+from ccd_casadi.codesign.design_entries import (
+    compliance_dict,
+    controller_dict,
+    figures_dict,
+    loop_of_design,
+)
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.robust_check import RobustCheck
+from ccd_casadi.codesign.verdict import CloserModel, Line, certified, look_words, survives
+from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import Design, DesignFigures
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifiedDesign(Verified):
+    """The design of a run: x = (θ, ln ω_S, ln ω_T), its controller and every true figure.
+
+    `unsuspended`: the same controller on the plant with its rigid-body modes free; `references`:
+    on closer models of the plant; `robust`: all along the case's own set.
+    """
+
+    x: Array
+    design: Design
+    binding: tuple[str, ...]
+    unsuspended: DesignFigures
+    references: tuple[ReferenceCheck, ...] = ()
+    robust: RobustCheck | None = None
+
+    kkt_level: ClassVar[float] = 1e-4  # the polish reaches 1e-6
+
+    @property
+    def controller(self) -> StateSpace:
+        return self.design.controller
+
+    @property
+    def certified(self) -> bool:
+        return self.design.figures.certified
+
+    @property
+    def bandwidth(self) -> float:
+        return self.design.figures.bandwidth
+
+    @property
+    def point(self) -> Array:
+        return self.x
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        return self.binding
+
+    def figures(self) -> dict[str, Any]:
+        found = figures_dict(self.design.figures)
+        found |= loop_of_design(self.problem, self.theta, self.design)
+        if self.survival is not None:
+            rest, most = self.survival.statics, self.design.figures.compliance
+            found |= compliance_dict(most, rest.compliance, rest.low, rest.low_hz)
+        return found
+
+    def evidence(self, predicted: float) -> dict[str, Any]:
+        free = self.unsuspended
+        found: dict[str, Any] = {
+            "surrogate_bandwidth_hz": predicted / HZ,
+            "without_suspension": {
+                "stable": free.certificate.stable,
+                "bandwidth_hz": free.bandwidth / HZ,
+                "sensitivity_peak": free.sensitivity_peak,
+            },
+            "references": {
+                check.name: {
+                    "certified": check.certified,
+                    "reason": check.outcome.value,
+                    "stable": check.figures.certificate.stable,
+                    "bandwidth_hz": check.figures.bandwidth / HZ,
+                    "sensitivity_peak": check.figures.sensitivity_peak,
+                    "gamma": check.figures.gamma,
+                }
+                for check in self.references
+            },
+        }
+        if self.robust is not None:
+            found["robust"] = {
+                "nominal_sensitivity_peak": self.robust.nominal,
+                "stable": isfinite(self.robust.peak),
+                "worst_sensitivity_peak": self.robust.peak,
+                "worst_shift": self.robust.at.shift,
+                "worst_damping": self.robust.at.damping,
+                "plants": self.robust.plants,
+                **({} if self.damping is None else self.damping.entry),
+            }
+        return found
+
+    def checks(self) -> dict[str, bool]:
+        found = {} if self.robust is None else {"robust": self.robust.passed}
+        if self.references:
+            stable = [check.figures.certificate.stable for check in self.references]
+            found["closer_models"] = all(stable)
+        return found
+
+    def controller_entry(self) -> dict[str, Any]:
+        return controller_dict(self.controller)
+
+    def certified_line(self) -> Line:
+        figures = self.design.figures
+        return certified(
+            certificate=figures.certified,
+            constraints=self.feasible,
+            norm=figures.certificate.norm,
+            norm_bound=figures.certificate.norm_bound,
+            peak=figures.sensitivity_peak,
+            bounds=self.problem.inner.bounds,
+            compliance=figures.compliance,
+        )
+
+    def survives_line(self) -> Line:
+        closer = (
+            (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
+            for check in self.references
+        )
+        return survives(
+            self.survival,
+            S_max=self.problem.inner.S_max,
+            robust=None if self.robust is None else self.robust.passed,
+            robust_words="" if self.robust is None else self.robust.words,
+            other_damping="" if self.damping is None else self.damping.words,
+            closer=tuple(CloserModel(*item) for item in closer),
+        )
+
+    def gap_words(self) -> str:
+        return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"
+
+    def searched(
+        self, outcome: FormulationResult, look: BoxLook | None
+    ) -> tuple[str, Mapping[str, Any]]:
+        solved = outcome.outer
+        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
+        return look_words(starts, optima, look)

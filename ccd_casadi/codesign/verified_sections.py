@@ -1,0 +1,202 @@
+"""A verified design with a controller of fixed structure: its figures, checks and lines."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.full_order import Beside
+from ccd_casadi.codesign.robust_check import reach_of
+from ccd_casadi.codesign.sections_entries import (
+    active_of,
+    beside_dict,
+    design_dict,
+    proof_dict,
+    sections_controller,
+)
+from ccd_casadi.codesign.sections_races import Raced
+from ccd_casadi.codesign.verdict import Line, State, look_words, survives
+from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.fixed_structure import Certificate, SectionsDesign
+from ccd_casadi.fixed_structure.box_proof import Proof
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.units import HZ, counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifiedSections(Verified):
+    """The design of a run, judged on its set and on the whole box of plants.
+
+    `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
+    the whole of it; `worst` the worst plant that was found. `raced` is a full race at θ, and
+    `beside` what controllers of full order reach there.
+    """
+
+    design: SectionsDesign
+    raced: Raced
+    wide: Certificate
+    checked: int
+    proof: Proof
+    worst: Excess
+    rounds: int
+    beside: Beside
+
+    # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
+    # and differences of two such say nothing of a small curvature.
+    kkt_level: ClassVar[float] = 1e-2
+    saddle: ClassVar[float] = -math.inf
+
+    @property
+    def controller(self) -> StateSpace:
+        assert self.design.controller is not None
+        return self.design.controller
+
+    @property
+    def certified(self) -> bool:
+        return self.design.certified
+
+    @property
+    def bandwidth(self) -> float:
+        return self.design.bandwidth
+
+    @property
+    def kept(self) -> bool:
+        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
+        found, ends = self.survival, reach_of(self.problem)
+        along = found is None or found.within(*ends)
+        return self.wide.passed and not self.proof.refuted and along
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        constraints = plant_of(self.problem).constraint_names
+        bounds = [name for name in self.kkt.active if name not in constraints]
+        return (*bounds, *active_of(self.design), *touched(self.problem, self.theta))
+
+    def figures(self) -> dict[str, Any]:
+        return design_dict(self.problem, self.theta, self.design)
+
+    def evidence(self, predicted: float) -> dict[str, Any]:
+        sections = sections_of_problem(self.problem)
+        found: dict[str, Any] = {
+            "surrogate_bandwidth_hz": predicted / HZ if sections.figure is BANDWIDTH else None,
+            "race": [
+                {"bandwidth_hz": value / HZ, "searches": count}
+                for value, count in self.raced.optima
+            ],
+            "rounds": self.rounds,
+            "anchors": [list(kappa) for kappa in sections.anchors],
+            "robust": self._robust_entry(),
+            "proof": proof_dict(self.proof),
+            "full_order": beside_dict(self.beside),
+        }
+        if sections.figure is not BANDWIDTH:
+            found |= {
+                "error_rms_of_set": self.value,
+                "surrogate_error_rms": predicted,
+                "error_rms_raced": self.raced.value,
+                "error_anchors": [list(kappa) for kappa in sections.error_anchors],
+            }
+        if sections.weighted_level is None:
+            words = "KS and T are not bounded: the case gives no controller.weighted_level"
+            found["notes"] = [*plant_of(self.problem).notes(self.theta), words]
+        return found
+
+    def _robust_entry(self) -> dict[str, Any]:
+        """The judge on a lattice of the box, and the worst plant that was searched."""
+        stable = [plant for plant in self.wide.plants if plant.stable]
+        members = sections_of_problem(self.problem).members
+        return {
+            "stable": len(stable) == len(self.wide.plants),
+            "plants": self.checked,
+            "passed": self.wide.passed,
+            "bandwidth_hz": self.wide.bandwidth / HZ,
+            "worst_sensitivity_peak": max((plant.S_peak for plant in stable), default=None),
+            "worst_excess": float(np.expm1(self.worst.value)),
+            "worst_plant": {"option": self.worst.option, "point": self.worst.point.tolist()},
+            "set": [{"option": option, "point": list(point)} for option, point in members],
+            "words": self.wide.words,
+            **({} if self.damping is None else self.damping.entry),
+        }
+
+    def checks(self) -> dict[str, bool]:
+        return {"robust": self.kept}
+
+    def controller_entry(self) -> dict[str, Any]:
+        return sections_controller(self.problem, self.design)
+
+    def certified_line(self) -> Line:
+        judged = self.design.certificate
+        figures = {} if judged is None else {"figures_over_bounds": judged.worst}
+        if not self.certified:
+            return Line(State.FAILED, self.design.words, figures)
+        if not self.feasible:
+            return Line(State.FAILED, "certified, but a constraint on theta is not met", figures)
+        count = 0 if judged is None else len(judged.plants)
+        where = "the model" if count == 1 else f"the {count} plants"
+        words = f"stable and within every bound on {where} that it was designed on"
+        return Line(State.PASSED, words, figures)
+
+    def survives_line(self) -> Line:
+        excess, proof = math.expm1(self.worst.value), self.proof
+        figures = {
+            "plants": self.checked,
+            "worst_excess": excess,
+            "proof": proof.outcome.name.lower(),
+            "proven": proof.levels,
+        }
+        where = f"{counted(self.checked, 'plant')} of the box that [robust] names"
+        words = (
+            f"within every bound on {where}, the worst searched {100.0 * excess:+.2g} % of a bound"
+        )
+        robust: bool | None = self.kept
+        if not self.wide.passed:
+            words = f"on {where}: {self.wide.words}"
+        elif proof.refuted:
+            words = f"within every bound on {where}, but {proof.words}"
+        elif self.checked <= 1:
+            robust, words = None, "[robust] names no plant but the model"
+        elif robust:
+            words = f"{words}; {proof.words}"
+        else:
+            words = f"within every bound on {where}, but not all along its common resonance shift"
+        line = survives(
+            self.survival,
+            S_max=self.problem.inner.S_max,
+            robust=robust,
+            robust_words=words,
+            other_damping="" if self.damping is None else self.damping.words,
+            figures=figures,
+        )
+        state = State.WARNED if robust is None and line.state is State.PASSED else line.state
+        return Line(state, line.words, line.figures)
+
+    def gap_words(self) -> str:
+        figure = self.problem.figure
+        here, there = figure.shown(self.value), figure.shown(self.raced.value)
+        return f"a race at this theta found a controller with {there} in place of {here}"
+
+    def no_gradient_words(self) -> str:
+        off = self.design.kkt_residual
+        words = "no gradient over theta, since the search over the controller ended"
+        return f"{words} {off:.1e} from its optimum"
+
+    def searched(
+        self, outcome: FormulationResult, look: BoxLook | None
+    ) -> tuple[str, Mapping[str, Any]]:
+        solved = outcome.outer
+        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
+        known, figures = look_words(starts, optima, look)
+        found, of = [value / HZ for value, _ in self.raced.optima], ""
+        if self.problem.figure is not BANDWIDTH:
+            of = f", from there at {self.problem.figure.shown(self.raced.value)}"
+        raced = ", ".join(f"{value:.2f}" for value in found)
+        words = f"a full race at this theta ended at {raced} Hz{of}; {known}"
+        return words, {**figures, "local_optima_hz": found}

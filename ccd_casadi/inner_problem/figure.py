@@ -1,0 +1,40 @@
+"""What an inner problem gives the outer one to count beside the hardware cost.
+
+v(θ) = max ω_b   or   v(θ) = min e,      J = w1 f(θ) + w2 v(θ)
+"""
+
+from dataclasses import dataclass
+
+from ccd_casadi.support.units import HZ
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A value v of the inner problem: its key, its symbol, and how it is shown.
+
+    `unit` and `factor` (per SI unit) are for the eye.
+    """
+
+    key: str
+    words: str
+    symbol: str
+    si_unit: str
+    unit: str
+    factor: float
+    larger_is_better: bool
+
+    def gain(self, other: float, than: float) -> float:
+        """By how much (relative) a value is better than another; negative where it is worse."""
+        return (other / than if self.larger_is_better else than / other) - 1.0
+
+    def shown(self, value: float, digits: int = 4) -> str:
+        """The value with its unit.
+
+        >>> RMS_ERROR.shown(12.3456e-9)
+        '12.35 nm'
+        """
+        return f"{self.factor * value:.{digits}g} {self.unit}"
+
+
+BANDWIDTH = Figure("bandwidth", "bandwidth", "ω_b", "rad/s", "Hz", 1.0 / HZ, True)
+RMS_ERROR = Figure("rms_error", "RMS error", "e", "m", "nm", 1e9, False)

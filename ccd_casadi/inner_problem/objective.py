@@ -1,0 +1,80 @@
+"""J of the outer problem and its slopes at true values of the inner one.
+
+    J(θ) = w1 f(θ) + w2 v(θ),   v = ω_b* in rad/s or the least RMS error in m,   λ(θ) <= 0
+
+λ counts in shares of its size (`constraints`), θ in the user's units and slopes per share of the
+box, in which every variable goes from 0 to 1.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
+from ccd_casadi.support.arrays import Array
+
+
+class TrueValue(Protocol):
+    """v(θ) with its gradient (n,) per unit of θ, and whether a certified design has it."""
+
+    @property
+    def theta(self) -> tuple[float, ...]: ...
+
+    @property
+    def value(self) -> float: ...
+
+    @property
+    def gradient(self) -> tuple[float, ...]: ...
+
+    @property
+    def feasible(self) -> bool: ...
+
+
+def objective(problem: CoDesignProblem, theta: Sequence[float] | Array, value: float) -> float:
+    """J at θ with a value v of the inner problem."""
+    return sum(objective_terms(problem, theta, value))
+
+
+def objective_terms(
+    problem: CoDesignProblem, theta: Sequence[float] | Array, value: float
+) -> tuple[float, float]:
+    """w1 f(θ) and w2 v, which may cancel."""
+    cost = hardware_cost(plant_of(problem), theta)
+    return problem.w1 * cost, problem.w2 * float(value)
+
+
+def objective_of(problem: CoDesignProblem, sample: TrueValue) -> float:
+    """J of a sample; infinite where no design is certified or λ(θ) <= 0 is not met."""
+    if not sample.feasible or unmet(problem, sample.theta):
+        return np.inf
+    return objective(problem, sample.theta, sample.value)
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """w1 ∇f (n,), λ (m,) in shares of its size and ∇λ (m, n) at θ, per share of the box."""
+
+    cost_gradient: Array
+    constraints: Array
+    slopes: Array
+
+
+def hardware_at(problem: CoDesignProblem, theta: Array) -> Hardware:
+    """What θ costs and may not, to first order."""
+    lower, upper = box(problem)
+    width = upper - lower
+    df, dlam = hardware_slopes(plant_of(problem), theta)
+    sizes = constraint_sizes(problem)
+    shares = constraint_shares(problem, theta)
+    return Hardware(problem.w1 * df * width, shares, dlam * width / sizes[:, None])
+
+
+def objective_gradient(problem: CoDesignProblem, sample: TrueValue) -> Array:
+    """∇J (n,) per share of the box; of one side, where v has a kink."""
+    lower, upper = box(problem)
+    own = hardware_at(problem, np.array(sample.theta)).cost_gradient
+    return own + problem.w2 * np.array(sample.gradient) * (upper - lower)

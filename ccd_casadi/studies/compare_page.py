@@ -1,0 +1,256 @@
+"""report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
+
+from pathlib import Path
+from typing import Any
+
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign.verdict import State
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
+from ccd_casadi.reporting.loops import figure_gains, synthesised_loop, table_gains
+from ccd_casadi.reporting.maps import figure_landscape
+from ccd_casadi.reporting.page import (
+    Section,
+    Table,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+    preformatted,
+    table_html,
+)
+from ccd_casadi.reporting.sections_loops import compared_html
+from ccd_casadi.reporting.solve_page import stage_sections
+from ccd_casadi.reporting.svg import axis_label
+from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.reporting.verdict import verdict_html, worst
+from ccd_casadi.studies.comparison import Comparison, Method
+from ccd_casadi.studies.methods import (
+    LABELS,
+    caption_cost,
+    caption_histories,
+    figure_cost,
+    figure_histories,
+    table_cost,
+    table_histories,
+    theta_paths,
+)
+from ccd_casadi.studies.steepest_descent import Descent
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.loop_responses import Loop
+from surrogates.files import write_whole
+
+
+def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Path:
+    """Write `report.html` into the folder, whole or not at all."""
+    problem = comparison.problem
+    found = answer["conclusions"]
+    sections = [
+        Section("What it shows", "\n".join(paragraph(text) for text in found["sentences"])),
+        Section("The methods", _methods(problem, answer)),
+        Section("Cost", _cost(comparison)),
+    ]
+    best = found["best"]
+    if len(problem.names) == 2:
+        sections.append(Section("Paths over the landscape", _paths(folder, comparison, best)))
+    if best is not None:
+        sections.append(
+            Section("Sensitivity, baseline against co-design", _loops(comparison, best))
+        )
+        sections += stage_sections(
+            problem,
+            {
+                LABELS[name]: tuple(comparison.method(name).figures["theta"].values())
+                for name in ("sequential", best)
+                if comparison.method(name).figures.get("theta")
+            },
+        )
+    for name, descent in histories(comparison).items():
+        body = figure_html(
+            figure_histories(problem, descent, key=f"history{len(sections)}"),
+            caption_histories(descent),
+            table_histories(problem, descent),
+        )
+        sections.append(Section(f"History: {name}", body))
+    sections.append(Section("The case", preformatted(case_to_toml(comparison.case))))
+    versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
+    sections.append(Section("Versions", paragraph(f"{versions}; seed {answer['seed']}.")))
+    verified = all(
+        method.figures["status"] == "verified" for method in comparison.methods if method.solution
+    )
+    head = header(
+        f"Comparison: {comparison.case.path.name}",
+        verified,
+        "verified" if verified else "not verified",
+        "",
+        f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
+        found["sentences"][0],
+        warned=any(
+            worst(method.figures) is not State.PASSED
+            for method in comparison.methods
+            if method.solution
+        ),
+    )
+    for method in reversed(comparison.methods):
+        lines = verdict_html(method.figures)
+        if lines:
+            sections.insert(0, Section(f"Verdict: {LABELS[method.name]}", lines))
+    path, title = folder / "report.html", f"Comparison: {comparison.case.path.name}"
+    text = page(title, sections, head, index="")
+    write_whole(path, text)
+    return path
+
+
+def histories(comparison: Comparison) -> dict[str, Descent]:
+    """The best descent of each gradient, and the best one from the case's own start."""
+    found: dict[str, Descent] = {}
+    for method in comparison.methods:
+        if method.descent is None or not method.descent.iterates:
+            continue
+        label = LABELS[method.name]
+        own = [
+            descent
+            for descent in comparison.descents
+            if descent.gradient is method.descent.gradient
+            and descent.start == comparison.problem.start
+            and descent.iterates
+        ]
+        if own:
+            found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
+        if method.descent.start != comparison.problem.start:
+            found[f"{label}, best of all runs"] = method.descent
+    return found
+
+
+def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
+    """All methods in one table, the paper's figures below them."""
+    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
+    factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
+    names = [axis_label(n, unit) for n, (unit, _) in zip(problem.names, shown, strict=True)]
+    cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
+    head = (
+        "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "box look",
+        "s", "certified",
+    )  # fmt: skip
+    rows: list[tuple[Any, ...]] = []
+    for name, figures in answer["methods"].items():
+        if figures.get("objective") is None:
+            empty = ("–",) * (len(head) - 2)
+            rows.append((LABELS[name], *empty, figures["status"]))
+            continue
+        rows.append(
+            (
+                LABELS[name],
+                *(number(factors[key] * figures["theta"][key], 4) for key in problem.names),
+                number(figures["hardware_cost"], 5),
+                number(figures["bandwidth_hz"], 5),
+                number(figures["objective"], 6),
+                number(figures["first_resonance_hz"], 5),
+                number(figures["sensitivity_peak"], 5),
+                str(figures["syntheses_to_optimum"]),
+                str(figures["syntheses"] - figures["syntheses_to_optimum"] or "–"),
+                number(figures["seconds"], 2),
+                "yes" if figures["certificate"]["passed"] else "no",
+            )
+        )
+    for name, label in (("sequential", "paper: sequential"), ("nested_ccd", "paper: nested CCD")):
+        item = answer["published"].get(name)
+        if item is not None:
+            theta = item.get("theta", {})
+            rows.append(
+                (
+                    label,
+                    *(number(factors[k] * theta[k], 4) if k in theta else "–" for k in factors),
+                    number(item["hardware_cost"], 5),
+                    number(item["bandwidth_hz"], 4),
+                    number(item["objective"], 5),
+                    number(item["first_resonance_hz"], 4),
+                    "–",
+                    "–",
+                    "–",
+                    "–",
+                    "–",
+                )
+            )
+    words = (
+        "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
+        "Syntheses are those to the optimum; what a formulation then spends on a look over the box "
+        "for a better one stands beside them. A descent's are those of its best run; all runs are "
+        "in compare.json."
+    )
+    if problem.sections is not None:
+        words = (
+            "Each formulation ends with a polish and a KKT certificate on the true problem. A "
+            "synthesis is a climb from the anchors, or a race; the descent and the sequential "
+            "designs climb from the best formulation's anchors. Left out: the descent with K held "
+            "fixed and the landscape over the weights' frequencies, which sections do not have."
+        )
+    return f'<div class="scroll">{table_html(Table(head, tuple(rows)))}</div>{paragraph(words)}'
+
+
+def _cost(comparison: Comparison) -> str:
+    methods = comparison.methods
+    return figure_html(figure_cost(methods), caption_cost(methods), table_cost(methods))
+
+
+def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
+    """The landscape from the lifted surrogates, the way of each iterative method over it."""
+    problem = comparison.problem
+    lifted = comparison.method("lifted")
+    processes = () if lifted.solution is None else lifted.solution.outcome.surrogates
+    nested = comparison.method("nested").solution
+    if nested is not None and nested.verified is not None:  # its samples may be of its own anchors
+        problem = nested.verified.problem
+    truths = read_truths(folder / "samples_nested.sqlite", problem)
+    land = landscape_data(problem, processes, truths)
+    walked = [m for m in comparison.methods if m.descent is not None or "sequential" in m.name]
+    optimum = None
+    if best is not None:
+        theta = comparison.method(best).figures["theta"]
+        optimum = (theta[problem.names[0]], theta[problem.names[1]])
+    ends = []
+    for method in walked:
+        if len(method.path):
+            last = ", ".join(number(v, 5) for v in method.path[-1])
+            ends.append(f"{LABELS[method.name]} ends at ({last})")
+    caption = (
+        "Colours: ω_b*(θ) predicted by the lifted surrogates; dots: the nested formulation's true "
+        "samples in the same colours. " + "; ".join(ends) + "."
+    )
+    svg = figure_landscape(land, theta_paths(walked), optimum)
+    return figure_html(svg, caption, *tables_landscape(land))
+
+
+def _loops(comparison: Comparison, best: str) -> str:
+    """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
+    if comparison.problem.sections is not None:
+        shown = [(name, comparison.method(name)) for name in ("sequential", best)]
+        return compared_html(
+            comparison.problem,
+            {
+                LABELS[name]: (tuple(method.figures["theta"].values()), method.sections)
+                for name, method in shown
+                if method.sections is not None
+            },
+        )
+    loops = [
+        _loop(comparison.problem, comparison.method(name))
+        for name in ("sequential", best)
+        if comparison.method(name).figures.get("objective") is not None
+    ]
+    words = "; ".join(
+        f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.gains[0].max():.3f}"
+        for loop in loops
+    )
+    caption = f"Largest singular values of the closed loop. {words}."
+    svg = figure_gains(loops, S_max=comparison.problem.inner.S_max, bounds=False)
+    return figure_html(svg, caption, *(table_gains(loop) for loop in loops))
+
+
+def _loop(problem: CoDesignProblem, method: Method) -> Loop:
+    figures = method.figures
+    theta = tuple(figures["theta"][name] for name in problem.names)
+    omega = HZ * figures["omega_S_hz"], HZ * figures["omega_T_hz"]
+    return synthesised_loop(problem, theta, *omega, LABELS[method.name])
