@@ -10,8 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import Learner
+from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Verified
@@ -128,3 +131,15 @@ class Outer(ABC):
     @abstractmethod
     def verified(self, end: End, rounds: int) -> Verified:
         """The design judged on the truth, after so many `rounds` of the whole search."""
+
+    def point_of(self, run: FinishedRun) -> Array:
+        """x of a run's design."""
+        return np.array(run.theta)
+
+    @abstractmethod
+    def learner(self, samples: int, seed: int) -> Learner:
+        """Surrogates for the trade-off of hardware cost against the value."""
+
+    @abstractmethod
+    def responses(self, x: Array) -> PostOptimal:
+        """How an optimum at x answers to what was given."""

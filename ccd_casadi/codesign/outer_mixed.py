@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.closer_models import check_references
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import (
@@ -20,6 +21,7 @@ from ccd_casadi.codesign.direct import (
 )
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import LiftedLearner
 from ccd_casadi.codesign.kinked import SETTLED, descend
 from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
@@ -27,6 +29,7 @@ from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
+from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_robust, other_damping, survived
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
@@ -223,6 +226,15 @@ class MixedOuter(Outer):
             damping=other_damping(problem, loops),
             survival=found,
         )
+
+    def point_of(self, run: FinishedRun) -> Array:
+        return np.append(run.theta, np.log([run.weights.omega_S, run.weights.omega_T]))
+
+    def learner(self, samples: int, seed: int) -> LiftedLearner:
+        return LiftedLearner(self.sampler, samples, seed)
+
+    def responses(self, x: Array) -> PostOptimal:
+        return post_optimal(self.problem, x, self.sampler.quiet)
 
     def _binding(self, x: Array, figures: DesignFigures) -> tuple[str, ...]:
         problem = self.problem

@@ -14,13 +14,16 @@ import numpy as np
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import NestedLearner
 from ccd_casadi.codesign.full_order import full_order_beside
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_direct import pieces_from, polish_sections, solve_direct_sections
 from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
+from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.true_value import TrueBandwidth
@@ -187,3 +190,10 @@ class SectionsOuter(Outer):
             rounds=rounds,
             beside=beside,
         )
+
+    def learner(self, samples: int, seed: int) -> NestedLearner:
+        return NestedLearner(self.sampler, seed=seed)
+
+    def responses(self, x: Array) -> PostOptimal:
+        sample = self.sampler.bandwidths(x, "the run's own design")[0]
+        return sections_responses(self.problem, sample, sections_value(self.problem, sample.theta))

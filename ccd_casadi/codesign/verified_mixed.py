@@ -16,7 +16,7 @@ from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.robust_check import RobustCheck
 from ccd_casadi.codesign.verdict import CloserModel, Line, certified, look_words, survives
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures

@@ -27,7 +27,7 @@ from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ, counted
 
 
