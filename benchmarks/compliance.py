@@ -27,9 +27,11 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scale
 from ccd_casadi.inner_problem.sections_bandwidth import prepared
 from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.compliance import compliance_of, force_to_position
+from ccd_casadi.synthesis.compliance import compliance_of
 from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parent.parent
@@ -51,7 +53,7 @@ weighted_level = {level}
 
 def rms(plant: ScaledPlant, K: StateSpace) -> float:
     """Of the position under white force; infinite where the loop is not stable."""
-    loop = force_to_position(plant.plant_si(), K)
+    loop = closed_loop(plant.plant_si(), K).GS
     A, B, C = balanced(loop.A, loop.B, loop.C)
     if not np.linalg.eigvals(A).real.max() < 0.0:
         return np.inf
@@ -62,7 +64,7 @@ def rms(plant: ScaledPlant, K: StateSpace) -> float:
 def figures(problem: CoDesignProblem, theta: tuple[float, ...], K: StateSpace) -> str:
     """|GS(0)|, max |GS| and the RMS position of white force, and the largest RMS of the set."""
     plain = scaled_plant(replace(problem, robust=None), theta)
-    loop = force_to_position(plain.plant_si(), K)
+    loop = closed_loop(plain.plant_si(), K).GS
     static = np.linalg.norm(loop.C @ np.linalg.solve(loop.A, loop.B), 2)
     if problem.sections is not None:
         uncertain = uncertain_plant(problem, theta)

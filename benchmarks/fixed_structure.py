@@ -32,8 +32,8 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
-from ccd_casadi.plants.registry import MODELS
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.plants.two_mass import two_mass_plant
 from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi
@@ -51,7 +51,7 @@ SAMPLED = Sampling(10000.0, 100.0)
 
 def two_mass(theta: tuple[float, float]) -> Mechanics:
     """Case study 1 at θ in kg."""
-    return mechanics(build_plant(MODELS["two_mass"], ("m1", "m2"), {"zeta": 0.01}), theta)
+    return mechanics(two_mass_plant(("m1", "m2")), theta)
 
 
 def box(shift: float, damping: tuple[float, float] = (1.0, 1.0)) -> UncertainPlant:
@@ -151,7 +151,7 @@ def derivatives(seed: int, count: int = 200) -> dict[str, float]:
     Relative to the largest derivative of its constraint; half of the loops are sampled.
     """
     rng = np.random.default_rng(seed)
-    plant = build_plant(MODELS["two_mass"], ("m1", "m2"), {"zeta": 0.01})
+    plant = two_mass_plant(("m1", "m2"))
     worst = {"kappa": 0.0, "tau": 0.0, "theta": 0.0}
     looked = 0
     while looked < count:

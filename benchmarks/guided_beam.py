@@ -25,8 +25,8 @@ from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem, structure_of
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
-from ccd_casadi.plants.scaling import StateSpace
 
 CASE = Path(__file__).resolve().parent.parent / "examples" / "guided_beam" / "case.toml"
 HZ = 2.0 * np.pi

@@ -29,8 +29,8 @@ from pid_judge import Loop, Table, controller, judged, loop_of, near, poles
 from ccd_casadi.fixed_structure import Bounds, Structure, synthesise_sections
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.plants.registry import MODELS
 from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.plants.two_mass import two_mass
 from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi
@@ -163,7 +163,7 @@ class Case:
 
 CASES = {
     "two_mass (55, 55), +-3 %": Case(
-        MODELS["two_mass"], {"m1": 55.0, "m2": 55.0}, {"zeta": 0.01},
+        two_mass, {"m1": 55.0, "m2": 55.0}, {"zeta": 0.01},
         Bounds(1.75, 0.03, HZ, 1.1, 8.426, weights(2e7, 100.0)), 2e7, 25.0, (0.0, -0.03, 0.03),
     ),
     "tutorial stage, rib 19 mm": Case(

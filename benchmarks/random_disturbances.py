@@ -25,7 +25,9 @@ from random_syntheses import SLACK, Case, draw_case, draw_weights
 from slycot import ab13dd
 from slycot.exceptions import SlycotError
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
@@ -35,7 +37,6 @@ from ccd_casadi.synthesis.backends.standard_plant import (
     close,
     mixed_sensitivity,
 )
-from ccd_casadi.synthesis.norms import hinf_norm
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds

@@ -28,11 +28,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, scale_state_space
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.synthesis.norms import hinf_norm
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 

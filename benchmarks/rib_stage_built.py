@@ -23,19 +23,18 @@ from typing import Any
 import numpy as np
 from scipy.signal import cont2discrete
 
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES
+from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
 from ccd_casadi.deployment.simulation import measure_sensitivity
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.rib_stage.geometry import NAMES
-from ccd_casadi.plants.rib_stage.plant import rib_stage
-from ccd_casadi.plants.scaling import StateSpace
 
 RESULTS = Path(__file__).with_suffix(".json")
 DESIGN = Path(__file__).parent / "rib_stage_design"
@@ -46,12 +45,12 @@ GROUP = 25  # plants of one finite-element model
 REACH, PAYLOAD = 0.03, 0.05  # m, kg
 
 
-def controller(folder: Path) -> DiscreteStateSpace:
+def controller(folder: Path) -> StateSpace:
     """K(z) by Tustin's rule."""
     table = json.loads((folder / "controller.json").read_text())
     parts = [np.array(table[name], float) for name in "ABCD"]
     A, B, C, D, _ = cont2discrete(parts, 1.0 / RATE, "bilinear")
-    return DiscreteStateSpace(A, B, C, D, 1.0 / RATE)
+    return StateSpace(A, B, C, D, period=1.0 / RATE)
 
 
 def theta_of(folder: Path) -> list[float]:
@@ -85,7 +84,7 @@ def plants(
 
 
 def judged(
-    K: DiscreteStateSpace, theta: list[float], seed: int, group: int, anywhere: bool
+    K: StateSpace, theta: list[float], seed: int, group: int, anywhere: bool
 ) -> tuple[list[dict[str, Any]], StateSpace]:
     """Rows of a group, and its worst plant."""
     rows, made = [], plants(theta, seed, group, anywhere)

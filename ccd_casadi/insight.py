@@ -16,14 +16,11 @@ from surrogates.options import whole
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    import numpy as np
-
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.insight import insight_dict
     from ccd_casadi.codesign.pareto import pareto_front
-    from ccd_casadi.codesign.post_optimal import post_optimal
-    from ccd_casadi.codesign.sections_insight import sections_front, sections_responses
-    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
+    from ccd_casadi.codesign.run import outer_of
+    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
@@ -33,26 +30,19 @@ def command(options: argparse.Namespace) -> ExitCode:
     done = read_run(options.run)
     require_bandwidth(done.problem, "insight")
     folder = run_folder(options.run, options.out or options.run)
-    theta, tolerance = np.array(done.theta), done.case.outer.tolerance
+    tolerance = done.case.outer.tolerance
     with (
         pool(options.scheduler, options.workers, PATIENCE) as workers,
         SampleStore(done.folder / "samples.sqlite") as samples,
     ):
         sampler = Sampler(done.problem, samples, workers, quiet=options.quiet)
-        if done.problem.sections is None:
-            x = np.append(theta, np.log([done.weights.omega_S, done.weights.omega_T]))
-            front = pareto_front(
-                sampler, points=options.points, samples=done.case.sampling.lifted_points,
-                tolerance=tolerance, seed=options.seed, own=x,
-            )  # fmt: skip
-            responses = post_optimal(done.problem, x, options.quiet)
-        else:
-            front = sections_front(
-                sampler, own=theta, points=options.points, tolerance=tolerance, seed=options.seed
-            )
-            sample = sampler.bandwidths(theta, "the run's own design")[0]
-            found = sections_value(done.problem, done.theta)
-            responses = sections_responses(done.problem, sample, found)
+        outer = outer_of(sampler)
+        own = outer.point_of(done)
+        learner = outer.learner(done.case.sampling.lifted_points, options.seed)
+        front = pareto_front(
+            learner, points=options.points, tolerance=tolerance, seed=options.seed, own=own
+        )
+        responses = outer.responses(own)
     seconds = perf_counter() - began
     told = insight_dict(done, front, responses)
     write_json(folder / "insight.json", told | {"seed": options.seed, "seconds": seconds})

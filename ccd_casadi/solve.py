@@ -154,9 +154,10 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     from ccd_casadi.cases.plant_report import size_words
     from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
-    from ccd_casadi.plants.registry import SHIPPED
+    from ccd_casadi.plants.registry import model_named
 
-    if case.plant.model in SHIPPED:
+    model = model_named(case.plant.model)
+    if model is not None and model.sound:
         for words in peak_words(problem.inner.S_max):
             print(f"warning: {words}", file=sys.stderr)
         return

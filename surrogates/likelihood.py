@@ -4,18 +4,21 @@ Source: Rasmussen & Williams (2006), eq. 5.8 and 5.9; the gradients enter as
 further observations of the same process (section 9.4).
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 
 from surrogates.covariance import (
     NO_NOISE,
+    Family,
     Hyperparameters,
-    Kernel,
     blocks,
     observed_covariance,
     radial,
     separations,
+    with_noise,
 )
 from surrogates.interface import Array, SurrogateFitError
 
@@ -26,11 +29,12 @@ from surrogates.interface import Array, SurrogateFitError
 LENGTH_BOUNDS = (1e-2, 1e3)
 SIGNAL_BOUNDS = (1e-3, 1e6)
 NOISE_BOUNDS = (1e-12, 1e0)
+SINGULAR = -1e10  # a likelihood where K is: a wall, flat, so that the line search backs off
 JITTERS = (0.0, *(10.0**k for k in range(-15, -5)))
 
 
 def factorise(
-    kernel: Kernel,
+    kernel: Family,
     X: Array,
     parameters: Hyperparameters,
     gradients: bool,
@@ -53,7 +57,7 @@ def factorise(
 
 
 def log_likelihood(
-    kernel: Kernel,
+    kernel: Family,
     X: Array,
     targets: Array,
     parameters: Hyperparameters,
@@ -73,16 +77,18 @@ def log_likelihood(
     n, d = X.shape
     gradients = targets.size > n
     lengths = parameters.length_scales
-    K = observed_covariance(kernel, X, parameters, gradients, jitter, sample_noise)
-    L = cholesky(K, lower=True)
+    z = separations(X, X, lengths)
+    squares = z * z
+    phi = radial(kernel, squares.sum(axis=0), 3 if gradients else 1)
+    C = blocks(z, phi, lengths, gradients, gradients)
+    K = with_noise(C, n, parameters, jitter, sample_noise)
+    L = cholesky(K, lower=True, overwrite_a=True)
     alpha = cho_solve((L, True), targets)
     value = (
         -0.5 * targets @ alpha - np.log(np.diag(L)).sum() - 0.5 * targets.size * np.log(2.0 * np.pi)
     )
     W = np.outer(alpha, alpha) - symmetric_inverse(L)
 
-    z = separations(X, X, lengths)
-    phi = radial(kernel, np.einsum("jab,jab->ab", z, z), 3 if gradients else 1)
     # K depends on log l_m in two ways. Through s, ds/dlog l_m = -2 z_m², which
     # shifts every φ to its derivative; and through the factors 1/l of the gradient
     # rows and columns, z_i/l_i going as l_i^-2 but the δ_ij term as l_i^-2 in all.
@@ -90,8 +96,8 @@ def log_likelihood(
     components = targets.size // n
     S = (W * shifted).reshape(components, n, components, n).sum(axis=(0, 2))
     slope = np.empty(d + 3)
-    slope[:d] = -np.einsum("jab,jab,ab->j", z, z, S)
-    WK = W * blocks(z, phi, lengths, gradients, gradients)
+    slope[:d] = -np.tensordot(squares, S, axes=2)
+    WK = W * C
     WK[np.diag_indices_from(WK)] *= 1.0 + jitter
     if gradients:
         # The jitter sits on the diagonal, where z = 0 and only the δ_ij term acts.
@@ -112,3 +118,35 @@ def symmetric_inverse(L: Array) -> Array:
     inverse, _ = dpotri(L, lower=1)
     lower = np.tril(inverse)
     return lower + np.tril(inverse, -1).T
+
+
+def maximised(
+    likelihood: Callable[[Array], tuple[float, Array]],
+    starts: Sequence[Array],
+    bounds: Sequence[tuple[float, float]],
+    iterations: int = 15_000,
+) -> tuple[float, Array]:
+    """Return the largest log likelihood and its positive parameters (k,), by L-BFGS-B.
+
+    `likelihood` gives it at parameters, with its slope (k,) in their logarithms, or raises
+    LinAlgError; it is SINGULAR where it does so everywhere. `starts` are clipped to the bounds.
+    """
+    from scipy.optimize import minimize  # slow to import, and only fitting needs it
+
+    def negative(theta: Array) -> tuple[float, Array]:
+        try:
+            value, slope = likelihood(np.exp(theta))
+        except LinAlgError:
+            return -SINGULAR, np.zeros_like(theta)
+        return -value, -slope
+
+    limits = np.log(bounds)
+    ends = [
+        minimize(
+            negative, np.clip(np.log(start), *limits.T), jac=True, bounds=limits,
+            method="L-BFGS-B", options={"maxiter": iterations},
+        )
+        for start in starts
+    ]  # fmt: skip
+    best = min(ends, key=lambda end: float(end.fun))
+    return -float(best.fun), np.exp(best.x)

@@ -20,6 +20,7 @@ from surrogates.likelihood import (
     NOISE_BOUNDS,
     SIGNAL_BOUNDS,
     log_likelihood,
+    maximised,
 )
 from surrogates.profile_likelihood import polished
 from surrogates.samples import Samples
@@ -179,65 +180,37 @@ def _by_joint_likelihood(
     starts: int,
 ) -> Hyperparameters:
     """Maximise the joint likelihood of values and gradients with L-BFGS-B."""
-    from scipy.linalg import LinAlgError
-    from scipy.optimize import minimize
-
     n, d = X.shape
-    bounds = np.log([LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS])
-    for noise in fixed:
-        known = NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2
-        bounds = np.vstack([bounds, np.log(known)])
+    bounds = [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS]
+    bounds += [NOISE_BOUNDS if noise is None else (max(noise, 1e-300),) * 2 for noise in fixed]
     order = rng.permutation(n)
     by_component = targets.reshape(1 + d, n)
 
-    def search(theta0: Array, limit: int, iterations: int) -> tuple[float, Array]:
+    def search(starts: list[Array], limit: int, iterations: int) -> Array:
         rows = order[: max(limit // (1 + d), 2)]
         samples, observed = X[rows], by_component[:, rows].ravel()
         own_here = own[rows] if own.size else own
+        return maximised(
+            lambda natural: log_likelihood(
+                kernel, samples, observed, _parameters(natural), SEARCH_JITTER, own_here
+            ),
+            starts,
+            bounds,
+            iterations,
+        )[1]
 
-        def negative(theta: Array) -> tuple[float, Array]:
-            try:
-                value, slope = log_likelihood(
-                    kernel, samples, observed, _parameters(theta, d), SEARCH_JITTER, own_here
-                )
-            except LinAlgError:
-                # A wall: large and flat, so that the line search backs off.
-                return 1e10, np.zeros_like(theta)
-            return -value, -slope
-
-        found = minimize(
-            negative,
-            theta0,
-            jac=True,
-            bounds=bounds,
-            method="L-BFGS-B",
-            options={"maxiter": iterations},
-        )
-        return float(found.fun), found.x
-
-    first = np.log([0.5] * d + [1.0, 1e-6, 1e-6])
-    spread = np.log([4.0] * d + [10.0, 100.0, 100.0])
-    trials = [first + spread * rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 1)]
-    found = [
-        search(np.clip(t, bounds[:, 0], bounds[:, 1]), START_ORDER, 100) for t in [first, *trials]
-    ]
-    theta = min(found, key=lambda pair: pair[0])[1]
+    first = np.array([0.5] * d + [1.0, 1e-6, 1e-6])
+    spread = np.array([4.0] * d + [10.0, 100.0, 100.0])
+    drawn = [first * spread ** rng.uniform(-1.0, 1.0, d + 3) for _ in range(starts - 1)]
+    natural = search([first, *drawn], START_ORDER, 100)
     if n * (1 + d) > START_ORDER:
-        theta = search(theta, POLISH_ORDER, 60)[1]
-    best = _parameters(theta, d)
-    return Hyperparameters(
-        length_scales=best.length_scales,
-        signal_variance=best.signal_variance,
-        noise_variance=best.noise_variance if fixed[0] is None else fixed[0],
-        gradient_noise_variance=best.gradient_noise_variance if fixed[1] is None else fixed[1],
-    )
+        natural = search([natural], POLISH_ORDER, 60)
+    for place, known in enumerate(fixed, d + 1):
+        if known is not None:  # exactly, and 0 too
+            natural[place] = known
+    return _parameters(natural)
 
 
-def _parameters(theta: Array, d: int) -> Hyperparameters:
-    natural = np.exp(theta)
-    return Hyperparameters(
-        length_scales=natural[:d],
-        signal_variance=float(natural[d]),
-        noise_variance=float(natural[d + 1]),
-        gradient_noise_variance=float(natural[d + 2]),
-    )
+def _parameters(natural: Array) -> Hyperparameters:
+    *_, signal, noise, gradient_noise = map(float, natural)
+    return Hyperparameters(natural[:-3], signal, noise, gradient_noise)

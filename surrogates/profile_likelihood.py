@@ -9,11 +9,17 @@ section 3.3.2; Jones, Schonlau & Welch, J. Global Optim. 13 (1998), eq. 4 to 6.
 """
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky
+from scipy.linalg import cho_solve, cholesky
 
 from surrogates.covariance import Hyperparameters, Kernel, radial, separations
 from surrogates.interface import Array
-from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS, symmetric_inverse
+from surrogates.likelihood import (
+    LENGTH_BOUNDS,
+    SIGNAL_BOUNDS,
+    SINGULAR,
+    maximised,
+    symmetric_inverse,
+)
 
 # On the diagonal of C, so that no trial point is lost to rounding.
 JITTER = 1e-13
@@ -28,36 +34,26 @@ def polished(kernel: Kernel, X: Array, targets: Array, found: Hyperparameters) -
     covariance is singular everywhere.
     """
     d = X.shape[1]
-
-    def negative(theta: Array) -> tuple[float, Array]:
-        try:
-            return _negative(kernel, X, targets, np.exp(theta))
-        except LinAlgError:
-            # A wall: large and flat, so that the line search backs off.
-            return 1e10, np.zeros(d)
-
-    from scipy.optimize import minimize  # slow to import, and only fitting needs it
-
-    limits = [tuple(np.log(LENGTH_BOUNDS))] * d
     starts = [found.length_scales, *(np.full(d, value) for value in STARTS)]
-    ends = [
-        minimize(negative, np.log(start), jac=True, bounds=limits, method="L-BFGS-B")
-        for start in starts
-    ]
-    best = min(ends, key=lambda end: float(end.fun))
-    if best.fun >= 1e10:
+    best, lengths = maximised(
+        lambda lengths: profile_likelihood(kernel, X, targets, lengths),
+        starts,
+        [LENGTH_BOUNDS] * d,
+    )
+    if best <= SINGULAR:
         return found
-    lengths = np.exp(best.x)
     variance = _solved(kernel, X, targets, lengths)[-1]
     return Hyperparameters(lengths, float(np.clip(variance, *SIGNAL_BOUNDS)), 0.0)
 
 
-def _negative(kernel: Kernel, X: Array, t: Array, lengths: Array) -> tuple[float, Array]:
-    """n/2 log σ² + ½ log det C, and its gradient in log lengths."""
+def profile_likelihood(
+    kernel: Kernel, X: Array, t: Array, lengths: Array
+) -> tuple[float, Array]:
+    """-n/2 log σ² - ½ log det C, and its gradient in log lengths. Raises LinAlgError."""
     z, phi, L, alpha, variance = _solved(kernel, X, t, lengths)
-    value = 0.5 * t.size * np.log(variance) + np.log(np.diag(L)).sum()
-    W = (np.outer(alpha, alpha) / variance - symmetric_inverse(L)) * phi[1]
-    return float(value), np.einsum("jab,jab,ab->j", z, z, W)
+    value = -0.5 * t.size * np.log(variance) - np.log(np.diag(L)).sum()
+    W = (symmetric_inverse(L) - np.outer(alpha, alpha) / variance) * phi[1]
+    return float(value), np.tensordot(z * z, W, axes=2)
 
 
 def _solved(

@@ -5,20 +5,17 @@ cost more than a whole solve, and differ by little); bands against residuals; ki
 and whether a point of interest lies where the samples are.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky
-from scipy.optimize import minimize
 
-from surrogates.covariance import Kernel, radial, separations
+from surrogates.covariance import Family, Hyperparameters, Kernel, Rough
 from surrogates.extrapolation import extrapolation
 from surrogates.gaussian_process import TWO_SIDED_95, GaussianProcess, conditioned, loo_errors
 from surrogates.interface import Array, Errors
-from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS, symmetric_inverse
+from surrogates.likelihood import LENGTH_BOUNDS, SIGNAL_BOUNDS, log_likelihood, maximised
 from surrogates.samples import Samples
 from surrogates.validation import errors, held_out
 
@@ -41,35 +38,11 @@ SHARE = 1e-3
 NEAR = 0.05  # share of the box: samples this close to the point of interest are around it
 
 
-# s = r² (n, n) to φ(s) and φ'(s), of which ν = 1/2 has none at 0, where only s φ' counts.
-Shape = Callable[[Array], tuple[Array, Array]]
-
-
-def _matern12(s: Array) -> tuple[Array, Array]:
-    r = np.sqrt(s)
-    e = np.exp(-r)
-    return e, -0.5 * np.divide(e, r, out=np.zeros_like(r), where=r > 0.0)
-
-
-def _matern32(s: Array) -> tuple[Array, Array]:
-    r = np.sqrt(3.0 * s)
-    e = np.exp(-r)
-    return (1.0 + r) * e, -1.5 * e
-
-
-def _covariance(kernel: Kernel) -> Shape:
-    def shape(s: Array) -> tuple[Array, Array]:
-        phi, slope = radial(kernel, s, 1)
-        return phi, slope
-
-    return shape
-
-
-MATERN: dict[str, Shape] = {
-    "1/2": _matern12,
-    "3/2": _matern32,
-    "5/2": _covariance(Kernel.MATERN52),
-    "inf": _covariance(Kernel.RBF),
+MATERN: dict[str, Family] = {
+    "1/2": Rough.MATERN12,
+    "3/2": Rough.MATERN32,
+    "5/2": Kernel.MATERN52,
+    "inf": Kernel.RBF,
 }
 
 
@@ -273,46 +246,18 @@ def smoothness_likelihoods(X: Array, values: Array, seed: int) -> dict[str, floa
     """
     n, d = X.shape
     rows = np.random.default_rng(seed).permutation(n)[:ROUGHNESS_ORDER]
-    squares = separations(X[rows], X[rows], np.ones(d)) ** 2
-    limits = np.log([LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS])
+    starts = [np.array([0.5] * d + [1.0]), np.array([5.0] * d + [100.0])]
     found = {}
-    for name, shape in MATERN.items():
+    for name, family in MATERN.items():
 
-        def negative(theta: Array, shape: Shape = shape) -> tuple[float, Array]:
-            try:
-                value, slope = _value_likelihood(shape, squares, values[rows], np.exp(theta))
-            except LinAlgError:
-                # A wall: large and flat, so that the line search backs off.
-                return 1e10, np.zeros_like(theta)
-            return -value, -slope
+        def at(natural: Array, family: Family = family) -> tuple[float, Array]:
+            parameters = Hyperparameters(natural[:d], float(natural[d]), NUGGET)
+            value, slope = log_likelihood(family, X[rows], values[rows], parameters)
+            return value, slope[: d + 1]
 
-        ends = (
-            minimize(negative, np.log(start), jac=True, bounds=limits, method="L-BFGS-B")
-            for start in ([0.5] * d + [1.0], [5.0] * d + [100.0])
-        )
-        found[name] = -min(float(end.fun) for end in ends)
+        found[name] = maximised(at, starts, [LENGTH_BOUNDS] * d + [SIGNAL_BOUNDS])[0]
     best = max(found.values())
     return {name: value - best for name, value in found.items()}
-
-
-def _value_likelihood(
-    shape: Shape, squares: Array, t: Array, parameters: Array
-) -> tuple[float, Array]:
-    """As `likelihood.log_likelihood`, of values (n,), any ν and parameters (l_1 ... l_d, σ²).
-
-    squares (d, n, n): (a_j - b_j)².
-    """
-    *lengths, variance = parameters
-    z2 = squares / np.square(lengths)[:, None, None]
-    phi, slope = shape(z2.sum(axis=0))
-    K = variance * phi
-    K[np.diag_indices_from(K)] += NUGGET
-    L = cholesky(K, lower=True, overwrite_a=True, check_finite=False)
-    alpha = cho_solve((L, True), t, check_finite=False)
-    value = -0.5 * t @ alpha - np.log(np.diag(L)).sum() - 0.5 * t.size * np.log(2.0 * np.pi)
-    W = variance * (np.outer(alpha, alpha) - symmetric_inverse(L))
-    by_length = -np.tensordot(z2, W * slope, axes=2)
-    return float(value), np.append(by_length, 0.5 * np.vdot(W, phi))
 
 
 def _samples(process: GaussianProcess) -> Samples:

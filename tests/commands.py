@@ -9,11 +9,11 @@ from ccd_casadi.solve import main
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.two_mass import two_mass
 
 def model(theta, least):
     total = theta["m1"] + theta["m2"]
-    return MODELS["two_mass"](theta, 0.01) | {"constraints": {"total": least - total}}
+    return two_mass(theta, 0.01) | {"constraints": {"total": least - total}}
 """
 
 

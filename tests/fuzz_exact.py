@@ -9,9 +9,9 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import RIGID_RATIO, Suspension
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 

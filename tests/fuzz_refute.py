@@ -16,8 +16,8 @@ from helpers import HZ, dense_grid, reference_plant, sensitivity_gain, stack_gai
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values, mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 
 CLOSE = 1e-4  # of a figure against the same from a grid

@@ -20,10 +20,11 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.kernels.design import assess
 from ccd_casadi.kernels.figures import Figure
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, Plant, build_plant, mechanics
-from ccd_casadi.plants.registry import MODELS
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.plants.two_mass import two_mass_plant
 from ccd_casadi.synthesis.synthesis import DesignFigures, figures_from_row
 from ccd_casadi.synthesis.weights import Weights
 
@@ -68,7 +69,7 @@ def problem(**changes: object) -> CoDesignProblem:
 
 @cache
 def two_mass_model() -> Plant:
-    return build_plant(MODELS["two_mass"], ("m1", "m2"), {"zeta": 0.01})
+    return two_mass_plant(("m1", "m2"))
 
 
 def two_mass(m1: float, m2: float, M_K: float = 2e7) -> ScaledPlant:

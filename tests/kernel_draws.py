@@ -7,7 +7,7 @@ from helpers import (
 )
 from hypothesis import strategies as st
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 
 seeds = st.integers(0, 10**6)
 WEIGHTS = PAPER.at(800.0 * HZ, 40.0 * HZ)

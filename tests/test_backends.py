@@ -17,7 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.cross_check import main
-from ccd_casadi.plants.scaling import StateSpace, scale_state_space
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import scale_state_space
 from ccd_casadi.support.optional_packages import MissingPackage
 from ccd_casadi.synthesis.backends.judgement import AGREE, verdicts
 from ccd_casadi.synthesis.backends.mixed import BackendResult, synthesise_with
@@ -29,7 +31,6 @@ from ccd_casadi.synthesis.backends.standard_plant import (
     with_d22,
     without_d22,
 )
-from ccd_casadi.synthesis.norms import hinf_norm
 
 ROOT = Path(__file__).resolve().parents[1]
 

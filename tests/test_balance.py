@@ -18,7 +18,7 @@ from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.riccati import NOISE, lqr_hamiltonian
 from ccd_casadi.kernels.synthesis import synthesise
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 

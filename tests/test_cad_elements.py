@@ -206,3 +206,23 @@ def test_a_morph_is_read_as_written(tmp_path) -> None:
 def test_an_element_inside_out_is_told() -> None:
     with pytest.raises(PlantError, match=r"inside out at length=-0\.3"):
         stretched().morph.points((-0.3, 0.02))
+
+
+@pytest.mark.parametrize("held", [(), ("near",)])
+def test_pictures_show_the_modes_on_a_closed_surface(held: tuple[str, ...]) -> None:
+    stage = stretched(held)
+    shapes = plant_of_stage(stage, ("thickness", "length")).shapes
+    assert shapes is not None
+    found, theta = shapes((0.019, 0.31), 4), (0.31, 0.019)
+    one, two, three = found.points[found.faces[:, :3]].transpose(1, 0, 2)
+    volume = np.einsum("qi,qi->", one, np.cross(two, three)) / 6.0
+    assert volume == pytest.approx(stage.mass(theta) / MATERIAL.density, rel=1e-12)
+    hertz = [mode.frequency for mode in found.modes]
+    np.testing.assert_allclose(hertz, stage.frequencies(theta), rtol=1e-9)
+    read = stage.mechanics(theta, derivatives=False).C[:, -4:]
+    far, near = (np.isclose(found.points[:, 0], x) for x in (found.points[:, 0].max(), 0.0))
+    for i, mode in enumerate(found.modes):
+        size = np.abs(mode.displacement).max()
+        assert (np.abs(mode.displacement[near]).max() == 0.0) == bool(held)
+        ends = mode.displacement[far].mean(axis=0)  # of corners, not over the face
+        assert abs(abs(ends[2]) - abs(read[0, i])) < 0.05 * size

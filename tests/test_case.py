@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from case_documents import DROP, PLANT, TWO_MASS, edited, message
 
@@ -14,7 +15,11 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case, parse_theta
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.plants.registry import BUILDERS, MODELS
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.plants import registry
+from ccd_casadi.plants.plant import Plant, mechanics
+from ccd_casadi.plants.registry import model_named, model_names
+from ccd_casadi.plants.two_mass import two_mass_plant
 from ccd_casadi.support.errors import UserError
 
 
@@ -155,19 +160,18 @@ def test_a_plant_function_that_fails_is_told(plant_folder: Path, function: str, 
 
 def test_what_is_known_of_the_models_is_what_they_take() -> None:
     """A model that reads another θ, or renames an option, would make the checks refuse it."""
-    for name, theta in plant_tables._MODEL_THETA.items():
-        if name in BUILDERS:
-            BUILDERS[name](theta)
-        else:
-            MODELS[name](dict.fromkeys(theta, 60.0))
+    for name in model_names():
+        model = model_named(name)
+        assert model is not None
+        theta = model.theta or ()
+        if theta:
+            model.build(theta)
         for gone in theta:
-            rest = tuple(sorted(set(theta) - {gone}))
             with pytest.raises((KeyError, UserError)):
-                BUILDERS[name](rest) if name in BUILDERS else MODELS[name](
-                    dict.fromkeys(rest, 60.0)
-                )
-    for name, option in plant_tables._MODEL_OPTIONS:
-        assert option in inspect.signature({**MODELS, **BUILDERS}[str(name)]).parameters
+                model.build(tuple(sorted(set(theta) - {gone})))
+        options = {option for known, option in plant_tables._MODEL_OPTIONS if known == name}
+        assert {*options, *model.checks} <= set(inspect.signature(model.build).parameters)
+        assert model.data in {"", *options}
 
 
 @pytest.mark.parametrize(
@@ -206,3 +210,30 @@ def test_wrong_theta_of_the_command_line(text: str, words: str) -> None:
     assert told.startswith(f"{TWO_MASS}: --theta: ")
     assert words in told
     assert told.isprintable()
+
+
+def test_another_package_offers_a_plant_by_its_entry_point(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def build(names: tuple[str, ...], zeta: float = 0.02) -> Plant:
+        return two_mass_plant(names, zeta)
+
+    class Point:
+        name = "pair"
+
+        def load(self) -> object:
+            return build
+
+    monkeypatch.setattr(registry, "_offered", lambda: {"pair": Point()})
+    registry.model_named.cache_clear()
+    try:
+        problem = problem_of(parse_case(edited(("plant", {"model": "pair"})), tmp_path / "x.toml"))
+        theta = problem.start
+        D = mechanics(plant_of(problem), theta).D
+        np.testing.assert_array_equal(D, mechanics(build(problem.names), theta).D)
+        with pytest.raises(CaseError, match="no option of pair"):
+            parse_case(edited(("plant", {"model": "pair", "mass": 1.0})), tmp_path / "x.toml")
+        with pytest.raises(CaseError, match="did you mean pair"):
+            parse_case(edited(("plant", {"model": "pairs"})), tmp_path / "x.toml")
+    finally:
+        registry.model_named.cache_clear()

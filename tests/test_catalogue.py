@@ -19,21 +19,22 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign import sections_run
+from ccd_casadi.codesign import outer_sections
 from ccd_casadi.codesign.catalogue import best_of_lists, restricted
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.outer_sections import SectionsOuter
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.run import solve as solve_problem
 from ccd_casadi.codesign.run_files import write_run
+from ccd_casadi.codesign.search import searched
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.compare import main as compare
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
-from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
@@ -97,7 +98,12 @@ def test_a_built_stage_with_a_fixed_length_is_drawn_and_differentiated() -> None
     part = restricted(whole, {name: (whole.start[1],)})
     kept = [i for i in range(len(whole.names)) if i != 1]
     here = tuple(whole.start[i] for i in kept)
-    assert stage_of(plant_of(part), here) == stage_of(plant_of(whole), whole.start)
+    drawn = [
+        plant.drawing({"": theta})
+        for plant, theta in ((plant_of(part), here), (plant_of(whole), whole.start))
+        if plant.drawing is not None
+    ]
+    assert drawn[0] == drawn[1]
     one, other = mechanics(plant_of(part), here), mechanics(plant_of(whole), whole.start)
     np.testing.assert_array_equal(one.K, other.K)
     np.testing.assert_array_equal(one.derivatives[2], other.derivatives[2][kept])
@@ -395,14 +401,14 @@ def test_what_sections_spend_is_counted_over_all_nodes(
 ) -> None:
     """They were solved on a sampler of their own, and a catalogue said "syntheses": 0."""
 
-    def formulated(sampler: Sampler, *_: object) -> FormulationResult:
-        sampler._spend("a design", 5, (60.0, 60.0), 12.0)
+    def formulated(outer: SectionsOuter, *_: object) -> FormulationResult:
+        outer.sampler._spend("a design", 5, (60.0, 60.0), 12.0)
         return FormulationResult(None, None, (), (), None, False, "nothing is feasible")
 
-    monkeypatch.setattr(sections_run, "_formulated", formulated)
-    monkeypatch.setattr(sections_run, "seeded_and_prepared", lambda _, own, *__: (own, ""))
+    monkeypatch.setattr(SectionsOuter, "formulated", formulated)
+    monkeypatch.setattr(outer_sections, "seeded_and_prepared", lambda _, own, *__: (own, ""))
     own = problem(sections=SectionsProblem())
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
-        found = sections_run.run_sections(sampler.of(own), Direct(), 0)
-        assert sum(found.spent.values()) == sampler.syntheses == 6  # five designs and a race
+        searched(SectionsOuter(sampler.of(own)), Direct(), 0)
+        assert sampler.syntheses == 6  # five designs and a race

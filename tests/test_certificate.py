@@ -23,7 +23,8 @@ from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import weighted_loop
 from ccd_casadi.kernels.design import certificate_grid
 from ccd_casadi.kernels.frequency import prepare
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
@@ -235,7 +236,8 @@ def check_perturbed(seed: int) -> bool:
     K = in_time_unit(design.controller, plant.omega_0)
     size = 10.0 ** rng.uniform(-6.0, -1.0)
     moved = {
-        name: value * (1.0 + size * rng.normal(size=value.shape)) for name, value in vars(K).items()
+        name: X * (1.0 + size * rng.normal(size=X.shape))
+        for name, X in ((name, getattr(K, name)) for name in "ABCD")
     }
     K = in_time_unit(StateSpace(**moved), 1.0 / plant.omega_0)
     real, norm = independent(plant, K, weights)

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ortho_group
 
+from ccd_casadi.case_studies.rib_stage import COARSE, RibStage
 from ccd_casadi.kernels import design, gradients
 from ccd_casadi.plants.channels import find_channels
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant
-from ccd_casadi.plants.rib_stage import COARSE, RibStage
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise

@@ -17,7 +17,8 @@ from helpers import (
 )
 
 from ccd_casadi.kernels.figures import Code, Figure
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks, measure, responses
 from ccd_casadi.synthesis.synthesis import Design, Outcome, figures_from_row, synthesise
 

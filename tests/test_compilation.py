@@ -13,7 +13,7 @@ from numba.core import event
 from ccd_casadi.kernels import compilation
 from ccd_casadi.kernels.gamma import plant_gain
 from ccd_casadi.kernels.synthesis import synthesise as search
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import sensitivities
 from ccd_casadi.synthesis.synthesis import sweep, synthesise

@@ -15,16 +15,15 @@ from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.c_code import COMPILE, c_files, write_c
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.deployment.realisation import Realisation, difference_equation, realise
-from ccd_casadi.deployment.sampled import DiscreteStateSpace
 from ccd_casadi.deployment.sections import Section, sections_of
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 
 HZ = 2.0 * np.pi
 # `make test` needs no compiler on a bare machine; where there is none only this is left out.
 compiled = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 
 
-def random_controller(seed: int, pairs: int, reals: int, inputs: int = 1) -> DiscreteStateSpace:
+def random_controller(seed: int, pairs: int, reals: int, inputs: int = 1) -> StateSpace:
     """Poles close to z = 1, slow and lightly damped ones among them, in mixed coordinates."""
     rng = np.random.default_rng(seed)
     n = 2 * pairs + reals
@@ -38,10 +37,10 @@ def random_controller(seed: int, pairs: int, reals: int, inputs: int = 1) -> Dis
     T = np.linalg.qr(rng.normal(size=(n, n)))[0] * rng.uniform(0.5, 2.0, n) if n else np.eye(0)
     B, C = rng.normal(size=(n, inputs)), 1e6 * rng.normal(size=(inputs, n))
     D = 1e6 * rng.normal(size=(inputs, inputs))
-    return DiscreteStateSpace(np.linalg.solve(T, A @ T) if n else A, B, C, D, 1e-4)
+    return StateSpace(np.linalg.solve(T, A @ T) if n else A, B, C, D, period=1e-4)
 
 
-def of_one_channel(K: DiscreteStateSpace, saturation: float | None = None) -> Realisation:
+def of_one_channel(K: StateSpace, saturation: float | None = None) -> Realisation:
     eye = np.eye(len(K.D))
     channel = Channel("all", eye, eye, None, StateSpace(K.A, K.B, K.C, K.D))  # type: ignore[arg-type]
     return realise([channel], [K], saturation)
@@ -129,8 +128,8 @@ def test_c_equals_python_bit_by_bit(
 def test_the_c_test_notices_a_wrong_number(tmp_path: Path) -> None:
     found = of_one_channel(random_controller(5, 1, 1))
     program = build(tmp_path, found)
-    other = DiscreteStateSpace(
-        found.system.A, found.system.B, found.system.C, found.system.D * (1 + 1e-10), 1e-4
+    other = StateSpace(
+        found.system.A, found.system.B, found.system.C, found.system.D * (1 + 1e-10), period=1e-4
     )
     files = c_files(Realisation(other, found.blocks), title="x", delay=1e-4, verified=True)
     (tmp_path / "controller.c").write_text(files["controller.c"])

@@ -11,7 +11,6 @@ from scipy.linalg import expm
 
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     SampledFigures,
     sampled_figures,
     sampled_plant,
@@ -20,7 +19,7 @@ from ccd_casadi.deployment.sampled import (
 )
 from ccd_casadi.deployment.simulation import measure_sensitivity, simulate
 from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 
 HZ = 2.0 * np.pi
 
@@ -43,7 +42,7 @@ def lead(channels: int = 1) -> StateSpace:
     return StateSpace(*(np.kron(eye, part) for part in (A, B, C, [[0.0]])))
 
 
-def loop(period: float, delay: float, channels: int = 1) -> DiscreteStateSpace:
+def loop(period: float, delay: float, channels: int = 1) -> StateSpace:
     K = discretise(lead(channels), Conversion(Discretisation.RAMP, True, HZ), period, delay)
     return sensitivity_loop(sampled_plant(stage(channels), period, delay), K)
 
@@ -129,10 +128,10 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     S1 = sensitivity_loop(sampled_plant(stage(), period, delay), K)
     S2 = sensitivity_loop(sampled_plant(stage(), period, 2.0 * delay), slow)
     zero = np.zeros((len(S1.A), len(S2.A)))
-    whole = sampled_figures(DiscreteStateSpace(
+    whole = sampled_figures(StateSpace(
         np.block([[S1.A, zero], [zero.T, S2.A]]),
         np.block([[S1.B, 0 * S1.B], [0 * S2.B, S2.B]]),
-        np.block([[S1.C, 0 * S2.C], [0 * S1.C, S2.C]]), np.eye(2), period,
+        np.block([[S1.C, 0 * S2.C], [0 * S1.C, S2.C]]), np.eye(2), period=period,
     ))  # fmt: skip
     assert both.sensitivity_peak == pytest.approx(whole.sensitivity_peak, rel=1e-8)
     assert both.bandwidth == pytest.approx(whole.bandwidth, rel=1e-9)

@@ -20,11 +20,12 @@ from ccd_casadi.kernels.disturbance import filter_solution, innovations_plant
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.lapack import stable_subspace
 from ccd_casadi.kernels.riccati import level_hamiltonian, lqr_hamiltonian
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
+from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
 from ccd_casadi.synthesis.derivatives import sensitivities
-from ccd_casadi.synthesis.norms import hinf_norm
 from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights

@@ -21,12 +21,13 @@ from ccd_casadi.budget import (
 from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.budget.evaluation import variances
 from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
-from ccd_casadi.budget.holding import Hold, noise_of_a_period
+from ccd_casadi.budget.holding import noise_of_a_period
 from ccd_casadi.budget.loops import Process, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space, state_spaces
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import parts
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 WINDOW = 0.02
@@ -60,7 +61,7 @@ def built(
     problem, kappa = loop(seed, structure, sampling)
     P = problem.plants
     kappa = structure.in_units(kappa, P.omega_0, P.force)
-    hold = None if sampling is None else Hold(sampling.period, sampling.delay)
+    hold = sampling
     return Loop(plant().plant_si(), state_space(structure, kappa), hold), structure, kappa
 
 
@@ -141,7 +142,7 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
     made, _, _ = built(sampling)
     assert made.hold is not None
     T, steps = sampling.period, 20
-    whole, rest = made.hold.parts
+    whole, rest = parts(T, made.hold.delay)
     for source in (SHAPED[0], SHAPED[1]):
         model = process(made.G, made.K, source, made.hold)
         moved = model.A + np.eye(len(model.A))

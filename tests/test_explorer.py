@@ -19,10 +19,10 @@ from ccd_casadi.explorer.landscape import field_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import end_words, move_words, standing_html, survival_words
+from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.machine import lumped, lumped_svg, machine_html
 from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.synthesis import Outcome
 
@@ -115,7 +115,7 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     assert abs(c.step[-1] - 1.0) < 0.05
     assert c.move.feedforward
     assert (
-        np.abs(c.move.error[c.move.time > 1.5 * c.move.end]).max()
+        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
         < 1e-2 * np.abs(c.move.error).max()
     )
 

@@ -29,9 +29,10 @@ from ccd_casadi.fixed_structure.structure import response, state_space
 from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, scale_state_space
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant, scale_state_space
 from ccd_casadi.synthesis.closed_loop import measure, responses
 
 # One notch and a first-order roll-off are quick to find and have every kind of bound.

@@ -34,9 +34,9 @@ from ccd_casadi.fixed_structure.structure import (
     state_space,
 )
 from ccd_casadi.kernels import sections
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.synthesis.norms import hinf_norm
 
 STRUCTURES = [
     Structure(),

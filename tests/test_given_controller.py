@@ -8,7 +8,7 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deployment.given_controller import read_controller, with_controller
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses

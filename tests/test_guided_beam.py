@@ -11,14 +11,14 @@ from scipy.signal import tf2ss
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_direct import polish_sections
-from ccd_casadi.codesign.sections_insight import sections_responses
 from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, prepared, sections_value
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hard_plants import HARD, regularised
 
+from ccd_casadi.lti.norms import gains
 from ccd_casadi.support.deadline import Runner
 from ccd_casadi.synthesis.backends import lmi, slicot
 from ccd_casadi.synthesis.backends.standard_plant import close
-from ccd_casadi.synthesis.norms import gains
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")

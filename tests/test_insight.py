@@ -12,6 +12,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.direct import polish
+from ccd_casadi.codesign.front_learners import LiftedLearner
 from ccd_casadi.codesign.pareto import Front, pareto_front
 from ccd_casadi.codesign.post_optimal import post_optimal
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
@@ -24,11 +25,11 @@ from ccd_casadi.support.process_pool import Workers
 
 TWO_MASS = Path(__file__).parent.parent / "runs" / "two_mass.toml"
 PLANT = """
-from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.two_mass import two_mass
 
 def model(theta):
     bowl = (theta["m1"] - 58.0) ** 2 + (theta["m2"] - 59.0) ** 2
-    return MODELS["two_mass"](theta, 0.01) | {"hardware_cost": COST}
+    return two_mass(theta, 0.01) | {"hardware_cost": COST}
 """
 
 
@@ -99,7 +100,7 @@ def _objective(problem: CoDesignProblem, x: Array) -> float:
 def front(tmp_path_factory: pytest.TempPathFactory) -> Front:
     problem = problem_of(load_case(TWO_MASS))
     with SampleStore(tmp_path_factory.mktemp("front") / "samples.sqlite") as store:
-        return pareto_front(Sampler(problem, store, Workers(1)), points=4)
+        return pareto_front(LiftedLearner(Sampler(problem, store, Workers(1))), points=4)
 
 
 def test_front_is_verified_and_spans_the_costs(front: Front) -> None:
@@ -132,7 +133,7 @@ def test_a_constant_cost_leaves_nothing_to_trade(
 ) -> None:
     problem = own_problem(tmp_path, "7.0")
     with pytest.raises(UserError, match="hardware_cost is the same"):
-        pareto_front(truth_of(problem), points=3)
+        pareto_front(LiftedLearner(truth_of(problem)), points=3)
 
 
 def test_command_writes_numbers_and_a_page(two_mass_run: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import scipy.io
 from helpers import FlexibleCase, flexible_case
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import (

@@ -25,8 +25,8 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.sampling import sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers

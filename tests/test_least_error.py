@@ -9,7 +9,6 @@ from case_documents import TWO_MASS
 from fixed_structure_loops import BOUNDS, FAST, loop, plant
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
-from ccd_casadi.budget.holding import Hold
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, synthesise_sections
@@ -28,7 +27,7 @@ def test_the_error_of_a_set_has_its_gradient() -> None:
     plants = [plant(-0.01), plant(0.02)]
     problem, kappa = loop(3, PID, FAST, (-0.01, 0.02))
     kappa = PID.in_units(kappa, problem.plants.omega_0, problem.plants.force)
-    hold = Hold(FAST.period, FAST.delay)
+    hold = FAST
     goal = RmsError(tuple(p.plant_si() for p in plants), PID, BUDGET, hold)
     value, slope = goal.at(kappa)
     each = [RmsError((one,), PID, BUDGET, hold).at(kappa)[0] for one in goal.plants]
@@ -56,7 +55,7 @@ def test_the_least_error_keeps_bounds_and_bandwidth_and_is_stationary() -> None:
     assert again.passed
     assert design.kkt_residual < 1e-4
     goal = RmsError(tuple(p.plant_si() for p in plants), PID, BUDGET,
-                    Hold(FAST.period, FAST.delay))  # fmt: skip
+                    FAST)  # fmt: skip
     assert np.exp(goal.at(design.kappa)[0]) == pytest.approx(found.error)
     # What may be slower need not err more.
     slower = least_error(plants, KEPT, first, BUDGET, sampling=FAST, least_bandwidth=0.9 * floor)

@@ -19,7 +19,7 @@ from ccd_casadi.fixed_structure.measured import (
 )
 from ccd_casadi.fixed_structure.measured_design import _OnLines, design_on_data
 from ccd_casadi.fixed_structure.structure import state_space
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 

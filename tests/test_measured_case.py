@@ -15,7 +15,7 @@ from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.fixed_structure.measured import controller_response, judge
 from ccd_casadi.inner import main as inner
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccd_casadi.case_studies.rib_stage import nearby
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, PointMass
+from ccd_casadi.case_studies.rib_stage.mesh import COARSE
+from ccd_casadi.case_studies.rib_stage.model import RibStage
+from ccd_casadi.case_studies.rib_stage.plant import plant_of_stage
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.plant import Mechanics, Plant
-from ccd_casadi.plants.rib_stage import nearby
-from ccd_casadi.plants.rib_stage.geometry import Geometry, PointMass
-from ccd_casadi.plants.rib_stage.mesh import COARSE
-from ccd_casadi.plants.rib_stage.model import RibStage
-from ccd_casadi.plants.rib_stage.plant import plant_of_stage
 from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.support.process_pool import Workers
 

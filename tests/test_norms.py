@@ -7,8 +7,8 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.synthesis.norms import gains, hinf_norm
+from ccd_casadi.lti.norms import gains, hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 
 
 def space(A: object, B: object, C: object, D: object) -> StateSpace:

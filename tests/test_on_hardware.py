@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from structured_text import run as run_text
 from test_deploy_code import of_one_channel, random_controller
 
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.setpoint import Limits, setpoint
 from ccd_casadi.deployment.anti_windup import back_calculation, limited, takeover
 from ccd_casadi.deployment.c_code import vectors
 from ccd_casadi.deployment.feedforward import feedforward
-from ccd_casadi.deployment.move import PARTS, Hardware, SampledMove, move
+from ccd_casadi.deployment.move import PARTS, Hardware, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
-from ccd_casadi.deployment.sampled import DiscreteStateSpace, sampled_plant
+from ccd_casadi.deployment.sampled import sampled_plant
 from ccd_casadi.deployment.simulation import simulate
 from ccd_casadi.deployment.structured_text import structured_text
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.robust.demands import Limits
-from ccd_casadi.robust.setpoint import setpoint
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 
 PERIOD = DELAY = 1e-4
@@ -57,7 +57,7 @@ def pid() -> Realisation:
     for zeros, poles in factors:
         K = K * control.ss(control.tf(zeros, poles))
     found = K.sample(PERIOD, "tustin")
-    return of_one_channel(DiscreteStateSpace(found.A, found.B, found.C, found.D, PERIOD))
+    return of_one_channel(StateSpace(found.A, found.B, found.C, found.D, period=PERIOD))
 
 
 def test_the_setpoint_at_any_time_is_its_own_integral() -> None:
@@ -141,7 +141,7 @@ def test_an_integrator_takes_over_for_good() -> None:
     np.testing.assert_allclose(u, 7.0, rtol=1e-9)
 
 
-def made(K: Realisation, **also: object) -> SampledMove:
+def made(K: Realisation, **also: object) -> Move:
     return move(stage(), K, DELAY, PROFILE, **also)  # type: ignore[arg-type]
 
 
@@ -164,14 +164,14 @@ def test_a_limited_move_ends_as_fast_and_without_a_cycle() -> None:
     held = made(limited(clipped, CROSSOVER))
     assert held.saturated > 0.05
     assert held.settled <= 1.2 * free.settled
-    assert held.restless < 1e-7  # of a window of 1e-6
+    assert held.last_error(0.25) < 1e-7  # of a window of 1e-6
     assert held.settled <= made(clipped).settled
     assert np.abs(held.force).max() <= limit
 
 
 def test_steps_of_sensor_and_force_bound_what_is_left() -> None:
     found = made(pid(), hardware=Hardware(sensor_step=1e-8, force_step=1e-3))
-    assert 0.0 < found.restless < 1e-7
+    assert 0.0 < found.last_error(0.25) < 1e-7
     np.testing.assert_allclose(found.force / 1e-3, np.round(found.force / 1e-3), atol=1e-6)
 
 

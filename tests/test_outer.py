@@ -28,11 +28,11 @@ from ccd_casadi.studies.sequential import design_hardware, first_resonance
 W1, W2 = 0.0995, -0.9950
 LOWER, UPPER = np.array([55.0, 55.0]), np.array([70.0, 70.0])
 CONSTRAINED = """
-from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.two_mass import two_mass
 
 def model(theta, least):
     light = {"total": least - theta["m1"] - theta["m2"], "never": theta["m1"] - 1000.0}
-    return MODELS["two_mass"](theta, 0.01) | {"constraints": light}
+    return two_mass(theta, 0.01) | {"constraints": light}
 """
 
 

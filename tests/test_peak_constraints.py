@@ -14,8 +14,8 @@ from ccd_casadi.codesign import peak_constraints
 from ccd_casadi.codesign.box_look import look_over_box
 from ccd_casadi.codesign.direct import true_objective as objective
 from ccd_casadi.codesign.kinked import descend
+from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
-from ccd_casadi.codesign.verify import verify
 from ccd_casadi.inner_problem import true_function
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.robust_set import RobustSet
@@ -112,7 +112,9 @@ def test_a_verification_synthesises_every_design_once(
     monkeypatch.setattr(true_function, "true_design", counted)
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(problem(), store, Workers(1))
-        verified = verify(sampler, at((62.0, 64.0, 500.0, 45.0)))
-        look_over_box(sampler, verified.x, verified.objective, 4, 0)
+        outer = MixedOuter(sampler)
+        end = outer.ended(at((62.0, 64.0, 500.0, 45.0)))
+        look_over_box(outer, end, 4, 0)
+        verified = outer.verified(end, 1)
     assert verified.feasible
     assert len(set(asked)) == len(asked)

@@ -23,9 +23,10 @@ from helpers import (
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, build_plant, mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant, transmission_zeros
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.errors import PlantError
 
 GRID = np.geomspace(0.05, 1000.0, 200) * HZ
@@ -126,7 +127,7 @@ def test_the_grid_has_nine_points_about_each_root(damping_ratio: float) -> None:
     system = masses_on_springs(20.0, 70.0, 300.0, outputs=np.ones((1, 3)))
     plant = scaled(replace(system, damping_ratio=damping_ratio), 1e5)
     poles = np.linalg.eigvals(plant.A)
-    roots = np.concatenate([poles, transmission_zeros(plant.A, plant.B, plant.C)])
+    roots = np.concatenate([poles, plant.system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) < 1e5)]
     assert len(roots) > len(poles) / 2
     for root in roots:

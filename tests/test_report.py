@@ -23,7 +23,7 @@ from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import figure_bode
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from benchmark_scripts import FOLDER, benchmark
 
+from ccd_casadi.case_studies.rib_stage import NAMES
+from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
@@ -17,8 +19,6 @@ from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
-from ccd_casadi.plants.rib_stage import NAMES
-from ccd_casadi.plants.rib_stage.plant import rib_stage
 from ccd_casadi.support.errors import UserError
 
 built = benchmark("rib_stage_built")

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from ccd_casadi.case_studies.rib_stage import COARSE, NAMES, Geometry, PointMass, RibStage
+from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
 from ccd_casadi.plants.modal import Suspension, modal_plant
-from ccd_casadi.plants.rib_stage import COARSE, NAMES, Geometry, PointMass, RibStage
-from ccd_casadi.plants.rib_stage.mesh import MeshOrder
 
 MIDDLE = tuple(1e-3 * np.array([2.0, 5.0, 5.5, 4.0, 12.0, 80.0]))
 B = tuple(1e-3 * np.array([1.0, 3.0, 4.2446, 4.0588, 11.917, 74.974]))

@@ -14,9 +14,11 @@ from helpers import HZ, SUSPENSION, random_plant, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace, scale_plant
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.reporting.robustness_page import _bandwidth_lost, conclusion, robustness_html
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import tolerances
@@ -28,7 +30,7 @@ from ccd_casadi.robust.perturbed import (
     system_of,
     worst_in_box,
 )
-from ccd_casadi.robust.signals import closed_loop, gains, noise
+from ccd_casadi.robust.signals import gains, noise
 from ccd_casadi.robust.structured import structured_bound
 from ccd_casadi.robust.study import study_dict, tried, with_structured_bound
 from ccd_casadi.robustness import main

@@ -28,10 +28,10 @@ ROOT = Path(__file__).parent.parent
 TRAP = """
 import pathlib
 (pathlib.Path(__file__).parent / "executed").touch()
-from ccd_casadi.plants.registry import MODELS
+from ccd_casadi.plants.two_mass import two_mass
 
 def f(theta, **options):
-    return MODELS["two_mass"](theta, 0.01)
+    return two_mass(theta, 0.01)
 """
 
 

@@ -23,9 +23,10 @@ from hypothesis import strategies as st
 from scipy.linalg import matrix_balance
 from scipy.optimize import brentq
 
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_plant
+from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.synthesis.synthesis import Outcome, synthesise
 from ccd_casadi.synthesis.weights import Weights
 

@@ -10,16 +10,16 @@ from helpers import few, random_plant
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.move import mass_feedforward, simulate
+from ccd_casadi.analysis.setpoint import Limits, Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace, scale_state_space
-from ccd_casadi.robust.demands import Limits
-from ccd_casadi.robust.move import mass_feedforward, simulate, simulate_sampled
-from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import closed_loop
+from ccd_casadi.plants.scaling import scale_state_space
 
 # ---- the setpoint -------------------------------------------------------------------------------
 
@@ -111,7 +111,7 @@ def rigid_loop(mass: float, gain: float, zeta: float) -> tuple[StateSpace, State
 
 def test_a_mass_driven_by_its_own_feedforward_has_no_error() -> None:
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
-    loop = closed_loop(plant, controller)
+    loop = Loop(plant, controller)
     profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
     move = simulate(loop, profile, axis=0, forces=np.array([3.0]), window=1e-9, bandwidth_hz=15.0)
     assert move.peak_error < 1e-13
@@ -123,7 +123,7 @@ def test_a_mass_driven_by_its_own_feedforward_has_no_error() -> None:
 def test_a_move_against_python_control() -> None:
     """forced_response on a fine grid, the setpoint held linear between its points."""
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
-    loop = closed_loop(plant, controller)
+    loop = Loop(plant, controller)
     profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
     move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
     dense = np.linspace(0.0, 0.36, 20001)
@@ -131,7 +131,7 @@ def test_a_move_against_python_control() -> None:
     r = np.interp(dense, times, states[:, 0])
     fine = np.interp(dense, move.time, move.position)  # of the same setpoint, closer points
     assert r == pytest.approx(fine, abs=3e-6)
-    system = control.ss(loop.A, loop.B_r, -loop.C_y, np.ones((1, 1)))
+    system = control.ss(loop.closed.A, loop.closed.B_r, -loop.closed.C_y, np.ones((1, 1)))
     error = control.forced_response(system, dense, fine).outputs
     assert np.interp(dense, move.time, move.error) == pytest.approx(error, abs=2e-7)
     inside = np.abs(move.error) <= 1e-7
@@ -144,15 +144,15 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
     """The difference, of hold and delay alone, halves with the period."""
     plant, controller = rigid_loop(3.0, 3e4, 0.7)
     profile = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
-    loop = closed_loop(plant, controller)
+    loop = Loop(plant, controller)
     move = simulate(loop, profile, axis=0, forces=None, window=1e-7, bandwidth_hz=15.0)
     apart = []
     for rate in (4e3, 8e3):
         period = 1.0 / rate
         tustin = Conversion(Discretisation.TUSTIN, False, 100.0)
         K = Sampled(discretise(controller, tustin, period, 0.5 * period), 0.5 * period)
-        found = simulate_sampled(K, scale_state_space(plant, 1e5), profile, axis=0, forces=None,
-                                 window=1e-7, bandwidth_hz=15.0)  # fmt: skip
+        found = simulate(K.loop(scale_state_space(plant, 1e5)), profile, axis=0, forces=None,
+                         window=1e-7, bandwidth_hz=15.0)  # fmt: skip
         there = np.interp(found.time, move.time, move.error)[found.time <= move.duration]
         apart.append(np.abs(found.error[: len(there)] - there).max() / move.peak_error)
     assert apart[0] < 0.05

@@ -24,8 +24,8 @@ from helpers import (
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.inner import main as inner
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main
 from surrogates import load

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -11,29 +12,19 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from ccd_casadi.plants.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shape
-from ccd_casadi.plants.rib_stage.geometry import LOWER, UPPER, mass
+from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
+from ccd_casadi.case_studies.rib_stage.drawing import TALLER, draw_stages, drawing
+from ccd_casadi.case_studies.rib_stage.geometry import LOWER, UPPER, mass
+from ccd_casadi.plants.pictures import ModeShape, ModeShapes
+from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
 from ccd_casadi.reporting.page import Section, page
-from ccd_casadi.reporting.stage_drawing import TALLER, draw_stages
-from ccd_casadi.reporting.stage_pictures import (
-    corner_motion,
-    dimensions_figure,
-    first_modes,
-    mode_shape_figure,
-    surface_of,
-    table_dimensions,
-    table_modes,
-)
 from ccd_casadi.reporting.turntable import (
     HEIGHT,
     MARGIN,
     REACH,
     WIDTH,
-    Picture,
-    Surface,
     box_scale,
     camera,
-    coarse_surface,
     colours,
     data,
     still,
@@ -48,16 +39,16 @@ HOSTILE = '</text><script>alert(1)</script>"&'
 
 @cache
 def modes_figure() -> str:
-    return mode_shape_figure(STAGE, A, count=6)
+    return mode_shape_figure(mode_shapes(STAGE, A))
 
 
 def svgs(html: str) -> list[ElementTree.Element]:
     return [ElementTree.fromstring(t) for t in re.findall(r"<svg.*?</svg>", html, re.DOTALL)]
 
 
-def volume(surface: Surface) -> float:
+def volume(surface: ModeShapes) -> float:
     """By the divergence theorem, of flat quads."""
-    a, b, c, d = surface.points[surface.quads].transpose(1, 0, 2)
+    a, b, c, d = surface.points[surface.faces].transpose(1, 0, 2)
     return float(np.einsum("ij,ij->", (a + c) / 2.0, np.cross(c - a, d - b)) / 6.0)
 
 
@@ -72,50 +63,18 @@ def assert_closed(quads: Array) -> None:
 
 
 @pytest.mark.parametrize("theta", [A, B, UPPER], ids=["a", "b", "thick"])
-def test_coarse_surface_is_closed_and_encloses_the_material(theta) -> None:
-    shape = mode_shape(STAGE, theta, 0)
-    surface = surface_of(STAGE, theta, shape)
-    assert_closed(surface.quads)
+def test_the_surface_is_closed_and_encloses_the_material(theta) -> None:
+    surface = mode_shapes(STAGE, theta, 1)
+    assert_closed(surface.faces)
     expected = mass(STAGE.geometry, theta) / STAGE.geometry.material.density
     assert volume(surface) == pytest.approx(expected, rel=1e-12)
-    assert surface.points == pytest.approx(shape.points[surface.source], abs=0.0)
-    assert len(surface.quads) < len(shape.quads)
 
 
-def test_coarse_surface_counts_its_quads() -> None:
-    surface = surface_of(STAGE, A, mode_shape(STAGE, A, 0))
+def test_the_surface_counts_its_faces() -> None:
     rib, bay = 1, 4  # cells a rib and a bay along an axis; the centre rib is two halves
     across = 6 * rib + 4 * bay
     below, walls, edge = across**2, 16 * 4 * bay, 4 * across * 2
-    assert len(surface.quads) == 2 * below + walls + edge == 1400
-
-
-def test_lines_between_points_merge_a_box_to_its_six_faces() -> None:
-    one = np.array([0.0, 0.5, 1.0])
-    points = np.array([(x, y, z) for x in one for y in one for z in one])
-    fine = coarse_surface(points, box_quads(points), (one, one, one))
-    assert_closed(fine.quads)
-    assert (len(fine.points), len(fine.quads)) == (26, 24)
-    ends = np.array([0.0, 1.0 + 1e-15])  # as other sums of the same lengths give it
-    coarse = coarse_surface(points, box_quads(points), (ends, ends, ends))
-    assert (len(coarse.points), len(coarse.quads)) == (8, 6)
-    assert volume(coarse) == pytest.approx(1.0)
-    assert_closed(coarse.quads)
-
-
-def box_quads(points: Array) -> Array:
-    """The 24 quads of a 2 x 2 x 2 grid of the unit cube's surface, wound from outside."""
-    index = {tuple(p): i for i, p in enumerate(points.tolist())}
-    quads = []
-    for axis in range(3):
-        u, v = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-        for i in (0.0, 0.5):
-            for j in (0.0, 0.5):
-                square = [i * u + j * v, (i + 0.5) * u + j * v]
-                square += [(i + 0.5) * u + (j + 0.5) * v, i * u + (j + 0.5) * v]
-                upper = [index[tuple((p + np.eye(3)[axis]).tolist())] for p in square]
-                quads += [upper, [index[tuple(p.tolist())] for p in square[::-1]]]
-    return np.array(quads)
+    assert len(mode_shapes(STAGE, A, 1).faces) == 2 * below + walls + edge == 1400
 
 
 # ---- projection and painting ------------------------------------------------------------------
@@ -152,7 +111,8 @@ def test_still_picture_leaves_out_back_faces_and_paints_near_last() -> None:
     quads = np.array([[4, 5, 6, 7], [0, 1, 2, 3], [0, 3, 2, 1]])  # above, below, below from below
     moves = np.zeros((8, 3))
     moves[:4, 2] = 1.0
-    svg = still(Surface(points, quads, np.arange(8)), Picture(moves, 'a "b" <c>'))
+    mode = ModeShape(moves, 1.0, (1,))
+    svg = still(ModeShapes(points, quads, (mode,)), mode, 'a "b" <c>')
     root = ElementTree.fromstring(svg)
     paths = root.findall(".//path")
     assert root.get("aria-label") == 'a "b" <c>'
@@ -174,29 +134,28 @@ def test_still_picture_leaves_out_back_faces_and_paints_near_last() -> None:
 
 
 def test_modes_have_names_in_words_and_pairs_are_one() -> None:
-    modes = first_modes(STAGE, A, 6)
+    modes = mode_shapes(STAGE, A, 6).modes
     words = ["twist", "saddle x² − y²", "bowl", "bent tilt", "second bowl", "second twist"]
     assert [m.words for m in modes] == words
     assert [m.numbers for m in modes] == [(1,), (2,), (3,), (4, 5), (6,), (7,)]
-    hertz = [m.shape.frequency for m in modes]
+    hertz = [m.frequency for m in modes]
     assert hertz == pytest.approx([264.0, 826.4, 916.6, 950.6, 1535.0, 1567.9], abs=0.1)
     # a mode that the model leaves out is shown all the same
-    few = first_modes(RibStage(order=COARSE, outputs="corners"), A, 8)
+    few = mode_shapes(RibStage(order=COARSE, outputs="corners"), A, 8).modes
     assert [m.numbers[0] for m in few] == [1, 2, 3, 4, 6, 7, 8, 10]
-    assert few[-1].shape.frequency == pytest.approx(1740, abs=20)
+    assert few[-1].frequency == pytest.approx(1740, abs=20)
 
 
 def test_corners_do_not_see_the_saddle() -> None:
-    modes = first_modes(STAGE, A, 3)
-    rows = table_modes(STAGE, modes).rows
+    rows = table_modes(mode_shapes(STAGE, A, 3)).rows
     assert rows[0][4] > 0.95  # the twist is largest there
-    assert corner_motion(STAGE, modes[1].shape) < 1e-9
+    assert rows[1][4] < 1e-9
     assert rows[2][3] == pytest.approx(2.796, abs=1e-3)
 
 
 def test_lopsided_stage_has_pictures_without_symmetry() -> None:
     stage = RibStage(Geometry(point_masses=(PointMass(0.1, 0.12, 0.05),)), order=COARSE)
-    html = mode_shape_figure(stage, A, count=10)
+    html = mode_shape_figure(mode_shapes(stage, A, 10))
     found = re.findall(r"<p>(\d+): bending, ", html)
     assert found == [str(i) for i in range(1, 11)]
     assert "A1" not in html
@@ -225,8 +184,9 @@ def test_mode_figure_is_sound_small_and_holds_the_script_s_data() -> None:
 
 
 def test_data_cannot_end_its_script_element() -> None:
-    surface = surface_of(STAGE, A, mode_shape(STAGE, A, 0))
-    text = data(surface, [Picture(np.zeros_like(surface.points), HOSTILE)])  # at rest: no 0/0
+    surface = mode_shapes(STAGE, A, 1)
+    still = replace(surface.modes[0], displacement=np.zeros_like(surface.points), words=HOSTILE)
+    text = data(replace(surface, modes=(still,)))  # at rest: no 0/0
     assert "<" not in text
     assert set(json.loads(text)["fields"][0]) == {0}
 
@@ -292,23 +252,23 @@ def test_words_above_the_plan_do_not_meet_at_the_ends_of_the_range() -> None:
 
 
 def test_dimension_figure_has_a_caption_with_numbers_and_a_table() -> None:
-    html = dimensions_figure(Geometry(), {"start": A, "end": B})
-    assert "From start to end the mass goes from 1.0189 to 0.59001 kg (−42.1 %)." in html
-    assert "Changed: t_c (−49.3 %), t_i (−46.9 %), H (−29.1 %), x_i (+11.1 %)." in html
-    assert "heights drawn 3 times as large" in html
-    rows = {row[0]: row[2:] for row in table_dimensions(Geometry(), {"a": A, "b": B}).rows}
+    words = drawing(Geometry(), {"start": A, "end": B}).caption
+    assert "From start to end the mass goes from 1.0189 to 0.59001 kg (−42.1 %)." in words
+    assert "Changed: t_c (−49.3 %), t_i (−46.9 %), H (−29.1 %), x_i (+11.1 %)." in words
+    assert "heights drawn 3 times as large" in words
+    rows = {row[0]: row[2:] for row in drawing(Geometry(), {"a": A, "b": B}).rows}
     assert rows["t_c"] == ("mm", 8.0, pytest.approx(4.0588))
     assert rows["b_1"] == ("mm", pytest.approx(75.5), pytest.approx(69.9037))
     assert rows["mass"] == ("kg", pytest.approx(1.01891, rel=1e-4), pytest.approx(0.59, rel=1e-3))
 
 
 def test_one_stage_three_stages_hostile_names_and_point_masses() -> None:
-    assert "Changed" not in dimensions_figure(Geometry(), {"start": A})
-    assert "No parameter changes." in dimensions_figure(Geometry(), {"a": A, "b": A})
+    assert "Changed" not in drawing(Geometry(), {"start": A}).caption
+    assert "No parameter changes." in drawing(Geometry(), {"a": A, "b": A}).caption
     masses = Geometry(point_masses=(PointMass(0.0, 0.15, 0.1),))
-    assert "Dashed" not in dimensions_figure(Geometry(), {"start": A})
-    assert "Dashed circles: masses" in dimensions_figure(masses, {"start": A})
-    html = dimensions_figure(masses, {HOSTILE: A, "x" * 90: B, "c": A})
+    assert "Dashed" not in drawing(Geometry(), {"start": A}).caption
+    assert "Dashed circles: masses" in drawing(masses, {"start": A}).caption
+    html = drawing(masses, {HOSTILE: A, "x" * 90: B, "c": A}).svg
     (root,) = svgs(html)
     assert "<script" not in html
     assert len(list(root.iter("circle"))) == 3
@@ -316,5 +276,5 @@ def test_one_stage_three_stages_hostile_names_and_point_masses() -> None:
     assert f"{HOSTILE}, 1.119 kg" in words
     assert f"{'x' * 39}…, 0.69 kg" in words
     tall = float(root.get("viewBox", "").split()[3])
-    single = float(svgs(dimensions_figure(masses, {"a": A}))[0].get("viewBox", "").split()[3])
+    single = float(svgs(drawing(masses, {"a": A}).svg)[0].get("viewBox", "").split()[3])
     assert tall == pytest.approx(2 * single, rel=1e-5)

@@ -117,7 +117,7 @@ def test_the_profile_likelihood_is_the_likelihood_with_mean_and_variance_elimina
     X = design("sobol", [0, 0], [1, 1], 24, seed=3)
     t = np.sin(3.0 * X[:, 0]) + X[:, 1] ** 2 + 5.0
     lengths = np.array([0.25, 0.35])  # longer ones drown the differences in rounding
-    value, slope = profile_likelihood._negative(kernel, X, t, lengths)
+    value, slope = profile_likelihood.profile_likelihood(kernel, X, t, lengths)
     C = covariance(kernel, X, X, lengths) + profile_likelihood.JITTER * np.eye(24)
 
     def negative(mean_and_log_variance: np.ndarray) -> float:
@@ -128,10 +128,10 @@ def test_the_profile_likelihood_is_the_likelihood_with_mean_and_variance_elimina
         return 0.5 * (24 * np.log(variance) + log_det + inside)
 
     least = minimize(negative, [5.0, 0.0], method="Nelder-Mead", options={"fatol": 1e-10}).fun
-    assert value + 12.0 == pytest.approx(least, abs=1e-6)  # ½ n of the quadratic form
+    assert 12.0 - value == pytest.approx(least, abs=1e-6)  # ½ n of the quadratic form
     for j, e in enumerate(1e-5 * np.eye(2)):
         up, down = (
-            profile_likelihood._negative(kernel, X, t, lengths * np.exp(sign * e))[0]
+            profile_likelihood.profile_likelihood(kernel, X, t, lengths * np.exp(sign * e))[0]
             for sign in (1.0, -1.0)
         )
         assert slope[j] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-6)

@@ -4,6 +4,8 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
 from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
 from ccd_casadi.sampling.samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
@@ -25,6 +28,11 @@ BOX = {"lower": [50.0, 50.0], "upper": [70.0, 70.0]}
 X = design("sobol", **BOX, n=60, seed=3)
 
 
+def at(*theta: float) -> Any:
+    """What the judgement asks of a design with these θ."""
+    return SimpleNamespace(point=np.array(theta), problem=SimpleNamespace(figure=BANDWIDTH))
+
+
 def process(kink: float) -> GaussianProcess:
     u = (X - 50.0) / 20.0
     Y = HZ * (60.0 + 4.0 * np.sin(u.sum(1)) + kink * np.abs(u @ [1.0, -0.7] - 0.2))
@@ -32,7 +40,7 @@ def process(kink: float) -> GaussianProcess:
 
 
 def test_a_smooth_bandwidth_is_trusted_in_its_own_unit() -> None:
-    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    (q,) = surrogate_quality([process(0.0)], at(*[60.0, 60.0]))
     assert q.smooth_enough
     assert not q.extrapolates
     assert q.true.min() > 59.0  # Hz, not rad/s
@@ -43,7 +51,7 @@ def test_a_smooth_bandwidth_is_trusted_in_its_own_unit() -> None:
 
 
 def test_a_kinked_bandwidth_recommends_lifted() -> None:
-    (q,) = surrogate_quality([process(20.0)], np.array([60.0, 60.0]))
+    (q,) = surrogate_quality([process(20.0)], at(*[60.0, 60.0]))
     assert q.roughness is not Roughness.SMOOTH
     assert "--formulation lifted" in recommendation([q])
     several = [q, replace(q, name="sensitivity_peak", unit="%")]
@@ -52,7 +60,7 @@ def test_a_kinked_bandwidth_recommends_lifted() -> None:
 
 def test_what_predicts_left_out_samples_badly_is_called_neither_smooth_nor_supported() -> None:
     """D10: Q² of 0.84 was "smooth, supported", and one of 0.998 "kinked"."""
-    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    (q,) = surrogate_quality([process(0.0)], at(*[60.0, 60.0]))
     for q2, said in ((0.84, "poorly followed"), (0.93, "kinked"), (0.998, "nearly smooth")):
         kinked = replace(q, roughness=Roughness.KINKED, kfold=replace(q.kfold, q2=q2))
         assert kinked.samples_look == said
@@ -66,7 +74,7 @@ def test_what_predicts_left_out_samples_badly_is_called_neither_smooth_nor_suppo
 @pytest.mark.parametrize("roughness", list(Roughness))
 def test_the_sentence_and_the_table_say_the_same_of_the_samples(roughness) -> None:
     """ "Kinked or torn", said the sentence; "nearly smooth", said the table below it."""
-    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    (q,) = surrogate_quality([process(0.0)], at(*[60.0, 60.0]))
     for q2 in (0.5, 0.91, 0.99, 0.9951, 1.0 - 1e-7):
         found = replace(q, roughness=roughness, kfold=replace(q.kfold, q2=q2))
         look = table_trust([found]).rows[0][-2]
@@ -78,7 +86,7 @@ def test_the_sentence_and_the_table_say_the_same_of_the_samples(roughness) -> No
 
 
 def test_a_design_beside_samples_that_are_missed_is_not_supported() -> None:
-    (q,) = surrogate_quality([process(0.0)], np.array([60.0, 60.0]))
+    (q,) = surrogate_quality([process(0.0)], at(*[60.0, 60.0]))
     assert table_trust([q]).rows[0][-1] == "supported"
     for error, sigmas, at_point in ((3.0, 10.0, False), (3.0, 10.0, True), (-3.0, 9.4, False)):
         far = replace(q, around=(Missed(error, sigmas, at_point), Missed(1e-9, 0.1, False)))
@@ -94,7 +102,7 @@ def test_a_design_beside_samples_that_are_missed_is_not_supported() -> None:
 def test_a_design_beyond_the_samples_is_flagged() -> None:
     near = X[(X < 58.0).all(axis=1)]
     few = fit(near, near.sum(1) ** 2, **BOX, starts=1)
-    (q,) = surrogate_quality([few], np.array([69.0, 69.0]))
+    (q,) = surrogate_quality([few], at(*[69.0, 69.0]))
     assert q.extrapolates
     assert "extrapolates" in recommendation([q])
     table = table_trust([q])
@@ -102,12 +110,12 @@ def test_a_design_beyond_the_samples_is_flagged() -> None:
 
 
 def test_nothing_is_said_of_no_surrogate() -> None:
-    assert quality_dict(surrogate_quality([], np.zeros(2))) == {}
+    assert quality_dict(surrogate_quality([], at(0.0, 0.0))) == {}
     assert recommendation([]) == ""
 
 
 def test_the_figure_shows_every_sample_and_the_bands() -> None:
-    qualities = surrogate_quality([process(5.0)], np.array([60.0, 60.0]))
+    qualities = surrogate_quality([process(5.0)], at(*[60.0, 60.0]))
     svg = figure_trust(qualities)
     assert "predicted (Hz)" in svg
     assert svg.count("95 % band") == 2

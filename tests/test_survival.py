@@ -14,17 +14,16 @@ from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import PEAK, REACH, Survival, survival
 from ccd_casadi.codesign.verdict import State, survives
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.robust_set import RobustSet
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.synthesis.norms import hinf_norm
 
 SUSPENSION = Suspension(0.5, 0.7)
 CROSSOVER = 100.0  # rad/s
@@ -188,7 +187,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
     loops, S_max = loops_and_bound(case, seed, sampling)
     found = found_of(loops, S_max)
     k = loops.controller.state
-    K = DiscreteStateSpace(k.A, k.B, k.C, k.D, sampling.period)
+    K = StateSpace(k.A, k.B, k.C, k.D, period=sampling.period)
 
     def judged(shift: float) -> tuple[bool, float]:
         modal = modal_plant(case.system(), SUSPENSION, Perturbation(shift))

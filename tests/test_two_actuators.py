@@ -20,7 +20,8 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import PlantError
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,8 +14,8 @@ from ccd_casadi.kernels.generalized_plant import (
     generalized_plant,
     squared_weights,
 )
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.synthesis.weights import Weights
 
 weights = st.builds(

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop, zeros
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.analysis.loop import Loop, constant_drive
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
+from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins, least_of
 
 PERIODS = 160.0  # of ω_b that a step is followed for
 PER_PERIOD = 100  # points of a continuous loop's step
@@ -66,7 +66,7 @@ def loop_figures(
     above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
     sizes = [np.linalg.norm(loop.sensitivity(above), 2, axis=(1, 2)) for loop in loops]
     return LoopFigures(
-        margins=replace(_least(margins), crossover=margins[0].crossover),
+        margins=replace(least_of(margins), crossover=margins[0].crossover),
         step=StepFigures(
             max(s.overshoot for s in steps),
             max(s.settling for s in steps),
@@ -80,18 +80,8 @@ def loop_figures(
 def _least_margins(loop: Loop) -> ClassicalMargins:
     omega = loop.grid()
     count = loop.plant.B.shape[1]
-    return _least(
+    return least_of(
         [classical_margins(partial(loop.open_at_input, i), omega) for i in range(count)]
-    )
-
-
-def _least(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
-    return ClassicalMargins(
-        max(m.gain_down for m in each),
-        min(m.gain_up for m in each),
-        min(m.phase_deg for m in each),
-        min(m.delay for m in each),
-        min(m.crossover for m in each),
     )
 
 
@@ -103,13 +93,13 @@ def step_figures(loop: Loop, bandwidth: float) -> StepFigures:
     time = np.arange(count) * steps.period
     overshoot, settling = 0.0, 0.0
     for i, drive in enumerate(steps.B_r.T):
-        y = steps.outputs(drive, count)[i]
+        y = constant_drive(steps, drive, count)[i]
         overshoot = max(overshoot, float(y.max()) - 1.0)
         outside = np.flatnonzero(np.abs(y - 1.0) > BAND)
         last = int(outside[-1]) + 1 if len(outside) else 0
         settling = max(settling, float(time[last]) if last < count else np.inf)
-    rest = steps.C @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
-    moved = [float(np.abs(steps.outputs(drive, count)).max()) for drive in steps.B_d.T]
+    rest = steps.C_y @ np.linalg.solve(np.eye(len(steps.A)) - steps.A, steps.B_d)
+    moved = [float(np.abs(constant_drive(steps, drive, count)).max()) for drive in steps.B_d.T]
     return StepFigures(overshoot, settling, max(*moved, float(np.abs(rest).max())))
 
 
@@ -117,7 +107,7 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
     """Poles and zeros of K with damping below 0.1 within 20 % of ω_b, ascending."""
     found = []
     for word, roots in (
-        ("zero", zeros(controller, bandwidth)),
+        ("zero", controller.zeros(bandwidth)),
         ("pole", np.linalg.eigvals(controller.A)),
     ):
         size = np.abs(roots)
@@ -141,7 +131,7 @@ def force_step(
     """
     steps = Loop(plant, controller, sampling).over_a_step(float(times[0]))
     counts = np.unique(np.maximum(np.round(times / steps.period), 1.0).astype(int))
-    A, C = steps.A, steps.C[0]
+    A, C = steps.A, steps.C_y[0]
     final = np.linalg.solve(np.eye(len(A)) - A, steps.B_d[:, 0])
     y = [float(C @ (final - np.linalg.matrix_power(A, int(n)) @ final)) for n in counts]
     return np.asarray(steps.period * counts, float), np.array(y)

@@ -20,12 +20,12 @@ from ccd_casadi.budget.frequency import (
     responses,
     sampled_plant,
 )
-from ccd_casadi.budget.holding import tustin
 from ccd_casadi.budget.loops import Disturbed, Process, closed, disturbed
 from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -165,7 +165,8 @@ class _ResponseChanges:
 
     def __init__(self, loop: Loop, hz: Array) -> None:
         self.loop, self.hz = loop, hz
-        self.s = loop.variable(hz)
+        omega = HZ * np.asarray(hz, float)
+        self.s = loop.sampled()[0].variable(omega)
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, change: Change) -> tuple[Any, Any, Any]:

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
-from ccd_casadi.budget.holding import Hold
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.lyapunov import covariance
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.budget.sources import ErrorBudget, Source
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -65,7 +65,7 @@ class BudgetFigures:
 
 
 def evaluate_budget(
-    G: StateSpace, K: StateSpace, budget: ErrorBudget, hold: Hold | None = None
+    G: StateSpace, K: StateSpace, budget: ErrorBudget, hold: Sampling | None = None
 ) -> BudgetFigures | None:
     """The budget of a loop in SI, plant without feedthrough, controller e in, u out.
 

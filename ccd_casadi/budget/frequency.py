@@ -12,11 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.holding import Hold, held, tustin
+from ccd_casadi.budget.holding import held
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.quadrature import Integral, integrate
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import closed_loop, sensitivity
+from ccd_casadi.lti.grid import around
+from ccd_casadi.lti.hold import Sampling, delayed, tustin
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -31,7 +34,7 @@ class Loop:
 
     G: StateSpace
     K: StateSpace
-    hold: Hold | None = None
+    hold: Sampling | None = None
 
     @property
     def period(self) -> float | None:
@@ -44,32 +47,11 @@ class Loop:
             return self.G, self.K
         return sampled_plant(self.G, self.hold), tustin(self.K, self.hold.period)
 
-    def variable(self, hz: Array) -> np.ndarray:
-        """s or z at frequencies in Hz."""
-        s = 1j * HZ * np.asarray(hz, float)
-        return s if self.hold is None else np.exp(s * self.hold.period)
 
-
-def sampled_plant(G: StateSpace, hold: Hold) -> StateSpace:
+def sampled_plant(G: StateSpace, hold: Sampling) -> StateSpace:
     """The plant behind hold and delay at its samples; states [x; u_{k-1}; …]."""
     change, gains = held(G.A, G.B, hold)
-    n, m = G.B.shape
-    A = np.eye(n) + change
-    kept = len(gains) - 1
-    older = np.eye(kept * m, k=-m)
-    Ad = np.block([[A, np.hstack([np.zeros((n, 0)), *gains[1:]])],
-                   [np.zeros((kept * m, n)), older]])  # fmt: skip
-    B = np.vstack([gains[0], np.eye(kept * m, m)])
-    C = np.hstack([G.C, np.zeros((len(G.C), kept * m))])
-    return StateSpace(Ad, B, C, np.zeros((len(C), m)))
-
-
-def response(system: StateSpace, s: np.ndarray) -> np.ndarray:
-    """C (s - A)⁻¹ B + D (k, p, m)."""
-    if not len(system.A):
-        return np.broadcast_to(system.D, (len(s), *system.D.shape)).astype(complex)
-    whole = s[:, None, None] * np.eye(len(system.A)) - system.A
-    return np.asarray(system.C @ np.linalg.solve(whole, system.B + 0j) + system.D)
+    return delayed(np.eye(len(G.A)) + change, gains, G.C, hold.period)
 
 
 @dataclass(frozen=True)
@@ -95,11 +77,10 @@ class Responses:
 def responses(loop: Loop, hz: Array) -> Responses:
     """The loop at frequencies in Hz."""
     plant, controller = loop.sampled()
-    s = loop.variable(hz)
-    G, K = response(plant, s), response(controller, s)
-    free = G if loop.hold is None else response(loop.G, 1j * HZ * np.asarray(hz, float))
-    S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
-    return Responses(G, K, free, S)
+    omega = HZ * np.asarray(hz, float)
+    G, K = plant.response(omega), controller.response(omega)
+    free = G if loop.hold is None else loop.G.response(omega)
+    return Responses(G, K, free, sensitivity(G @ K))
 
 
 def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
@@ -139,8 +120,7 @@ def panels(loop: Loop, source: Source) -> Array:
     A table's own range. What is white goes on from far below the slowest to far above the fastest
     pole, in a sampled loop to half the rate, beyond which the noise of samples is not counted.
     """
-    roots = np.concatenate([loop_poles(loop), np.linalg.eigvals(loop.G.A),
-                            np.linalg.eigvals(loop.K.A)])  # fmt: skip
+    roots = np.concatenate([loop_poles(loop), loop.G.poles, loop.K.poles])
     sizes = np.abs(roots[np.abs(roots) > 1e-9 * np.abs(roots).max()])
     corners = source.corners()
     if source.shaped:
@@ -151,9 +131,8 @@ def panels(loop: Loop, source: Source) -> Array:
             low = min(low, 1e-6 * high)
     else:
         low, high = corners[0], corners[-1]
-    near = np.abs(roots.imag)[:, None] + np.abs(roots.real)[:, None] * FLANKS
     steps = np.geomspace(low, high, 2 + int(PER_DECADE * np.log10(high / low)))
-    joint = np.concatenate([[low, high], steps, corners, sizes, near.ravel()])
+    joint = np.concatenate([[low, high], steps, corners, sizes, around(roots, FLANKS)])
     joint = np.unique(joint[(joint >= low) & (joint <= high)])
     apart = np.concatenate([[True], np.diff(joint) > 1e-9 * joint[1:]])
     return np.asarray(joint[apart] / HZ)
@@ -161,13 +140,7 @@ def panels(loop: Loop, source: Source) -> Array:
 
 def loop_poles(loop: Loop) -> np.ndarray:
     """Poles of the closed loop in 1/s; sampled ln(z)/T."""
-    G, K = loop.sampled()
-    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-    poles = np.linalg.eigvals(A)
-    if loop.hold is None:
-        return poles
-    sizes = np.abs(poles)
-    return np.log(poles[sizes > 1e-6] + 0j) / loop.hold.period
+    return closed_loop(*loop.sampled()).S.rates
 
 
 def integrated(loop: Loop, source: Source, weight: Callable[[Array], Array]) -> Integral:

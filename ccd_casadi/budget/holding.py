@@ -10,36 +10,21 @@ Everything is analytic in the matrices, so that a step along the imaginary axis 
 rounding (Squire and Trapp 1998).
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import Sampling, parts
+from ccd_casadi.lti.state_space import StateSpace
 
-INSTANT = 1e-9  # share of a period that counts as none
 Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis
 
 
-@dataclass(frozen=True)
-class Hold:
-    """A sampled loop: period T and delay from measurement to force in s."""
-
-    period: float
-    delay: float = 0.0
-
-    @property
-    def parts(self) -> tuple[int, float]:
-        """Whole periods of the delay, and the rest in s."""
-        whole = int(np.floor(self.delay / self.period + INSTANT))
-        return whole, max(self.delay - whole * self.period, 0.0)
-
-
-def held(A: Matrix, B: Matrix, hold: Hold) -> tuple[Matrix, list[Matrix]]:
+def held(A: Matrix, B: Matrix, hold: Sampling) -> tuple[Matrix, list[Matrix]]:
     """x_{k+1} = Φ x_k + Σ Γ_i u_{k-i} behind hold and delay: Φ - 1, and all Γ_i."""
     n, m = B.shape
-    whole, rest = hold.parts
+    whole, rest = parts(hold.period, hold.delay)
     late, late_in = over(A, hold.period - rest)
     gains = [np.zeros((n, m))] * whole + [late_in @ B]
     if rest == 0.0:
@@ -74,18 +59,6 @@ def noise_of_a_period(A: Matrix, W: Matrix, T: float) -> Matrix:
     for _ in range(doublings):
         Q, moved = Q + moved @ Q @ moved.T, moved @ moved
     return 0.5 * (Q + Q.T)
-
-
-def tustin(K: StateSpace, T: float) -> StateSpace:
-    """K at z by s = (2/T)(z - 1)/(z + 1)."""
-    one = np.eye(len(K.A))
-    inverse = np.linalg.inv(one - 0.5 * T * K.A)
-    return StateSpace(
-        inverse @ (one + 0.5 * T * K.A),
-        T * inverse @ K.B,
-        K.C @ inverse,
-        K.D + 0.5 * T * K.C @ inverse @ K.B,
-    )
 
 
 def tustin_change(K: StateSpace, T: float) -> Matrix:

@@ -15,17 +15,17 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from ccd_casadi.budget.holding import (
-    Hold,
     Matrix,
     held,
     noise_of_a_period,
     over,
     stacked,
-    tustin,
     tustin_change,
 )
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import closed_matrix
+from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.state_space import StateSpace
 
 FORCES = (Kind.FORCE, Kind.FLOOR_MOTION)
 
@@ -85,7 +85,7 @@ class Disturbed:
     """
 
     kind: Kind
-    hold: Hold | None
+    hold: Sampling | None
     system: StateSpace
     filter: StateSpace
     change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
@@ -94,7 +94,7 @@ class Disturbed:
     filter_change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
 
 
-def disturbed(G: StateSpace, source: Source, hold: Hold | None) -> Disturbed:
+def disturbed(G: StateSpace, source: Source, hold: Sampling | None) -> Disturbed:
     """A plant without feedthrough (SI) under a source of white noise through a filter.
 
     Raises ValueError for a tabulated source, which has no state space.
@@ -120,7 +120,7 @@ def disturbed(G: StateSpace, source: Source, hold: Hold | None) -> Disturbed:
     return Disturbed(source.kind, hold, StateSpace(A, B, C, G.D), f, change, tuple(gains), noise)
 
 
-def process(G: StateSpace, K: StateSpace, source: Source, hold: Hold | None) -> Process:
+def process(G: StateSpace, K: StateSpace, source: Source, hold: Sampling | None) -> Process:
     """The loop of a plant without feedthrough (SI), a controller (e in, u out) and a source."""
     return closed(disturbed(G, source, hold), K)
 
@@ -134,7 +134,7 @@ def _continuous(plant: Disturbed, K: StateSpace) -> Process:
     G, f, kind = plant.system, plant.filter, plant.kind
     n, nk, nf = len(G.A), len(K.A), len(f.A)
     m = G.B.shape[1]
-    loop = stacked([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+    loop = closed_matrix(G, K)
     C = np.hstack([-G.C, np.zeros((len(G.C), nk + nf))])
     if kind in FORCES:
         enters, direct = np.vstack([G.B, np.zeros((nk, m))]), np.zeros((len(K.C), m))
@@ -151,7 +151,7 @@ def _continuous(plant: Disturbed, K: StateSpace) -> Process:
                    infinite_force=bool(np.any(direct @ f.D)))  # fmt: skip
 
 
-def _sampled(plant: Disturbed, K: StateSpace, hold: Hold) -> Process:
+def _sampled(plant: Disturbed, K: StateSpace, hold: Sampling) -> Process:
     B, C, f, gains = plant.system.B, plant.system.C, plant.filter, plant.gains
     k, k_change = tustin(K, hold.period), tustin_change(K, hold.period)
     own = plant.kind not in FORCES  # whether the filter stands beside the plant

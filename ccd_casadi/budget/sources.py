@@ -15,7 +15,7 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.budget.spectra import ShapedSpectrum, TabulatedSpectrum
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

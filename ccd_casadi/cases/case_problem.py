@@ -14,7 +14,7 @@ from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
-from ccd_casadi.plants.registry import DATA, SHIPPED
+from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.units import HZ
 from surrogates.options import one_line
@@ -83,7 +83,8 @@ def problem_of(case: Case) -> CoDesignProblem:
             sets = problem.sections.uncertainty.options
             plants += [plant_of(with_options(problem, item)) for item in sets]
             require_channels(plants, problem.sections)
-        if case.plant.model not in SHIPPED:
+        model = model_named(case.plant.model)
+        if model is None or not model.sound:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:
                 if finding.severity is Severity.ERROR:
                     raise PlantError(finding.words)
@@ -106,7 +107,7 @@ def _option_sets(case: Case) -> tuple[tuple[tuple[str, object], ...], ...]:
             return CaseError(one_line(f"{case.path}: {key}: {words}"))
 
         options = options_in(file, file, fail)
-        data = DATA.get(case.plant.model or "")
+        data = data_option(case.plant.model)
         if data in options:
             options[data] = str((case.path.parent / options[data]).resolve())
         found.append(tuple(sorted((key, _frozen(value)) for key, value in options.items())))

@@ -10,39 +10,22 @@ from ccd_casadi.cases.checks import (
     FRACTION,
     POSITIVE,
     Check,
-    choice,
     closest,
     count,
     flag,
     names,
     number,
-    rows,
     shown,
     text,
     too_large,
 )
 from ccd_casadi.cases.parameters import parameters_of
 from ccd_casadi.cases.sections import Parameter, PlantSection
-from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
-from ccd_casadi.plants.rib_stage import NAMES
-from ccd_casadi.plants.rib_stage.model import OUTPUTS
-from ccd_casadi.plants.rib_stage.plant import MESHES
+from ccd_casadi.plants.registry import model_named, model_names
 
 # What the models of the package take, as far as a function's signature does not say it.
-_MODEL_THETA: dict[str, tuple[str, ...]] = {"two_mass": ("m1", "m2"), "rib_stage": NAMES}
 _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
     ("two_mass", "zeta"): FRACTION,
-    ("rib_stage", "zeta"): FRACTION,
-    ("rib_stage", "outputs"): choice(*OUTPUTS),
-    ("rib_stage", "mesh"): choice(*MESHES),
-    ("rib_stage", "side"): POSITIVE,
-    ("rib_stage", "young"): POSITIVE,
-    ("rib_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
-    ("rib_stage", "density"): POSITIVE,
-    ("rib_stage", "least_bay"): POSITIVE,
-    ("rib_stage", "actuators"): rows(2),
-    ("rib_stage", "sensors"): rows(2),
-    ("rib_stage", "point_masses"): rows(3),
     ("modal_table", "table"): text,
     ("modal_table", "rigid_below_hz"): POSITIVE,
     ("sampled_matrices", "folder"): text,
@@ -60,7 +43,6 @@ _MODEL_OPTIONS: dict[tuple[str | None, str], Check] = {
     ("cad_stage", "poisson"): number(0.0, 0.5, "give a number between 0 and 0.5"),
     ("cad_stage", "density"): POSITIVE,
 }
-_KNOWN_MODELS: dict[str, Callable[..., Any]] = {**MODELS, **BUILDERS}
 
 
 def plant_table(
@@ -73,8 +55,9 @@ def plant_table(
     if model == "measured":
         words = "is one frequency response and has no theta: it goes with the command inner alone"
         raise fail("plant.model", words)
-    if model is not None and (not isinstance(model, str) or model not in _KNOWN_MODELS):
-        hint = closest(str(model), _KNOWN_MODELS)
+    known = model_named(model) if isinstance(model, str) else None
+    if model is not None and known is None:
+        hint = closest(str(model), model_names())
         raise fail("plant.model", f"is {shown(model)}, not a known model{hint}; or use function")
     if function is not None:
         parts = function.rsplit(":", 1) if isinstance(function, str) else []
@@ -90,17 +73,18 @@ def plant_table(
         # Absolute, so that the resolved case means the same from the run folder.
         function = f"{(path.parent / parts[0]).resolve()}:{parts[1]}"
     options = {key: value for key, value in table.items() if key not in ("model", "function")}
-    takes = None if model is None else list(inspect.signature(_KNOWN_MODELS[model]).parameters)[1:]
+    takes = None if known is None else list(inspect.signature(known.build).parameters)[1:]
+    checks = {} if known is None else known.checks
     for key, value in options.items():
         if not key.isidentifier():
             raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
         if takes is not None and key not in takes:
             raise fail(f"plant.{key}", f"is no option of {model}{closest(key, takes)}")
-        wrong = _MODEL_OPTIONS.get((model, key), _option)(value)
+        wrong = _MODEL_OPTIONS.get((model, key), checks.get(key, _option))(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
-    data = DATA.get(model or "")
-    if data is not None:
+    data = "" if known is None else known.data
+    if data:
         if data not in options:
             raise fail(f"plant.{data}", f"is missing; add it, which {model} needs")
         try:
@@ -139,7 +123,8 @@ def theta_tables(
     Those that a model of the package needs, and no other.
     """
     searched, fixed = parameters_of(table, fail)
-    needed = _MODEL_THETA.get(model or "")
+    known = model_named(model)
+    needed = None if known is None else known.theta
     if needed is not None:
         for name in table:
             if name not in needed:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
@@ -23,7 +24,8 @@ from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.notebook import Shown
@@ -49,11 +51,8 @@ class SampledController(Protocol):
     def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
         """Stability, ω_b (rad/s), ‖S‖∞ and rate of growth (1/s) of the loop on a plant."""
 
-    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G (k, p, m) and K (k, m, p) at frequencies (k,) in rad/s."""
-
-    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
-        """Errors (k, p) and all forces (k, m) at the instants, from rest, `forces` fed forward."""
+    def loop(self, plant: ScaledPlant) -> Loop:
+        """The loop on a plant, for its responses and signals."""
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,7 @@ def _controller(path: Path, table: Mapping[str, Any], plant: ScaledPlant) -> Sta
         if found[key].shape != shape:
             words = f"is {found[key].shape}, not {shape} for this plant; solve the case again"
             raise UserError(f"{path}: {key}: {words}")
-    return StateSpace(**found)
+    return StateSpace(*(found[key] for key in "ABCD"))
 
 
 def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:

@@ -13,7 +13,7 @@ from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.measured_case import MODEL as MEASURED
 from ccd_casadi.cases.parameters import KEYS as THETA
 from ccd_casadi.cases.sections import SECTIONS
-from ccd_casadi.plants.registry import BUILDERS, MODELS
+from ccd_casadi.plants.registry import model_names
 
 _SHAPE = (
     "`shape` makes ω_b a bandwidth. A narrow filter at ω_b holds |S| just below -3 dB up to there,",
@@ -41,7 +41,7 @@ def case_schema() -> dict[str, Any]:
             "description": "The plant; every other key goes to the model or function.",
             "properties": {
                 "model": {
-                    "enum": sorted({*MODELS, *BUILDERS, MEASURED}), "description": _PLANT["model"],
+                    "enum": sorted({*model_names(), MEASURED}), "description": _PLANT["model"],
                 },
                 "function": {
                     "type": "string", "pattern": r".+\.py:\w+$", "description": _PLANT["function"],

@@ -19,123 +19,76 @@ excludes is a better optimum whose basin one of the starts lies in, and no more.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.direct import acceptable, true_objective
-from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.formulation import BoxLook
+from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import lifted_bounds
-from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, scaled_plant
+from ccd_casadi.inner_problem.objective import objective, objective_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
-from surrogates import GaussianProcess, design, quality_of
+from surrogates import GaussianProcess, design
 
 POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
 TRIES = 4
-STATIONARY = 1e-4  # scaled residual of an end whose basin is not looked into again
 OPTIMISM = 4.0  # deviations of the surrogates by which a θ must miss to be passed over
 CHECKED = 4  # of those passed over that are solved nevertheless
-COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
-NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 COARSE = 1.02  # what the best between the points of the mesh may be above the best on it
 MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
 
-@dataclass(frozen=True)
-class BoxLook:
-    """What was looked at: `points` θ, `solved` by true inner problems, `feasible` of these with a
-    design; the others were passed over, their optimistic surrogates being worse.
-
-    `better`: how many of them beat the J that the formulation came `before` with; `starts` local
-    solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
-    """
-
-    points: int
-    solved: int
-    feasible: int
-    better: int
-    starts: int
-    seed: int
-    before: float
-    after: float
-    x: Array | None
-
-    @property
-    def moved(self) -> bool:
-        """Whether something better was found."""
-        return self.x is not None
-
-
 def look_over_box(
-    sampler: Sampler,
-    x: Array,
-    J: float,
+    outer: Outer,
+    end: End,
     points: int,
     seed: int,
     processes: tuple[GaussianProcess, ...] = (),
 ) -> BoxLook:
-    """Look at `points` θ over the box for a J lower than that of x = (θ, ln ω_S, ln ω_T).
+    """Look at `points` θ over the box for a J lower than that of an end.
 
-    `processes`: surrogates of ω_b, ln‖S‖∞ and ln|S(jω_low)| over x, where there are any.
+    `processes`: the formulation's surrogates, where there are any.
     """
-    problem = sampler.problem
-    quantities = sampler.truth
-    if processes and _may_jump(problem, x, quantities.at(x)):
-        processes = ()
-    samples, passed_over = _spread(sampler, J, points, seed, processes) if points else ([], 0)
-    feasible = [sample for sample in samples if sample.feasible and _allowed(problem, sample)]
-    values = np.array([objective(problem, sample.theta, sample.value) for sample in feasible])
+    problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
+    processes = outer.excluding(processes, end.x, seed) if points else ()
+    samples, passed_over = _spread(outer.sampler, J, points, seed, processes) if points else ([], 0)
+    able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]
+    values = np.array([objective_of(problem, sample) for sample in able])
     margin = BETTER * abs(J) if np.isfinite(J) else 0.0
     best_x, best, begun = None, J, 0
-    ended: list[tuple[Array, float]] = []
-
-    def note(place: Array, value: float) -> None:
-        kkt = kkt_certificate(problem, place, quantities.at(place))
-        if kkt.stationarity <= STATIONARY:
-            ended.append((place, value))
+    stationary = np.isfinite(J) and end.kkt.stationarity <= outer.kkt_level
+    known = [Place(end.x, J, bool(stationary))]
 
     def solve_from(starts: Sequence[BandwidthSample]) -> None:
         nonlocal best_x, best, begun
         begun += len(starts)
-        if starts and np.isfinite(J) and not ended:
-            note(x, J)
         for sample in starts:
-            begin = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-            end = descend(problem, quantities, begin, ended=ended)
-            for place in (end, begin):
-                found = quantities.at(place)
-                if acceptable(problem, place, found):
-                    value = true_objective(problem, place, found)
-                    note(place, value)
-                    if value < best - margin:
-                        best_x, best = place, value
-                    break
+            place = outer.solved_from(sample, known)
+            if place is not None:
+                known.append(place)
+                if place.objective < best - margin:
+                    best_x, best = place.x, place.objective
 
-    solve_from(
-        _starts(problem, feasible, values, np.asarray(x[:-2]))[: -(-points // POINTS_A_START)]
-    )
-    ends = _ends(problem, np.asarray((x if best_x is None else best_x)[:-2]))
-    if len(ends) and len(processes) == 3 and _trustworthy(processes, seed):
+    lowest, others = _starts(problem, able, values, here)
+    starts = [*lowest, *others] if outer.look_is_cheap else lowest
+    solve_from(starts[: -(-points // POINTS_A_START)])
+    ends = _ends(problem, here if best_x is None else outer.theta_of(best_x))
+    if len(ends) and processes:
         ends = ends[_optimistic_objective(problem, processes, ends) < best]
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
-        found = sampler.bandwidths(ends, "looking at the ends of each parameter")
-        able = [sample for sample in found if sample.feasible and _allowed(problem, sample)]
-        solve_from(able)
+        found = outer.sampler.bandwidths(ends, "looking at the ends of each parameter")
+        least = np.inf if outer.look_is_cheap else best
+        solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return BoxLook(
         points=len(samples) + passed_over,
         solved=len(samples),
-        feasible=len(feasible),
+        feasible=len(able),
         better=int((values < J - margin).sum()),
         starts=begun,
         seed=seed,
@@ -158,21 +111,17 @@ def _ends(problem: CoDesignProblem, theta: Array) -> Array:
     return np.array(allowed).reshape(-1, len(theta))
 
 
-def perturbed(sampler: Sampler, x: Array, seed: int) -> list[Array]:
+def perturbed(outer: Outer, x: Array, seed: int) -> list[Array]:
     """Ends of local solves from a few starts around x: the last try where x is not stationary."""
-    problem = sampler.problem
-    quantities = sampler.truth
-    lower, upper = box(problem)
-    ends = []
+    lower, upper = box(outer.problem)
+    found = []
     for step in np.random.default_rng(seed).normal(0.0, PERTURBED, (TRIES, lower.size)):
-        theta = np.clip(x[:-2] + step * (upper - lower), lower, upper)
-        sample = sampler.bandwidths(theta, "perturbed starts")[0]
-        if sample.feasible:
-            begin = np.array([*theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-            end = descend(problem, quantities, begin, settled=1e-13)
-            if acceptable(problem, end, quantities.at(end)):
-                ends.append(end)
-    return ends
+        theta = np.clip(outer.theta_of(x) + step * (upper - lower), lower, upper)
+        sample = outer.sampler.bandwidths(theta, "perturbed starts")[0]
+        place = outer.solved_from(sample, (), 1e-13) if sample.feasible else None
+        if place is not None:
+            found.append(place.x)
+    return found
 
 
 def _spread(
@@ -191,7 +140,7 @@ def _spread(
         spread = design("sobol", lower, upper, points, seed)[len(known) :]
         more = [theta for theta in spread if not unmet(sampler.problem, theta)]
         solve: list[Array] = list(more)
-        if more and len(processes) > 1 and _trustworthy(processes, seed):
+        if more and processes:
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
             order = np.argsort(hopes)
             keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
@@ -207,28 +156,6 @@ def _spread(
         if solve:
             known = [*known, *sampler.bandwidths(np.array(solve), "looking over the box")]
     return known, passed_over
-
-
-def _may_jump(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
-    """Whether a local maximum of S at x is near -3 dB: there ω_b jumps, and surrogates do not."""
-    peaks = local_peaks_with_gradients(
-        scaled_plant(problem, tuple(x[:-2])),
-        problem.weights.at(design.figures.omega_S, design.figures.omega_T),
-        design,
-        gamma_backoff=problem.inner.gamma_backoff,
-        least=float(np.exp(HALF_POWER - NEAR_SHELF)),
-    )
-    return any(abs(p.ln_gain - HALF_POWER) <= NEAR_SHELF for p in peaks if p.member == 0)
-
-
-def _trustworthy(processes: tuple[GaussianProcess, ...], seed: int) -> bool:
-    """Whether the surrogates may rule anything out: smooth samples, predicted within their bands.
-
-    Where ω_b jumps (a peak below it reaches -3 dB) a smooth surrogate is sure of what is not so.
-    """
-    middle = 0.5 * (processes[0].lower + processes[0].upper)
-    found = [quality_of(process, middle, seed=seed) for process in processes]
-    return all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
 
 
 def _optimistic_objective(
@@ -270,10 +197,11 @@ def _apart(thetas: Array, width: Array) -> list[bool]:
 
 def _starts(
     problem: CoDesignProblem, samples: Sequence[BandwidthSample], values: Array, theta: Array
-) -> list[BandwidthSample]:
-    """Samples with a lower J than their n_θ + 1 nearest neighbours, then the best; away from θ."""
+) -> tuple[list[BandwidthSample], list[BandwidthSample]]:
+    """Samples with a lower J than their n_θ + 1 nearest neighbours, and the rest; away from θ, the
+    best first."""
     if not samples:
-        return []
+        return [], []
     lower, upper = box(problem)
     unit = (np.array([sample.theta for sample in samples]) - lower) / (upper - lower)
     here = (theta - lower) / (upper - lower)
@@ -284,8 +212,4 @@ def _starts(
         near = np.argsort(away)[1 : lower.size + 2]
         if np.abs(unit[i] - here).max() > SAME:
             (lowest if (values[near] >= values[i]).all() else others).append(samples[i])
-    return lowest + others
-
-
-def _allowed(problem: CoDesignProblem, sample: BandwidthSample) -> bool:
-    return not unmet(problem, sample.theta)
+    return lowest, others

@@ -6,7 +6,7 @@ from typing import Any
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 
 
 def budget_entry(

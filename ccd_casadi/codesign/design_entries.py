@@ -6,7 +6,7 @@ from typing import Any
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import compliance_words
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures

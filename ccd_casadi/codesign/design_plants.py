@@ -71,11 +71,12 @@ def best_over_design_plants(
     sampler: Sampler,
     solve: Callable[[Sampler], Solution],
     conclude: Callable[[Sampler, FormulationResult], Solution],
+    explain: Callable[[Sampler, Solution, float | None], str],
 ) -> Solution:
     """The best of a problem's solutions over its design plants, by `solve` and continuation.
 
-    `conclude` verifies what a continuation ended with. A problem with one design plant, or none,
-    is solved as it is.
+    `conclude` verifies what a continuation ended with, `explain` says why there is no better one.
+    A problem with one design plant, or none, is solved as it is.
     """
     began = perf_counter()
     problem = sampler.problem
@@ -102,7 +103,8 @@ def best_over_design_plants(
         names = [_at(choice) for choice in choices]
         tried = {name: _tried(item.result) for name, item in zip(names, found, strict=True)}
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
-    result["reason"] = _reason(samplers[best], problem, found[best], share)
+    sampler.nearest = samplers[best].nearest
+    result["reason"] = explain(sampler, found[best], share)
     return replace(found[best], result=result, problem=choices[best])
 
 
@@ -131,9 +133,9 @@ def _tried(result: dict[str, Any]) -> dict[str, Any]:
     return {key: result[key] for key in keys if key in result}
 
 
-def _reason(sampler: Sampler, problem: CoDesignProblem, best: Solution, share: float | None) -> str:
+def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Why a search failed: where it looked, how near it came, what may be tried."""
-    words = str(best.result["reason"])
+    problem, words = sampler.problem, str(best.result["reason"])
     if _verified(best):
         return words
     if isinstance(best.verified, VerifiedDesign):

@@ -42,3 +42,28 @@ class FormulationResult:
     outer: OuterSolution | None
     agreed: bool
     message: str
+
+
+@dataclass(frozen=True)
+class BoxLook:
+    """What was looked at: `points` θ, `solved` by true inner problems, `feasible` of these with a
+    design; the others were passed over, their optimistic surrogates being worse.
+
+    `better`: how many of them beat the J that the formulation came `before` with; `starts` local
+    solves went from them; `after` is the best J at the end, at `x` (None: nothing was better).
+    """
+
+    points: int
+    solved: int
+    feasible: int
+    better: int
+    starts: int
+    seed: int
+    before: float
+    after: float
+    x: Array | None
+
+    @property
+    def moved(self) -> bool:
+        """Whether something better was found."""
+        return self.x is not None

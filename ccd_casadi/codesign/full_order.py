@@ -28,7 +28,8 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise

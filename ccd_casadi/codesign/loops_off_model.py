@@ -7,17 +7,17 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import eig
 
-from ccd_casadi.budget.holding import tustin
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling, sampled, transfer
+from ccd_casadi.lti.closed_loop import closed_loop, largest, sensitivity
+from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 
 PER_DECADE = 40
-FLANKS = np.array([0.0, 0.3, 0.7, 1.5, 3.0])
+FLANKS = np.array([-3.0, -1.5, -0.7, -0.3, 0.0, 0.3, 0.7, 1.5, 3.0])
 ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 STEP = 0.3  # of the distance to a shift at which a pole of G meets a pole or zero of K
 WIDEST = 0.03  # of the frequency: step of a shift far from all of these
@@ -30,38 +30,17 @@ class Controller:
     def __init__(self, continuous: StateSpace, sampling: Sampling | None = None) -> None:
         self.continuous, self.sampling = continuous, sampling
         self.state = continuous if sampling is None else tustin(continuous, sampling.period)
-        self._poles, V = np.linalg.eig(self.state.A)
-        self._sound = bool(not V.size or np.linalg.cond(V) < 1e8)
-        if self._sound:
-            right = np.linalg.solve(V, self.state.B + 0j)
-            self._left, self._right = self.state.C @ V, right
 
     def __call__(self, omega: Array) -> np.ndarray:
         """K(jω) (k, m, p) at frequencies in rad/s."""
-        c, s = self.state, 1j * np.asarray(omega, float)
-        if self.sampling is not None:
-            s = np.exp(s * self.sampling.period)
-        if self._sound:
-            parts = self._right[None] / (s[:, None] - self._poles)[:, :, None]
-            return np.asarray(self._left @ parts + c.D)
-        shape = s[:, None, None] * np.eye(len(c.A)) - c.A
-        return np.asarray(c.C @ np.linalg.solve(shape, c.B + 0j) + c.D)
+        return self.state.swept(omega)
 
     @cached_property
     def roots(self) -> np.ndarray:
         """Poles and finite zeros in 1/s, as the loop sees them; one of each conjugate pair."""
-        c = self.continuous
-        n, m = c.B.shape
-        found = [np.linalg.eigvals(c.A)]
-        if len(c.C) == m and n:
-            size = np.abs(found[0]).max()
-            gain = max(float(np.linalg.norm(c.C) * np.linalg.norm(c.B)), 1e-300) / size
-            system = np.block([[c.A / size, c.B / size], [c.C / gain, c.D / gain]])
-            shape = np.zeros_like(system)
-            shape[:n, :n] = np.eye(n)
-            zeros = eig(system, shape, right=False)
-            found.append(size * zeros[np.isfinite(zeros) & (np.abs(zeros) < 1e5)])
-        s = np.concatenate(found)
+        poles = self.continuous.poles
+        size = float(np.abs(poles).max(initial=0.0))
+        s = np.concatenate([poles, self.continuous.zeros(size)])
         if self.sampling is not None:
             half = 0.5 * self.sampling.period * s
             s = np.log((1.0 + half) / (1.0 - half)) / self.sampling.period
@@ -76,26 +55,23 @@ class Loop:
     controller: Controller
 
     @cached_property
-    def state(self) -> tuple[Array, Array, Array]:
-        """(A, B, C) of the plant; velocities in units in which a mode's energy is even."""
+    def state(self) -> StateSpace:
+        """The plant; velocities in units in which a mode's energy is even."""
         p, n = self.plant, len(self.plant.K)
         scale = np.sqrt(np.maximum(np.diag(p.K), 1e-12))
         A = np.zeros((2 * n, 2 * n))
         A[:n, n:], A[n:, :n], A[n:, n:] = np.diag(scale), -p.K / scale, -p.D
         B = np.vstack([np.zeros_like(p.B), p.B])
-        return A, B, np.hstack([p.C / scale, np.zeros_like(p.C)])
+        C = np.hstack([p.C / scale, np.zeros_like(p.C)])
+        return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
 
     @cached_property
     def poles(self) -> np.ndarray:
         """Closed-loop poles in 1/s; of a sampled loop ln z/T."""
-        (A, B, C), K, sampling = self.state, self.controller.state, self.controller.sampling
+        G, K, sampling = self.state, self.controller.state, self.controller.sampling
         if sampling is not None:
-            A, B, C = sampled(A, B, C, sampling.period, sampling.delay)
-        joint = np.block([[A - B @ K.D @ C, B @ K.C], [-K.B @ C, K.A]])
-        found = np.linalg.eigvals(joint).astype(complex)
-        if sampling is not None:  # z = 0 is a delay
-            found = np.log(found[np.abs(found) > 1e-12]) / sampling.period
-        return np.asarray(found)
+            G = sampled(G, sampling.period, sampling.delay)
+        return closed_loop(G, K).S.rates
 
     @property
     def growth(self) -> float:
@@ -110,29 +86,24 @@ class Loop:
     @cached_property
     def grid(self) -> Array:
         """Frequencies in rad/s, logarithmic and through the roots of plant, K and loop."""
-        own = np.linalg.eigvals(self.state[0])
-        roots = np.concatenate([self.poles, own, self.controller.roots])
+        roots = np.concatenate([self.poles, self.state.poles, self.controller.roots])
         roots = roots[np.isfinite(roots) & (np.abs(roots) > 0.0)]
         sizes = np.abs(roots)
         low, high = 0.03 * sizes[sizes > 1e-9 * sizes.max()].min(), 30.0 * sizes.max()
         if self.controller.sampling is not None:
             high = np.pi / self.controller.sampling.period
-        roots = roots[roots.imag > 0.0]
-        pieces = [np.geomspace(low, high, int(PER_DECADE * np.log10(high / low)))]
-        for sign in (1.0, -1.0):
-            pieces += [roots.imag + sign * np.abs(roots.real) * flank for flank in FLANKS]
-        grid = np.unique(np.concatenate(pieces))
-        grid = grid[(grid >= low) & (grid <= high)]
-        return grid[np.append(True, np.diff(grid) > 1e-9 * grid[1:])]
+        points = int(PER_DECADE * np.log10(high / low))
+        near = around(roots[roots.imag > 0.0], FLANKS)
+        return frequency_grid(low, high, points, near, apart=1e-9)
 
     def respond(self, omega: Array) -> np.ndarray:
         """G(jω) (k, p, m), behind hold and delay where there are any."""
         p, sampling = self.plant, self.controller.sampling
         if sampling is not None:
-            A, B, C = self.state
-            poles, V = np.linalg.eig(A)
+            poles, V = np.linalg.eig(self.state.A)
             f, _ = transfer(poles, omega, sampling.period, sampling.delay)
-            return np.asarray((C @ V) @ (f[:, :, None] * np.linalg.solve(V, B + 0j)))
+            drive = np.linalg.solve(V, self.state.B + 0j)
+            return np.asarray((self.state.C @ V) @ (f[:, :, None] * drive))
         k, d = np.diag(p.K), np.diag(p.D)
         w = omega[:, None]
         if not (np.diag(d) - p.D).any():
@@ -145,7 +116,7 @@ class Loop:
         L = self.respond(omega) @ self.controller(omega)
         if L.shape[1] == 1:
             return np.asarray(1.0 / np.abs(1.0 + L[:, 0, 0]))
-        return np.linalg.norm(np.linalg.inv(np.eye(L.shape[1]) + L), 2, axis=(1, 2))
+        return largest(sensitivity(L))
 
     @cached_property
     def peak(self) -> float:

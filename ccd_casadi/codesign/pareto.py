@@ -3,7 +3,7 @@
     max ω_b*(θ)   s.t.  f(θ) = f_k,  θ_min <= θ <= θ_max,  λ(θ) <= 0,     k = 1 … N
 
 An equation, not a bound: where lighter is also faster, the curve shows by how much. IPOPT walks
-it on the lifted surrogates, each point started from its neighbour's; the true inner problem
+it on surrogates (`front_learners`), each point started from its neighbour's; the true inner problem
 answers at every θ, and its designs teach the surrogates until both agree. The two ends are found
 anew in every round, and the curve goes through a design that is known already, or above it.
 """
@@ -14,21 +14,18 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.codesign.lifted import MARGIN, REFIT, fit_quantities, update_quantities
+from ccd_casadi.codesign.front_learners import Learner
 from ccd_casadi.codesign.outer_problem import (
     NonlinearProgram,
     OuterFailure,
-    lifted_bounds,
-    lifted_program,
     solve_program,
 )
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from surrogates import GaussianProcess, design, to_casadi
+from surrogates import design
 
 STARTS = 6  # of IPOPT at every point, besides its neighbours' optima
 FLAT = 1e-9  # relative: a hardware cost that moves less over the box is constant
@@ -65,10 +62,9 @@ class Front:
 
 
 def pareto_front(
-    sampler: Sampler,
+    learner: Learner,
     *,
     points: int = 20,
-    samples: int = 0,
     tolerance: float = 1e-3,
     max_rounds: int = 8,
     seed: int = 0,
@@ -78,31 +74,24 @@ def pareto_front(
 
     Where the lightest is the fastest there is no trade-off, and the costs go on to the largest.
 
-    `samples` designs are sampled first (0: six per variable). `own`, a design (θ, ln ω_S, ln ω_T)
-    known to be good, is a point of the front unless a faster one is found at its cost. What is
-    slower than a lighter point is solved again from there; an end that stays so is dropped. Raises
-    UserError where the hardware cost is constant, or where too few designs are certified to learn
-    from.
+    `own`, a design (θ, and what else the learner's surrogates depend on) known to be good, is a
+    point of the front unless a faster one is found at its cost. What is slower than a lighter point
+    is solved again from there; an end that stays so is dropped. Raises UserError where the hardware
+    cost is constant, or where too few designs are certified to learn from.
     """
-    problem = sampler.problem
-    lower, upper = lifted_bounds(problem)
-    count = samples or 6 * len(lower)
-    found = sampler.quantities(design("sobol", lower, upper, count, seed))
+    sampler, problem = learner.sampler, learner.sampler.problem
+    lower, upper = learner.bounds
     if own is not None:
-        found = [*found, *sampler.quantities(np.clip(own, lower, upper))]
-    known = [sample for sample in found if sample.certified]
-    if len(known) <= len(lower):
-        words = f"only {len(known)} of {count} designs in the box were certified"
-        raise UserError(f"no trade-off can be learnt: {words}; widen the bounds")
-    processes, fitted = fit_quantities(problem, known, seed), len(known)
-    program = _program(problem, processes)
+        own = np.clip(own, lower, upper)
+    learner.begin(own)
     starts = design("sobol", lower, upper, STARTS, seed + 1)
     if own is not None:
-        starts = np.vstack([np.clip(own, lower, upper), starts])
-    ends, trades = ends_of(program, problem, starts)
-    f_low, f_high = (hardware_cost(plant_of(problem), x[:-2]) for x in ends)
+        starts = np.vstack([own, starts])
+    ends, trades = ends_of(learner.program(), problem, starts)
+    count = len(problem.names)
+    f_low, f_high = (hardware_cost(plant_of(problem), x[:count]) for x in ends)
     if own is not None:  # the true optimum may lie beyond what the first surrogates expect
-        f_own = hardware_cost(plant_of(problem), own[:-2])
+        f_own = hardware_cost(plant_of(problem), own[:count])
         f_low, f_high = min(f_low, f_own), max(f_high, f_own)
     if not f_high - f_low > FLAT * max(abs(f_low), abs(f_high)):
         raise UserError("hardware_cost is the same all over the box: there is nothing to trade")
@@ -112,42 +101,32 @@ def pareto_front(
     through = None
     if own is not None:
         through = int(np.argmin(np.abs(costs - f_own)))
-        costs[through], x[through] = f_own, starts[0]
+        costs[through], x[through] = f_own, own
     result: dict[int, FrontPoint] = {}
     rounds = 0
     while todo and rounds < max_rounds:
         rounds += 1
         if rounds > 1:
-            _move_ends(program, problem, starts, [k for k in todo if k != through], costs, x)
-        x = walk(program, problem, costs, todo, starts, x)
-        learn = []
-        inner = sampler.bandwidths(x[todo, :-2], f"verifying round {rounds}")
+            free = [k for k in todo if k != through]
+            _move_ends(learner.program(), problem, starts, free, costs, x)
+        x = walk(learner.program(), problem, costs, todo, starts, x)
+        inner = sampler.bandwidths(x[todo, :count], f"verifying round {rounds}")
         for k, sample in zip(todo, inner, strict=True):
-            predicted = float(processes[0].predict(x[k][None, :])[0])
-            result[k] = front_point(problem, sample, predicted, tolerance)
-            if not result[k].verified:
-                learn.append(x[k])
-        todo = [k for k in todo if not result[k].verified]
+            result[k] = front_point(problem, sample, learner.predicted(x[k]), tolerance)
+        missed = [i for i, k in enumerate(todo) if not result[k].verified]
+        rows, todo = x[todo][missed], [todo[i] for i in missed]
         if todo and rounds < max_rounds:
-            new = [s for s in sampler.quantities(np.array(learn), "learning") if s.certified]
-            known = list({sample.x: sample for sample in (*known, *new)}.values())
-            if len(known) >= REFIT * fitted:
-                processes, fitted = fit_quantities(problem, known, seed), len(known)
-            else:
-                processes = update_quantities(problem, known, processes)
-            program = _program(problem, processes)
+            learner.learn(rows, [inner[i] for i in missed])
     if through is not None:
         assert own is not None
-        sample = sampler.bandwidths(own[:-2], "the run's own design")[0]
-        there = result[through]
-        if sample.feasible and not there.bandwidth >= sample.bandwidth:
-            promised = float(processes[0].predict(own[None, :])[0])
-            result[through] = front_point(problem, sample, promised, tolerance)
+        sample = sampler.bandwidths(own[:count], "the run's own design")[0]
+        if sample.feasible and not result[through].bandwidth >= sample.bandwidth:
+            result[through] = front_point(problem, sample, learner.predicted(own), tolerance)
     for k in range(1, points):
         lighter = [result[i] for i in range(k) if result[i].bandwidth > result[k].bandwidth]
         if lighter:
             faster = max(lighter, key=lambda point: point.bandwidth)
-            _solve_again(sampler, program, processes, costs[k], faster, k, result, tolerance)
+            _solve_again(learner, costs[k], faster, k, result, tolerance)
     kept = sorted(result.values(), key=lambda point: point.hardware_cost)
     while trades and len(kept) > 1 and not kept[-1].bandwidth >= kept[-2].bandwidth:
         kept.pop()  # the fastest design is not there
@@ -172,13 +151,11 @@ def _move_ends(
         return
     for k, end in ((0, ends[0]), (last, ends[1])):
         if k in todo:
-            x[k], costs[k] = end, hardware_cost(plant_of(problem), end[:-2])
+            x[k], costs[k] = end, hardware_cost(plant_of(problem), end[: len(problem.names)])
 
 
 def _solve_again(
-    sampler: Sampler,
-    program: NonlinearProgram,
-    processes: tuple[GaussianProcess, ...],
+    learner: Learner,
     cost: float,
     faster: FrontPoint,
     k: int,
@@ -189,23 +166,18 @@ def _solve_again(
 
     A design that was not predicted takes no verified one's place for less than the `tolerance`.
     """
-    problem = sampler.problem
-    start = np.array([*faster.theta, np.log(faster.omega_S), np.log(faster.omega_T)])
+    sampler, problem = learner.sampler, learner.sampler.problem
+    sample = sampler.bandwidths(np.array(faster.theta))[0]
     try:
-        x = solve_program(_at_cost(program, problem, cost), start).best.x
+        x = solve_program(_at_cost(learner.program(), problem, cost), learner.point(sample)).best.x
     except OuterFailure:
         return
-    sample = sampler.bandwidths(x[:-2], "from a lighter point")[0]
+    sample = sampler.bandwidths(x[: len(problem.names)], "from a lighter point")[0]
     if sample.feasible and not result[k].bandwidth >= sample.bandwidth:
-        promised = float(processes[0].predict(x[None, :])[0])
-        new, old = front_point(problem, sample, promised, tolerance), result[k]
+        new, old = front_point(problem, sample, learner.predicted(x), tolerance), result[k]
         gained = not new.bandwidth <= (1.0 + tolerance) * old.bandwidth
         if new.verified or gained or not old.verified:
             result[k] = new
-
-
-def _program(problem: CoDesignProblem, processes: tuple[GaussianProcess, ...]) -> NonlinearProgram:
-    return lifted_program(problem, to_casadi(processes, std=False), margin=MARGIN)
 
 
 def walk(

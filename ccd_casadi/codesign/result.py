@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from ccd_casadi.codesign.box_look import BoxLook
 from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.outer_problem import OuterSolution
 from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import (
@@ -24,6 +23,7 @@ from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
@@ -46,7 +46,7 @@ def result_dict(
     """result.json of a solved run; `status` says whether it is verified, `reason` why not."""
     problem = verified.problem
     plant = plant_of(problem)
-    promised = predicted_value(outcome, verified)
+    promised = predicted_value(outcome, verified.point, verified.value)
     error = abs(promised / verified.value - 1.0)
     verdict = verdict_of(outcome, verified, tolerance, error, quality, look)
     stationary = optimal_line(outcome, verified, tolerance, look, gap=0.0)
@@ -143,16 +143,16 @@ def optimal_line(
     return Line(line.state, line.words, {**line.figures, **figures})
 
 
-def predicted_value(outcome: FormulationResult, verified: Verified) -> float:
-    """What the last surrogate says of the value at the verified design, SI.
+def predicted_value(outcome: FormulationResult, x: Array, value: float) -> float:
+    """What the last surrogate says at a design x of its value, SI.
 
-    Without a surrogate: the truth at IPOPT's own optimum, or at the design itself where IPOPT
-    found none.
+    Without a surrogate: the truth at IPOPT's own optimum, or `value`, that of the design, where
+    IPOPT found none.
     """
     if outcome.surrogates:
         process = outcome.surrogates[0]
-        return float(process.predict(verified.point[None, : process.lower.size])[0])
-    return verified.value if outcome.design is None else outcome.design.figures.bandwidth
+        return float(process.predict(x[None, : process.lower.size])[0])
+    return value if outcome.design is None else outcome.design.figures.bandwidth
 
 
 def infeasible_dict(

@@ -25,11 +25,10 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.run import solution_of_sections
+from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.codesign.run_files import write_run
-from ccd_casadi.codesign.second_look import conclude, rescue
+from ccd_casadi.codesign.search import concluded_at
 from ccd_casadi.codesign.sections_races import seeded_and_prepared
-from ccd_casadi.codesign.sections_run import conclude_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.constraints import constraint_sizes
@@ -140,23 +139,16 @@ class CoDesignTruth:
         if before is not None and before["retraining"] == mark | {"x": before["retraining"]["x"]}:
             return str(before["status"])
         start = None if x is None else self._start(x, before)
-        processes = tuple(surrogates)
+        processes, outer = tuple(surrogates), outer_of(self.sampler)
         outcome = FormulationResult(start, None, (), processes, None, True, "")
         if start is None:
             words = unmet_constraint(self.sampler.problem, self.case.outer.starts, self.seed)
             outcome = replace(outcome, message=words)
             if not words:
-                outcome = rescue(self.sampler, outcome, self.seed)
-        if self.structured:
-            found = conclude_sections(self.sampler, outcome)
-            solution = solution_of_sections(
-                self.sampler.problem, self.formulation, found, self.tolerance, self.seed,
-                perf_counter() - began, self.sampler.quiet,
-            )  # fmt: skip
-        else:
-            solution = conclude(
-                self.sampler, self.formulation, outcome, self.tolerance, self.seed, began
-            )
+                outcome = outer.rescued(outcome, self.seed)
+        solution = concluded_at(
+            outer, outcome, self.formulation, self.tolerance, self.seed, began
+        )
         result = solution.result
         result |= spent_entry({"store": self.spent})
         end = None if solution.verified is None else solution.verified.point

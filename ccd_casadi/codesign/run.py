@@ -4,27 +4,24 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.catalogue import best_of_lists
 from ccd_casadi.codesign.design_plants import best_over_design_plants
-from ccd_casadi.codesign.direct import Direct, solve_direct
+from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import MANY, Formulation
-from ccd_casadi.codesign.lifted import Lifted, solve_lifted
-from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.outer_problem import unmet_constraint
-from ccd_casadi.codesign.result import infeasible_dict, result_dict
-from ccd_casadi.codesign.second_look import conclude, conclude_with_look, rescue
+from ccd_casadi.codesign.outer_sections import SectionsOuter
+from ccd_casadi.codesign.search import concluded, concluded_at, nothing_found, searched
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.sections_run import SectionsRun, run_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.surrogate_quality import surrogate_quality
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
@@ -82,32 +79,38 @@ def co_design(
             raise UserError("--surrogate: starts no solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
     began = perf_counter()
-    name = type(formulation).__name__.lower()
-
-    def concluded(each: Sampler, outcome: FormulationResult) -> Solution:
-        return conclude(each, name, outcome, formulation.tolerance, seed, began)
-
+    name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
+    outer = outer_of(sampler)
+    require_solvable(sampler.problem, given is not None)
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
-    if sampler.problem.sections is not None and not forbidden:
-        return _of_sections(sampler, formulation, seed, given)
     if forbidden:
-        return concluded(sampler, FormulationResult(None, None, (), (), None, False, forbidden))
+        return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
 
     def solved(each: Sampler) -> Solution:
-        if isinstance(formulation, Nested):
-            outcome = solve_nested(each, formulation, seed=seed, given=given)
-        elif isinstance(formulation, Lifted):
-            outcome = solve_lifted(each, formulation, seed=seed, given=given)
-        else:
-            with each.spent.on("search"):
-                outcome = solve_direct(each, formulation, seed=seed)
-        if outcome.x is None:
-            outcome = rescue(each, outcome, seed)
-        if outcome.x is None:
-            return concluded(each, outcome)
-        return conclude_with_look(each, formulation, outcome, seed, began)
+        found = searched(outer_of(each), formulation, seed, given)
+        return concluded(found, name, tolerance, seed, began)
 
-    return best_over_design_plants(sampler, solved, concluded)
+    def continued(each: Sampler, outcome: FormulationResult) -> Solution:
+        return concluded_at(outer_of(each), outcome, name, tolerance, seed, began)
+
+    def explained(each: Sampler, found: Solution, share: float | None) -> str:
+        return outer_of(each).explained(found, share)
+
+    return best_over_design_plants(sampler, solved, continued, explained)
+
+
+def outer_of(sampler: Sampler) -> Outer:
+    """The outer problem of the kind of controller that a sampler's problem has."""
+    return MixedOuter(sampler) if sampler.problem.sections is None else SectionsOuter(sampler)
+
+
+def require_solvable(problem: CoDesignProblem, given: bool) -> None:
+    """Raise UserError where J rewards what it should not, or `given` surrogates are of no use."""
+    if problem.sections is not None and given:
+        raise UserError("--surrogate: starts no solve with sections; solve the case without it")
+    if not problem.figure.larger_is_better and not problem.w2 > 0.0:
+        words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
+        raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
@@ -121,41 +124,3 @@ def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution
         lambda each, near: co_design(each, quick, seed),
         lambda each, near: co_design(each, formulation, seed),
     )
-
-
-def _of_sections(
-    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None
-) -> Solution:
-    """A co-design with a controller of fixed structure."""
-    if given is not None:
-        raise UserError("--surrogate: starts no solve with sections; solve the case without it")
-    problem = sampler.problem
-    if sections_of_problem(problem).of_error and not problem.w2 > 0.0:
-        words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
-        raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
-    began, name = perf_counter(), type(formulation).__name__.lower()
-    found = run_sections(sampler, formulation, seed)
-    return solution_of_sections(
-        sampler.problem, name, found, formulation.tolerance, seed, perf_counter() - began,
-        sampler.quiet,
-    )  # fmt: skip
-
-
-def solution_of_sections(
-    problem: CoDesignProblem,
-    name: str,
-    found: SectionsRun,
-    tolerance: float,
-    seed: int,
-    seconds: float,
-    quiet: bool = True,
-) -> Solution:
-    """result.json and the objects behind it."""
-    spent: dict[str, Any] = {"spent": found.spent, "seconds": seconds, "seed": seed}
-    if found.verified is None:
-        return Solution(infeasible_dict(name, found.outcome.message, **spent), found.outcome, None)
-    quality = surrogate_quality(found.outcome.surrogates, found.verified, seed, quiet=quiet)
-    result = result_dict(
-        name, found.outcome, found.verified, tolerance=tolerance, quality=quality, **spent
-    )
-    return Solution(result, found.outcome, found.verified, quality)

@@ -96,7 +96,7 @@ def by_pieces(
     one becomes an anchor, and the search goes on.
     """
     for _ in range(FOLLOWED):
-        best, jumped = _by_pieces(truth, best, settled)
+        best, jumped = pieces_from(truth, best, settled)
         if not jumped:
             break
         problem = joined(truth.sampler.problem, np.array(best.kappa), ())
@@ -105,7 +105,7 @@ def by_pieces(
     return truth, best
 
 
-def _by_pieces(
+def pieces_from(
     truth: TrueBandwidth, best: BandwidthSample, settled: float
 ) -> tuple[BandwidthSample, bool]:
     """The best sample of one function ω_b*, and whether that jumps beside it."""

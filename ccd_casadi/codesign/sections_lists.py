@@ -20,8 +20,9 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
+from ccd_casadi.codesign.outer_sections import SectionsEnd, SectionsOuter
+from ccd_casadi.codesign.search import searched
 from ccd_casadi.codesign.sections_direct import by_pieces
-from ccd_casadi.codesign.sections_run import search_sections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
@@ -69,8 +70,9 @@ class ListedSections:
         return self._anew(sampler) if found is None else found
 
     def _anew(self, sampler: Sampler) -> Solution:
-        first = search_sections(sampler, self.formulation, self.seed)
-        if first.end is None:
+        quick = replace(self.formulation, box_points=0)  # a bound needs no look at the box
+        first = searched(SectionsOuter(sampler), quick, self.seed)
+        if not isinstance(first.end, SectionsEnd):
             return _nothing(first.outcome.message)
         more = sections_of_problem(first.end.asked.problem).members
         self.members = tuple(dict.fromkeys((*self.members, *more)))

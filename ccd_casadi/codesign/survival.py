@@ -18,9 +18,11 @@ from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel,
 from ccd_casadi.codesign.reach import reach
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_robustness import LOOSE
+from ccd_casadi.lti.closed_loop import open_alone
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import StateSpace, scale_plant
+from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
@@ -152,8 +154,6 @@ def _margins(loop: Loop) -> list[ClassicalMargins]:
     """Of each loop broken alone at the plant's inputs."""
 
     def broken(i: int, w: Array) -> np.ndarray:
-        L = loop.controller(w) @ loop.respond(w)
-        S = np.linalg.inv(np.eye(L.shape[1]) + L)
-        return np.asarray(1.0 / S[:, i, i] - 1.0)
+        return open_alone(loop.controller(w) @ loop.respond(w), i)
 
     return [classical_margins(partial(broken, i), loop.grid) for i in range(loop.plant.B.shape[1])]

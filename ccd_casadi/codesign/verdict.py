@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
-from ccd_casadi.codesign.box_look import BoxLook
+from ccd_casadi.codesign.formulation import BoxLook
 from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure

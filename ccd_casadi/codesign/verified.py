@@ -12,14 +12,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.box_look import BoxLook
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
 from ccd_casadi.codesign.verdict import SADDLE, Line
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.arrays import Array
 
 

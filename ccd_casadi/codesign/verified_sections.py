@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ccd_casadi.codesign.box_look import BoxLook
-from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.full_order import Beside
 from ccd_casadi.codesign.robust_check import reach_of
 from ccd_casadi.codesign.sections_entries import (
@@ -19,7 +18,7 @@ from ccd_casadi.codesign.sections_entries import (
     sections_controller,
 )
 from ccd_casadi.codesign.sections_races import Raced
-from ccd_casadi.codesign.verdict import Line, State, survives
+from ccd_casadi.codesign.verdict import Line, State, look_words, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -28,7 +27,7 @@ from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ, counted
 
 
@@ -192,10 +191,12 @@ class VerifiedSections(Verified):
     def searched(
         self, outcome: FormulationResult, look: BoxLook | None
     ) -> tuple[str, Mapping[str, Any]]:
-        found = [value / HZ for value, _ in self.raced.optima]
-        raced, of = ", ".join(f"{value:.2f}" for value in found), ""
-        figure = self.problem.figure
-        if figure is not BANDWIDTH:
-            of = f", from there at {figure.shown(self.raced.value)}"
-        known = f"a full race at this theta ended at {raced} Hz{of}; gap not known"
-        return known, {"local_optima_hz": found}
+        solved = outcome.outer
+        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
+        known, figures = look_words(starts, optima, look)
+        found, of = [value / HZ for value, _ in self.raced.optima], ""
+        if self.problem.figure is not BANDWIDTH:
+            of = f", from there at {self.problem.figure.shown(self.raced.value)}"
+        raced = ", ".join(f"{value:.2f}" for value in found)
+        words = f"a full race at this theta ended at {raced} Hz{of}; {known}"
+        return words, {**figures, "local_optima_hz": found}

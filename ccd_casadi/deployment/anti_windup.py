@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import lstsq, null_space, solve_discrete_are
 
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.deployment.sampled import DiscreteStateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -40,7 +40,7 @@ def limited(realisation: Realisation, bandwidth: float) -> Realisation:
     return replace(realisation, back_calculation=L)
 
 
-def back_calculation(K: DiscreteStateSpace, limit: float, bandwidth: float) -> Array:
+def back_calculation(K: StateSpace, limit: float, bandwidth: float) -> Array:
     """L (n, m) for a limit in N and ω_b in rad/s; raises UserError where K has no such gain."""
     n, m = K.B.shape[0], K.C.shape[0]
     if not n:
@@ -65,7 +65,7 @@ def back_calculation(K: DiscreteStateSpace, limit: float, bandwidth: float) -> A
     )
 
 
-def takeover(K: DiscreteStateSpace) -> Array:
+def takeover(K: StateSpace) -> Array:
     """X (n, p + m): the state [e₀; u₀] -> x₀ from which the first force is u₀ and least moves on.
 
     min ‖(A - I) x + B e‖ subject to C x = u - D e; where C has dependent rows (no state can make

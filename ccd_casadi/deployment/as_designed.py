@@ -32,7 +32,7 @@ from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure

@@ -6,10 +6,11 @@ is not in it.
 """
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
-from ccd_casadi.deployment.sampled import DiscreteStateSpace
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 PER_DECADE = 60
@@ -17,33 +18,27 @@ DECADES = 6  # below the Nyquist frequency
 CLOSE = 0.1  # relative: local maxima this close to the largest are followed to their tops
 
 
-def sampled_compliance(plant: StateSpace, S: DiscreteStateSpace) -> float:
+def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
     """max over ω of σ_max(S(e^{jωT}) G(jω)), m/N; the plant in SI without hold and delay.
 
     S is stable (`sensitivity_loop`). Points on a logarithmic grid and at every resonance of plant
     and loop, the largest local maxima climbed.
     """
     end = np.pi / S.period
-    poles = np.linalg.eigvals(S.A)
-    roots = np.concatenate([np.abs(np.angle(poles)) / S.period, np.abs(np.linalg.eigvals(plant.A))])
+    poles = S.poles
+    roots = np.concatenate([np.abs(np.angle(poles)) / S.period, np.abs(plant.poles)])
     near = (roots[:, None] * np.array([0.98, 0.995, 1.0, 1.005, 1.02])).ravel()
-    grid = np.geomspace(end * 10.0**-DECADES, end, DECADES * PER_DECADE)
-    rest = 1e-2 * grid[:1]  # a constant force, but for a plant without suspension
-    omega = np.unique(np.concatenate([rest, grid, near[(near > grid[0]) & (near < end)]]))
+    low = end * 10.0**-DECADES
+    grid = frequency_grid(low, end, DECADES * PER_DECADE, near)
+    omega = np.append(1e-2 * low, grid)  # a constant force, but for a plant without suspension
 
     def gain(at: Array) -> Array:
-        s = 1j * at[:, None, None]
-        G = plant.C @ np.linalg.solve(s * np.eye(len(plant.A)) - plant.A, plant.B + 0j) + plant.D
-        return np.asarray(np.linalg.norm(S.response(at) @ G, 2, axis=(1, 2)), dtype=float)
+        return largest(S.response(at) @ plant.response(at))
 
     found = gain(omega)
     best = float(found.max())
-    inner = np.flatnonzero((found[1:-1] >= found[:-2]) & (found[1:-1] >= found[2:])) + 1
-    for i in inner[found[inner] >= (1.0 - CLOSE) * best]:
-        top = minimize_scalar(
-            lambda x: -float(gain(np.exp([x]))[0]),
-            bounds=(float(np.log(omega[i - 1])), float(np.log(omega[i + 1]))),
-            method="bounded", options={"xatol": 1e-9},
-        )  # fmt: skip
-        best = max(best, -float(top.fun))
+    for i in local_maxima(found):
+        if found[i] >= (1.0 - CLOSE) * best:
+            ends = float(omega[i - 1]), float(omega[i + 1])
+            best = max(best, climbed(lambda w: float(gain(np.array([w]))[0]), *ends, 1e-9)[1])
     return best

@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     SampledFigures,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
 from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.state_space import StateSpace
 
 SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
 CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed
@@ -51,7 +51,7 @@ class Conversion:
 
 def discretise(
     controller: StateSpace, conversion: Conversion, period: float, delay: float
-) -> DiscreteStateSpace:
+) -> StateSpace:
     """K(z) for a period and a delay in s, the lead on its input.
 
     Raises ValueError where the frequency to be exact at lies above half the sampling rate.
@@ -65,19 +65,20 @@ def discretise(
             if not conversion.defined(period):
                 raise ValueError("the peak of S lies above half the sampling rate")
             step = 2.0 * np.tan(0.5 * conversion.warp * period) / conversion.warp
-        A, B, C, D, _ = cont2discrete(parts, step, "bilinear")
+        found = tustin(controller, step)
+        A, B, C, D = found.A, found.B, found.C, found.D
     else:
         A, B, C, D, _ = cont2discrete(parts, period, conversion.method.value)
     alpha = conversion.advance(period, delay)
     if not alpha:
-        return DiscreteStateSpace(A, B, C, D, period)
+        return StateSpace(A, B, C, D, period=period)
     n, m = B.shape
-    return DiscreteStateSpace(
+    return StateSpace(
         np.block([[A, -alpha * B], [np.zeros((m, n + m))]]),
         np.vstack([(1.0 + alpha) * B, np.eye(m)]),
         np.hstack([C, -alpha * D]),
         (1.0 + alpha) * D,
-        period,
+        period=period,
     )
 
 

@@ -8,9 +8,8 @@ Steinbuch 2004). A setpoint of fourth order has all of these derivatives bounded
 """
 
 import numpy as np
-from scipy.linalg import eigvals
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
@@ -26,28 +25,15 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     aliasing error is RADIUS^(POINTS - ORDER). Raises UserError where the plant has a zero at s = 0,
     so that no finite force holds a position.
     """
-    zeros = _zeros(plant)
-    poles = np.abs(np.linalg.eigvals(plant.A))
+    poles = np.abs(plant.poles)
+    zeros = plant.zeros(float(poles.max()))
     nearest = min([*np.abs(zeros), poles.max()])
     if not nearest > 1e-9 * poles.max():
         raise UserError("the plant has a zero at 0 Hz: no feedforward of the setpoint exists")
     s = RADIUS * nearest * np.exp(2j * np.pi * np.arange(POINTS) / POINTS)
-    G = (
-        plant.C @ np.linalg.solve(s[:, None, None] * np.eye(len(plant.A)) - plant.A, plant.B + 0j)
-        + plant.D
-    )
+    G = plant.at(s)
     ahead = np.exp(s * (delay + 0.5 * period))[:, None, None] * np.linalg.pinv(G)
     series = np.fft.fft(ahead, axis=0).real / POINTS
     powers = (RADIUS * nearest) ** np.arange(ORDER + 1)
     return np.asarray(series[: ORDER + 1] / powers[:, None, None])
 
-
-def _zeros(plant: StateSpace) -> np.ndarray:
-    """Finite transmission zeros of a square plant; none of another (in general it has none)."""
-    n, m = plant.B.shape
-    if len(plant.C) != m:
-        return np.zeros(0)
-    system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
-    alpha, beta = eigvals(system, np.diag([1.0] * n + [0.0] * m), homogeneous_eigvals=True)
-    finite = np.abs(beta) * np.linalg.norm(plant.A, 2) > 1e-9 * np.abs(alpha)
-    return np.asarray(alpha[finite] / beta[finite])

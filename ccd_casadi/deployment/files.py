@@ -10,7 +10,6 @@ from ccd_casadi.deployment.reduction import Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
 from ccd_casadi.deployment.sections import Root, Section, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -34,8 +33,8 @@ def write_files(
         "plant": named_plant(run.plant.plant_si()),
         "controller": named_controller(run.controller),
         "controller_reduced": named_controller(found.reduced),
-        "controller_discrete": named_controller(StateSpace(K.A, K.B, K.C, K.D), K.period),
-        "plant_discrete": named_plant(StateSpace(held.A, held.B, held.C, held.D), held.period),
+        "controller_discrete": named_controller(K, K.period),
+        "plant_discrete": named_plant(held, held.period),
     }
     theta = dict(zip(run.problem.names, run.theta, strict=True))
     units = dict(zip(run.problem.names, run.problem.units, strict=True))

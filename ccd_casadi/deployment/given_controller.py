@@ -20,19 +20,17 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
-from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.recurrence import states
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.interchange import read_mat
@@ -62,7 +60,7 @@ class Given:
 class Sampled:
     """A controller in discrete time with its delay in s; see `SampledController`."""
 
-    system: DiscreteStateSpace
+    system: StateSpace
     delay: float
 
     @property
@@ -77,23 +75,14 @@ class Sampled:
         growth = np.log(max(f.spectral_radius, 1e-300)) / self.period
         return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
 
-    def responses(self, plant: ScaledPlant, omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G behind hold and delay, and K."""
-        held = sampled_plant(plant.plant_si(), self.period, self.delay)
-        return held.response(omega), self.system.response(omega)
+    def loop(self, plant: ScaledPlant) -> Loop:
+        """The loop on a plant, hold and delay exact."""
+        return Loop(plant.plant_si(), self.system, Sampling(1.0 / self.period, 1e6 * self.delay))
 
-    def run(self, plant: ScaledPlant, references: Array, forces: Array) -> tuple[Array, Array]:
-        """Errors e (N, p) and forces u (N, m) from rest.
 
-        u = K e + what is fed forward; x and z are the states of plant and controller.
-        """
-        G, K = sampled_plant(plant.plant_si(), self.period, self.delay), self.system
-        n = len(G.A)
-        A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-        driven = np.hstack([(references @ K.D.T + forces) @ G.B.T, references @ K.B.T])
-        joint = states(A, driven)
-        errors = references - joint[:, :n] @ G.C.T
-        return errors, joint[:, n:] @ K.C.T + errors @ K.D.T + forces
+def in_discrete_time(controller: StateSpace, at: Sampling) -> Sampled:
+    """K(z) by Tustin's rule, as loops of fixed structure are designed to run."""
+    return Sampled(tustin(controller, at.period), at.delay)
 
 
 def as_it_runs(run: FinishedRun) -> FinishedRun:
@@ -104,14 +93,10 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
     sections = run.problem.sections
     if sections is None or sections.sampling is None:
         return run
-    period, delay = sections.sampling.period, sections.sampling.delay
-    tustin = Conversion(Discretisation.TUSTIN, False, run.figures.sensitivity_peak_frequency)
-    system = discretise(run.controller, tustin, period, delay)
-    sampled = Sampled(system, delay)
+    sampled = in_discrete_time(run.controller, sections.sampling)
     _, bandwidth, peak, _ = sampled.judge(run.plant)
     figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
-    K = StateSpace(system.A, system.B, system.C, system.D)
-    return replace(run, controller=K, figures=figures, sampled=sampled)
+    return replace(run, controller=sampled.system, figures=figures, sampled=sampled)
 
 
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
@@ -133,7 +118,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
-    sampled = Sampled(DiscreteStateSpace(K.A, K.B, K.C, K.D, given.period), given.delay)
+    sampled = Sampled(replace(K, period=given.period), given.delay)
     stable, bandwidth, peak, growth = sampled.judge(run.plant)
     if not stable:
         words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
@@ -214,7 +199,7 @@ def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
     found = replace(one, D=np.array([[number("gain", table["gain"])]]))
     if "integrator_hz" in table:
         w = HZ * number("integrator_hz", table["integrator_hz"])
-        found = _series(found, StateSpace(np.zeros((1, 1)), np.eye(1), np.array([[w]]), np.eye(1)))
+        found = found.series(StateSpace(np.zeros((1, 1)), np.eye(1), np.array([[w]]), np.eye(1)))
     for kind, (needed, optional) in SECTIONS.items():
         rows = table.get(kind, [])
         for i, row in enumerate(rows if isinstance(rows, list) else [rows], 1):
@@ -222,9 +207,9 @@ def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:
             if not isinstance(row, Mapping) or not set(needed) <= set(row) <= {*needed, *optional}:
                 raise UserError(f"{path}: {place}: give {', '.join((*needed, *optional))}")
             values = {key: number(f"{place}: {key}", value) for key, value in row.items()}
-            found = _series(found, _section(values))
+            found = found.series(_section(values))
     # a gain alone gets a state that nothing sees: what certifies a loop expects one
-    return found if len(found.A) else _series(found, UNSEEN)
+    return found if len(found.A) else found.series(UNSEEN)
 
 
 def _section(v: Mapping[str, float]) -> StateSpace:
@@ -251,13 +236,3 @@ def _polynomial(v: Mapping[str, float], root: str) -> tuple[float, float, float]
         return 0.0, 1.0 / w, 1.0
     return 1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0
 
-
-def _series(first: StateSpace, then: StateSpace) -> StateSpace:
-    """`then` behind `first`."""
-    n, m = len(first.A), len(then.A)
-    return StateSpace(
-        np.block([[first.A, np.zeros((n, m))], [then.B @ first.C, then.A]]),
-        np.vstack([first.B, then.B @ first.D]),
-        np.hstack([then.D @ first.C, then.C]),
-        then.D @ first.D,
-    )

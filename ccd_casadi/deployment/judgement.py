@@ -12,14 +12,13 @@ from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
 from ccd_casadi.deployment.sampled import (
-    DiscreteStateSpace,
     sampled_figures,
     sampled_plant,
     sensitivity_loop,
 )
 from ccd_casadi.deployment.simulation import measure_set
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
-from ccd_casadi.plants.scaling import StateSpace
 from ccd_casadi.synthesis.statics import Statics, statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -87,7 +86,7 @@ def unverified(run: FinishedRun) -> str:
     return "" if status == "verified" else str(run.result.get("reason") or status)
 
 
-def statics_of(run: FinishedRun, K: DiscreteStateSpace) -> Statics:
+def statics_of(run: FinishedRun, K: StateSpace) -> Statics:
     """What a constant force moves with the sampled controller."""
     return statics(
         run.plant.plant_si(), StateSpace(K.A, K.B, K.C, K.D), bandwidth=run.figures.bandwidth,

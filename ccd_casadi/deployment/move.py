@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.robust.setpoint import Setpoint
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 PARTS = 20  # of a period
@@ -37,29 +38,6 @@ class Hardware:
         return not (self.sensor_step or self.force_step or self.jitter)
 
 
-@dataclass(frozen=True)
-class SampledMove:
-    """Times (k,) in s, setpoint (k,), true error (k, p) and applied force (k, m) at the instants.
-
-    `settled`: seconds from the start until the error stays within the window, inf where it does
-    not; `restless`: largest error over the last quarter of the watch, a limit cycle's amplitude;
-    `saturated`: share of the samples at the limit.
-    """
-
-    time: Array
-    position: Array
-    error: Array
-    force: Array
-    settled: float
-    restless: float
-    saturated: float
-
-    @property
-    def peak_error(self) -> float:
-        """Largest error of any output."""
-        return float(np.abs(self.error).max())
-
-
 def move(
     plant: StateSpace,
     realisation: Realisation,
@@ -70,7 +48,7 @@ def move(
     forward: Array | None = None,
     window: float = 1e-6,
     hardware: Hardware | None = None,
-) -> SampledMove:
+) -> Move:
     """The move of output `axis` on a plant in SI; `forward` from `feedforward`, or None."""
     hardware = hardware or Hardware()
     K, T = realisation.system, realisation.system.period
@@ -115,11 +93,8 @@ def move(
             step = ahead_by[following - part]
             x = step[:, :n] @ x + step[:, n:] @ u_now
             part = following
-    outside = np.flatnonzero(np.abs(error).max(axis=1) > window)
-    last = outside[-1] if outside.size else -1
-    settled = np.inf if last == count - 1 else float(time[last + 1])
-    rest = float(np.abs(error[-max(count // 4, 1) :]).max())
-    return SampledMove(time, wanted[0], error, force, settled, rest, clipped / count)
+    return Move(time, wanted[0], wanted[2], error, force, forward is not None, profile.duration,
+                window, saturated=clipped / count)  # fmt: skip
 
 
 def _stepped(value: Array, step: float) -> Array:

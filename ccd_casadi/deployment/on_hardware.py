@@ -12,16 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.setpoint import Limits, Setpoint, setpoint
 from ccd_casadi.deployment.anti_windup import limited
 from ccd_casadi.deployment.feedforward import feedforward
-from ccd_casadi.deployment.move import Hardware, SampledMove, move
+from ccd_casadi.deployment.move import Hardware, move
 from ccd_casadi.deployment.realisation import Realisation
-from ccd_casadi.plants.scaling import StateSpace
-from ccd_casadi.robust.demands import Limits
-from ccd_casadi.robust.setpoint import Setpoint, setpoint
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
+WATCHED = 0.25  # of the watch, in whose end a limit cycle is seen
 SHARES = (0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of the peak force that are tried
 
 
@@ -30,7 +31,7 @@ class Way:
     """One way to make the move, in words and as it went."""
 
     words: str
-    move: SampledMove
+    move: Move
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def on_hardware(
 
     def made(
         controller: Realisation, ahead: Array | None, electronics: Hardware | None = None
-    ) -> SampledMove:
+    ) -> Move:
         return move(
             plant, controller, delay, profile, forward=ahead, window=window, hardware=electronics
         )
@@ -86,7 +87,7 @@ def on_hardware(
         ways.append(Way("limited, with back-calculation", made(realisation, forward)))
     if hardware is not None and not hardware.ideal:
         ways.append(Way("with the electronics", made(realisation, forward, hardware)))
-    peak, least = float(np.abs(unlimited.force).max()), np.nan
+    peak, least = float(unlimited.peak_force.max()), np.nan
     if realisation.saturation is not None and np.isfinite(unlimited.settled):
         progress("least force")
         least = 1.0
@@ -110,8 +111,8 @@ def hardware_dict(found: OnHardware) -> dict[str, Any]:
                 "words": way.words,
                 "settled": None if np.isinf(way.move.settled) else way.move.settled,
                 "peak_error": way.move.peak_error,
-                "last_error": way.move.restless,
-                "peak_force": float(np.abs(way.move.force).max()),
+                "last_error": way.move.last_error(WATCHED),
+                "peak_force": float(way.move.peak_force.max()),
                 "saturated": way.move.saturated,
             }
             for way in found.ways

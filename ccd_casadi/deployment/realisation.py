@@ -8,13 +8,12 @@ numbers.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ccd_casadi.deployment.channels import Channel, assemble
-from ccd_casadi.deployment.sampled import DiscreteStateSpace
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 CONDITION = 1e4  # most of the block-diagonalising transformation's entries
@@ -28,7 +27,7 @@ class Realisation:
     cut off: + L (u_k - v_k), L = `back_calculation` (n, m) (`anti_windup`).
     """
 
-    system: DiscreteStateSpace
+    system: StateSpace
     blocks: tuple[int, ...]
     saturation: float | None = None
     back_calculation: Array | None = None
@@ -45,7 +44,7 @@ class Realisation:
 
 def realise(
     channels: Sequence[Channel],
-    controllers: Sequence[DiscreteStateSpace],
+    controllers: Sequence[StateSpace],
     saturation: float | None = None,
 ) -> Realisation:
     """The controllers of all channels as one block-diagonal system from e to u."""
@@ -55,11 +54,11 @@ def realise(
         parts.append(part)
         blocks += sizes
     whole = assemble(channels, parts)
-    system = DiscreteStateSpace(whole.A, whole.B, whole.C, whole.D, controllers[0].period)
+    system = replace(whole, period=controllers[0].period)
     return Realisation(system, tuple(blocks), saturation)
 
 
-def _block_diagonal(K: DiscreteStateSpace) -> tuple[StateSpace, list[int]]:
+def _block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
     from control import bdschur  # it takes a second to import, and reports import this module

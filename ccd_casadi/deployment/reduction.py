@@ -25,7 +25,9 @@ from scipy.linalg import LinAlgError, eigh, solve_continuous_are, svd
 from scipy.linalg import solve_continuous_lyapunov as lyapunov
 
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.synthesis.closed_loop import measure
@@ -82,7 +84,7 @@ def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Red
     A method that cannot give an order is left out there. ω_low in rad/s.
     """
     plant = channel.plant
-    K = _in_units_of(plant, channel.controller)
+    K = channel.controller.in_units(plant.omega_0, plant.force)
     _, values = _loop_balanced(plant, K, 0)
     order = int(np.sum(values > NEGLIGIBLE * values[0]))
     K, _ = _loop_balanced(plant, K, order)
@@ -94,7 +96,7 @@ def reductions(channel: Channel, weights: Weights, omega_low: float) -> list[Red
             smaller = reduce(plant, K, r)
             if smaller is None:
                 continue
-            controller = _in_si(plant, smaller)
+            controller = smaller.in_units(1.0 / plant.omega_0, 1.0 / plant.force)
             figures = measure(plant, controller, weights, gamma=UNBOUNDED, omega_low=omega_low)
             found.append(Reduced(r, method, controller, figures))
     return found
@@ -157,16 +159,14 @@ def _closed_loop(plant: ScaledPlant, K: StateSpace, r: int) -> StateSpace | None
 
 def _loop_balanced(plant: ScaledPlant, K: StateSpace, order: int) -> tuple[StateSpace, Array]:
     """K truncated to `order` in the coordinates that balance it in the loop, and its values."""
-    n, N, p = len(plant.A), len(K.A), plant.C.shape[0]
-    A = np.block([[plant.A - plant.B @ K.D @ plant.C, plant.B @ K.C], [-K.B @ plant.C, K.A]])
-    B = np.vstack([plant.B @ K.D, K.B])
-    C = np.hstack([plant.C, np.zeros((p, N))])
+    n, T = len(plant.A), closed_loop(plant.system, K).T
+    A, B, C = T.A, T.B, T.C
     R = _root(lyapunov(A, -B @ B.T)[n:, n:])
     L = _root(lyapunov(A.T, -C.T @ C)[n:, n:])
     U, s, Vt = svd(L.T @ R)
     size = np.sqrt(s[:order])
-    T, inverse = R @ Vt[:order].T / size, (U[:, :order] / size).T @ L.T
-    return StateSpace(inverse @ K.A @ T, inverse @ K.B, K.C @ T, K.D), s
+    turned, inverse = R @ Vt[:order].T / size, (U[:, :order] / size).T @ L.T
+    return StateSpace(inverse @ K.A @ turned, inverse @ K.B, K.C @ turned, K.D), s
 
 
 def _residual(K: StateSpace, r: int) -> StateSpace:
@@ -209,12 +209,3 @@ def _root(gramian: Array) -> Array:
 def _sizes(K: StateSpace) -> tuple[int, int, int]:
     return len(K.A), K.B.shape[1], K.C.shape[0]
 
-
-def _in_units_of(plant: ScaledPlant, K: StateSpace) -> StateSpace:
-    w0, force = plant.omega_0, plant.force
-    return StateSpace(K.A / w0, K.B / w0, K.C / force, K.D / force)
-
-
-def _in_si(plant: ScaledPlant, K: StateSpace) -> StateSpace:
-    w0, force = plant.omega_0, plant.force
-    return StateSpace(w0 * K.A, w0 * K.B, force * K.C, force * K.D)

@@ -11,30 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.peaks import climbed
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 ROUNDS = 30  # of climbing; two or three are used
 CLOSE = 1e-9  # relative: by how much a peak may be missed
-
-
-@dataclass(frozen=True)
-class DiscreteStateSpace:
-    """x_{k+1} = A x_k + B v_k, z_k = C x_k + D v_k, every `period` (s)."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    period: float
-
-    def response(self, omega: Array) -> np.ndarray:
-        """C (z - A)⁻¹ B + D at z = e^{jωT}, (k, p, m); ω in rad/s."""
-        z = np.exp(1j * np.asarray(omega, float) * self.period)[:, None, None]
-        return self.C @ np.linalg.solve(z * np.eye(len(self.A)) - self.A, self.B + 0j) + self.D
 
 
 @dataclass(frozen=True)
@@ -48,11 +34,11 @@ class SampledFigures:
     bandwidth: float
 
 
-def sampled_plant(plant: StateSpace, period: float, delay: float) -> DiscreteStateSpace:
+def sampled_plant(plant: StateSpace, period: float, delay: float) -> StateSpace:
     """u_k to y_k behind a zero-order hold and a delay in s; states [x; u_{k-1}; …; u_{k-d-1}].
 
     With τ = (d + f)T, 0 <= f < 1, u_{k-d-1} acts during the first fT of a period, u_{k-d} during
-    the rest.
+    the rest. The judge's own, beside `lti.hold`.
     """
     n, m = plant.B.shape
     d = int(np.floor(delay / period + 1e-12))
@@ -75,21 +61,24 @@ def sampled_plant(plant: StateSpace, period: float, delay: float) -> DiscreteSta
         B[n : n + m] = np.eye(m)
         A[n + m :, n : n + (kept - 1) * m] = np.eye((kept - 1) * m)
     C = np.hstack([plant.C, np.zeros((len(plant.C), kept * m))])
-    return DiscreteStateSpace(A, B, C, np.zeros((len(C), m)), period)
+    return StateSpace(A, B, C, np.zeros((len(C), m)), period=period)
 
 
 def sensitivity_loop(
-    plant: DiscreteStateSpace, controller: DiscreteStateSpace
-) -> DiscreteStateSpace:
-    """S, r to e = r - y; the plant without feedthrough, states [plant; controller]."""
+    plant: StateSpace, controller: StateSpace
+) -> StateSpace:
+    """S, r to e = r - y; the plant without feedthrough, states [plant; controller].
+
+    The judge's own, beside `lti.closed_loop`.
+    """
     G, K = plant, controller
     A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
     B = np.vstack([G.B @ K.D, K.B])
     C = np.hstack([-G.C, np.zeros((len(G.C), len(K.A)))])
-    return DiscreteStateSpace(A, B, C, np.eye(len(C)), G.period)
+    return StateSpace(A, B, C, np.eye(len(C)), period=G.period)
 
 
-def sampled_figures(S: DiscreteStateSpace) -> SampledFigures:
+def sampled_figures(S: StateSpace) -> SampledFigures:
     """Stability by eigenvalues, ‖S‖∞ and ω_b by level tests confirmed on the response."""
     poles = np.linalg.eigvals(S.A)
     radius = float(np.abs(poles).max())
@@ -121,7 +110,7 @@ class _Levels:
     loops: 1.737 instead of 1.877 in one.)
     """
 
-    def __init__(self, S: DiscreteStateSpace) -> None:
+    def __init__(self, S: StateSpace) -> None:
         self.S = S
         inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
         self.A = np.ascontiguousarray(inverse @ (S.A - np.eye(len(S.A))))
@@ -131,7 +120,7 @@ class _Levels:
 
     def gains(self, omega: Array) -> Array:
         """σ_max(S) at frequencies in rad/s."""
-        return np.asarray(np.linalg.norm(self.S.response(omega), 2, axis=(1, 2)), dtype=float)
+        return largest(self.S.response(omega))
 
     def crossings(self, level: float) -> Array:
         """Candidates in rad/s, ascending."""
@@ -172,8 +161,5 @@ class _Levels:
         ends = (0.9 * start, min(1.1 * start, np.pi / self.S.period))
         if ends[0] >= ends[1]:
             return gain, start
-        found = minimize_scalar(
-            lambda omega: -float(self.gains(np.array([omega]))[0]),
-            bounds=ends, method="bounded", options={"xatol": 1e-9 * start},
-        )  # fmt: skip
-        return max((gain, start), (-float(found.fun), float(found.x)))
+        at, top = climbed(lambda w: float(self.gains(np.array([w]))[0]), *ends, 1e-9)
+        return max((gain, start), (top, at))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eig
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.support.units import HZ
@@ -99,7 +99,7 @@ def sections_of(K: StateSpace, bandwidth: float) -> Sections:
     found += [_section(z, None, bandwidth / HZ) for z in _left(zeros, used)]
     found += [_section(None, p, bandwidth / HZ) for p in _left(poles, used)]
     found.sort(key=lambda s: abs((s.pole or s.zero or Root(0.0)).hz))
-    at = K.C @ np.linalg.solve(1j * bandwidth * np.eye(len(K.A)) - K.A, K.B) + K.D
+    at = K.response(np.array([bandwidth]))[0]
     return Sections(gain, float(abs(at[0, 0])), tuple(found))
 
 

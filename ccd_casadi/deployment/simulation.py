@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from ccd_casadi.deployment.sampled import DiscreteStateSpace
 from ccd_casadi.kernels.sensitivity import HALF_POWER
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 LINES = 128  # frequency lines up to ω_b
@@ -36,8 +36,8 @@ class MeasuredSensitivity:
 
 
 def simulate(
-    plant: DiscreteStateSpace,
-    controller: DiscreteStateSpace,
+    plant: StateSpace,
+    controller: StateSpace,
     references: Array,
     state: tuple[Array, Array] | None = None,
 ) -> tuple[Array, tuple[Array, Array]]:
@@ -58,7 +58,7 @@ def simulate(
 
 
 def measure_sensitivity(
-    plant: DiscreteStateSpace, controller: DiscreteStateSpace, bandwidth: float, seed: int
+    plant: StateSpace, controller: StateSpace, bandwidth: float, seed: int
 ) -> MeasuredSensitivity:
     """S from a random-phase multisine on one reference after the other; ω_b to expect in rad/s.
 
@@ -68,8 +68,8 @@ def measure_sensitivity(
 
 
 def measure_set(
-    plants: Sequence[DiscreteStateSpace],
-    controller: DiscreteStateSpace,
+    plants: Sequence[StateSpace],
+    controller: StateSpace,
     bandwidth: float,
     seed: int,
 ) -> tuple[MeasuredSensitivity, ...]:
@@ -105,9 +105,9 @@ def measure_set(
     return tuple(found)
 
 
-def _beside(systems: Sequence[DiscreteStateSpace]) -> DiscreteStateSpace:
+def _beside(systems: Sequence[StateSpace]) -> StateSpace:
     A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
-    return DiscreteStateSpace(A, B, C, D, systems[0].period)
+    return StateSpace(A, B, C, D, period=systems[0].period)
 
 
 def _crossing(omega: Array, gain: Array) -> float:
@@ -119,12 +119,3 @@ def _crossing(omega: Array, gain: Array) -> float:
     i = above[0] - 1
     return float(np.exp(x[i] - y[i] * (x[i + 1] - x[i]) / (y[i + 1] - y[i])))
 
-
-def step_errors(
-    plant: DiscreteStateSpace, controller: DiscreteStateSpace, direction: Array, seconds: float
-) -> tuple[Array, Array]:
-    """Times in s and errors (k, p) after a unit step of the reference in `direction` (p,)."""
-    count = max(2, round(seconds / plant.period))
-    references = np.tile(np.asarray(direction, float)[:, None], (count, 1, 1))
-    errors, _ = simulate(plant, controller, references)
-    return np.arange(count, dtype=float) * plant.period, errors[:, :, 0]

@@ -1,21 +1,26 @@
 """What is drawn of one design: gains, Nyquist, poles, a step and a move; pure functions of it."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.signals import signals_of
+from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.sweep import missed_by
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.closed_loop import largest, responses_of
+from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.loops import section_bounds
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of
-from ccd_casadi.reporting.signals import Moved, in_discrete_time, signals_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
-from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 180  # of the frequency grid, besides those around resonances
 SAME = 1e-9  # relative distance of two frequencies below which they are one
@@ -40,7 +45,7 @@ class Curves:
     plant_poles: np.ndarray
     step_time: Array
     step: Array
-    move: Moved
+    move: Move
 
     @property
     def unstable(self) -> bool:
@@ -70,24 +75,22 @@ def curves_of(look: Look) -> Curves | None:
     hz = grid_of(look)
     run_at = sampling_of(look)
 
-    def respond(omega: Array) -> tuple[np.ndarray, np.ndarray]:
-        return responses(plant, K, omega)[:2]
-
+    loop = Loop(plant.plant_si(), K, run_at)
     if run_at is not None:  # it was designed for hold and delay
         hz = hz[hz < 0.499 * run_at.rate_hz]
-        respond = partial(in_discrete_time(K, run_at).responses, plant)
-    G, k = respond(HZ * hz)
-    S = np.linalg.inv(np.eye(G.shape[1]) + G @ k)
-    KS = k @ S
-    gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in (S, KS, G @ KS)])
+    G, k = loop.responses(HZ * hz)
+    found = responses_of(G, k)
+    gains = np.array([largest(found[name]) for name in ("S", "KS", "T")])
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
-    signals = signals_of(look.problem, look.elements.system, plant, K, run_at, bandwidth)
+    signals = signals_of(
+        loop, modal_plant(look.elements.system, Suspension(0.0, 0.0)), bandwidth
+    )
     return Curves(
         hz=hz,
         gains=gains,
         bounds=bounds_of(look, hz),
         loci=loci_of(G @ k, np.inf),
-        margins=least_margins(respond, HZ * hz),
+        margins=least_margins(loop.responses, HZ * hz),
         poles=signals.poles / HZ,
         controller_poles=np.linalg.eigvals(K.A) / HZ,
         plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
@@ -123,9 +126,8 @@ def grid_of(look: Look) -> Array:
     high = max(30.0 * bandwidth, 3.0 * float(natural.max(initial=0.0)))
     around = around_resonances(plant, look.controller)
     special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
-    grid = np.concatenate([np.geomspace(low, high, POINTS), around, special])
-    grid = np.unique(grid[(grid >= low) & (grid <= high)])  # NaN compares false
-    return grid[np.diff(grid, prepend=0.0) > SAME * grid]  # around a double pole they come twice
+    # around a double pole they come twice
+    return frequency_grid(low, high, POINTS, around, np.array(special), apart=SAME)
 
 
 def sampled_of(look: Look) -> AsSampled | None:
@@ -158,8 +160,6 @@ def as_sampled(
     sampled = in_discrete_time(controller, Sampling(rate_hz, delay_us))
     stable, bandwidth, peak, _ = sampled.judge(plant)
     near = plant.grid * plant.omega_0 / HZ
-    hz = np.unique(np.concatenate([np.geomspace(1e-4 * rate_hz, 0.499 * rate_hz, POINTS), near]))
-    hz = hz[(hz >= 1e-4 * rate_hz) & (hz <= 0.499 * rate_hz)]
-    G, K = sampled.responses(plant, HZ * hz)
-    S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
-    return AsSampled(stable, bandwidth / HZ, peak, hz, np.linalg.norm(S, 2, axis=(1, 2)))
+    hz = frequency_grid(1e-4 * rate_hz, 0.499 * rate_hz, POINTS, near)
+    S = sampled.loop(plant).sensitivity(HZ * hz)
+    return AsSampled(stable, bandwidth / HZ, peak, hz, largest(S))

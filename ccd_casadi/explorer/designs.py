@@ -18,9 +18,10 @@ from ccd_casadi.inner_problem.problem import (
     scaled_system,
 )
 from ccd_casadi.inner_problem.sweep import InnerResult, active_constraints, missed_by
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant, modal_plant
 from ccd_casadi.plants.plant import Mechanics, hardware_cost, mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
@@ -180,7 +181,7 @@ def _look(
     standing, reason = judged(problem, made.figures, broken)
     if elements.error > OWN and standing is not Standing.REFUSED:
         standing, reason = Standing.NEAR, ""
-    finite = all(np.isfinite(part).all() for part in vars(made.controller).values())
+    finite = all(np.isfinite(getattr(made.controller, part)).all() for part in "ABCD")
     return Look(
         knobs=knobs,
         problem=problem,

@@ -282,7 +282,7 @@ class Figures:
         end, um = 1e3 * c.move.time, 1e6 * c.move.error
         found += [
             _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
-            (self.end, {"location": 1e3 * c.move.end}),
+            (self.end, {"location": 1e3 * c.move.duration}),
         ]  # fmt: skip
         known = [c, *(pin.curves for pin in pinned if pin.curves is not None)]
         spans = [(made.y_range, [c.gains[i]], True) for i, made in enumerate(self.of_gain)]

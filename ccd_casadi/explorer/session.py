@@ -15,7 +15,7 @@ from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.modes import KnownModes, in_modal_form
 from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.machine import lumped, stage_modes_html
+from ccd_casadi.reporting.machine import lumped, surface_modes_html
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
@@ -158,4 +158,4 @@ def searched_exactly(task: tuple[CoDesignProblem, Knobs]) -> tuple[Look, str]:
     """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
     problem, knobs = task
     elements = elements_at(problem, knobs.theta)
-    return searched(problem, knobs, elements), stage_modes_html(problem, knobs.theta)
+    return searched(problem, knobs, elements), surface_modes_html(problem, knobs.theta)

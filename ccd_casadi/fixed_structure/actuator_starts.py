@@ -12,11 +12,11 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set, whole_closed_loops
 from ccd_casadi.fixed_structure.starts import at_random, with_crossover
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 

@@ -22,12 +22,13 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     frequency_grid,
     peaks,
 )
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced, transmission_zeros
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.units import counted
-from ccd_casadi.synthesis.norms import hinf_norm
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
@@ -160,7 +161,7 @@ def judged(
     if not stability < -_rounding(S.A):
         return _unstable(stability)
     roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
-    roots += [transmission_zeros(*_scaled(x)) * _size(x) for x in (G, K) if not x.D.any()]
+    roots += [x.zeros(_size(x)) for x in (G, K) if not x.D.any()]
     corner = 0.0
     if bounds.weights is not None:
         w = bounds.weights
@@ -237,7 +238,7 @@ def _unstable(stability: float) -> PlantFigures:
 
 
 def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:
-    """S, r to e, of a plant without feedthrough."""
+    """S, r to e, of a plant without feedthrough; the judge's own, beside `lti.closed_loop`."""
     A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
     B = np.vstack([G.B @ K.D, K.B])
     C = np.hstack([-G.C, np.zeros((len(G.C), len(K.A)))])
@@ -246,6 +247,8 @@ def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:
 
 def sampled(G: StateSpace, sampling: Sampling) -> StateSpace:
     """u_k to y_k with the delay as whole periods and a rest, in which the older force still acts.
+
+    The judge's own, beside `lti.hold`.
 
     ẋ = A x + B u with u held is integrated over both parts of a period by one exponential of
     [[A, B, 0], [0, 0, 1/T], [0, 0, 0]]-like blocks each.
@@ -292,6 +295,3 @@ def _norm(S: StateSpace, period: float | None) -> float:
 def _size(system: StateSpace) -> float:
     return float(np.abs(np.linalg.eigvals(system.A)).max())
 
-
-def _scaled(system: StateSpace) -> tuple[Array, Array, Array]:
-    return system.A / _size(system), system.B, system.C

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 HALF_POWER = 1.0 / np.sqrt(2.0)

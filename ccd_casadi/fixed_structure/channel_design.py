@@ -21,7 +21,6 @@ from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike,
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import Progress, synthesise_sections
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
@@ -33,7 +32,9 @@ from ccd_casadi.fixed_structure.sections_design import (
 )
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.fixed_structure.trust_region import Point, ascend
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from ccd_casadi.fixed_structure.decoupling import Decoupling
 from ccd_casadi.fixed_structure.structure import Kind, Structure, roots, state_space
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 

@@ -16,7 +16,6 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
 from ccd_casadi.fixed_structure.figures import assess, to_theta
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
@@ -30,6 +29,7 @@ from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
 from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, loop_matrices
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
 from ccd_casadi.fixed_structure.structure import response
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 

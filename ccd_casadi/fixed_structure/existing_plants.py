@@ -8,10 +8,11 @@ import numpy as np
 from ccd_casadi.fixed_structure import design
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import Progress
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.interchange import from_control, plant_from_control
 

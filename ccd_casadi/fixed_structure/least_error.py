@@ -22,7 +22,6 @@ from scipy.optimize import nnls
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
 from ccd_casadi.budget.frequency import Loop
-from ccd_casadi.budget.holding import Hold
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
@@ -30,7 +29,6 @@ from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
 from ccd_casadi.fixed_structure.descent import Point, descend
 from ccd_casadi.fixed_structure.design import Progress, problem_for
 from ccd_casadi.fixed_structure.figures import assess, to_theta
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.sections_design import (
@@ -39,7 +37,9 @@ from ccd_casadi.fixed_structure.sections_design import (
     in_problem_units,
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -58,7 +58,7 @@ class RmsError:
     plants: tuple[StateSpace, ...]
     structure: Structure
     budget: ErrorBudget
-    hold: Hold | None
+    hold: Sampling | None
 
     def at(self, kappa: Array) -> tuple[float, Array]:
         """ln e (m) at κ in SI, and its gradient; infinite where a loop is unstable."""
@@ -134,9 +134,8 @@ def least_error(
     if not isinstance(structure, Structure):
         raise ValueError("the least RMS error is searched for one input and one output only")
     problem = problem_for(plants, structure, bounds, sampling, design.frequencies)
-    hold = None if sampling is None else Hold(sampling.period, sampling.delay)
     goal = RmsError(
-        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), hold
+        tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), sampling
     )
     model = _OnPlants(problem, goal)
     w0 = problem.plants.omega_0

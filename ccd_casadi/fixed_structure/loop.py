@@ -16,7 +16,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling, moments, transfer
 from ccd_casadi.fixed_structure.loop_plant import (
     LoopPlant,
     finite_zeros,
@@ -25,6 +24,7 @@ from ccd_casadi.fixed_structure.loop_plant import (
     padded_states,
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
+from ccd_casadi.lti.hold import Sampling, moments, transfer
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError

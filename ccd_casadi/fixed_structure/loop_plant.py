@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eig
 
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling, in_w, sampled
+from ccd_casadi.lti.hold import Sampling, in_w, sampled
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -101,18 +101,12 @@ def _loop_plant(
         raise PlantError(f"plant {number} {words}")
     state = (A, B, C, np.zeros((len(C), B.shape[1])))
     if period is not None:
-        state = in_w(*sampled(A, B, C, period, delay), period)
+        w = in_w(sampled(StateSpace(*state), period, delay))
+        state = (w.A, w.B, w.C, w.D)
     dA = W @ (ratio * plant.dA) @ V
     return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)
 
 
 def finite_zeros(plant: LoopPlant) -> np.ndarray:
     """Finite eigenvalues of the system matrix's pencil in w; none where it is not square."""
-    n, m = plant.B.shape
-    if len(plant.C) != m:
-        return np.empty(0, complex)
-    system = np.block([[plant.A, plant.B], [plant.C, plant.D]])
-    shape = np.zeros((n + m, n + m))
-    shape[:n, :n] = np.eye(n)
-    values = eig(system, shape, right=False)
-    return np.asarray(values[np.isfinite(values) & (np.abs(values) < 1e5)])
+    return StateSpace(plant.A, plant.B, plant.C, plant.D).zeros()

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ

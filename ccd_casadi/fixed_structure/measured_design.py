@@ -34,7 +34,7 @@ from ccd_casadi.fixed_structure.structure import (
     second_slopes,
     state_space,
 )
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

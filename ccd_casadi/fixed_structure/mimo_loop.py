@@ -13,7 +13,6 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
-from ccd_casadi.fixed_structure.hold_and_delay import Sampling
 from ccd_casadi.fixed_structure.loop import PlantSet, rows_alike
 from ccd_casadi.fixed_structure.loop_plant import (
     finite_zeros,
@@ -21,6 +20,7 @@ from ccd_casadi.fixed_structure.loop_plant import (
     padded_modes,
     padded_states,
 )
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError

@@ -15,7 +15,7 @@ from ccd_casadi.fixed_structure.bounds import ShapeEnd
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 FITS = 6

@@ -14,7 +14,7 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.kernels.sections import INTEGRATOR, PAIR, REAL
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 LEAST_DAMPING = 1e-3  # of roots whose structure gives none: below it a notch is a needle

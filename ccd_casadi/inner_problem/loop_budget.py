@@ -8,11 +8,10 @@ import numpy as np
 from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.derivatives import variance_slopes
 from ccd_casadi.budget.frequency import Loop
-from ccd_casadi.budget.holding import Hold
-from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import plants_of
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
 
 
 @dataclass(frozen=True)
@@ -27,12 +26,7 @@ class LoopBudget:
     plants: int
     largest_error: float
     largest_force: float
-    hold: Hold | None
-
-
-def hold_of(sampling: Sampling | None) -> Hold | None:
-    """Hold and delay of a sampled loop."""
-    return None if sampling is None else Hold(sampling.period, sampling.delay)
+    hold: Sampling | None
 
 
 def loop_budget(
@@ -43,7 +37,7 @@ def loop_budget(
         return None
     plants, hold = [scaled_plant(problem, theta)], None
     if problem.sections is not None:
-        plants, hold = plants_of(problem, theta), hold_of(problem.sections.sampling)
+        plants, hold = plants_of(problem, theta), problem.sections.sampling
     model = evaluate_budget(plants[0].plant_si(), controller, problem.budget, hold)
     found = [
         variance_slopes(Loop(plant.plant_si(), controller, hold), problem.budget, ())

@@ -11,8 +11,8 @@ from typing import Any
 
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
-from ccd_casadi.plants.plant import ModelFunction, Plant, build_plant
-from ccd_casadi.plants.registry import BUILDERS, DATA, MODELS
+from ccd_casadi.plants.plant import ModelFunction, Plant
+from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
 from ccd_casadi.support.user_code import limited, require_user_code
 
@@ -51,8 +51,8 @@ class PlantSource:
         """What determines the plant; a file counts by its content, not by where it lies."""
         digest = self.pinned().content
         options = dict(self.options)
-        data = DATA.get(self.model or "")
-        if data is not None:
+        data = data_option(self.model)
+        if data:
             digest = _digest(Path(str(options.pop(data, ""))))
         return {
             "model": self.model,
@@ -90,12 +90,10 @@ def plant_from(
 
 @lru_cache(maxsize=8)
 def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
-    options, held = dict(source.options), source.held
-    if source.model in BUILDERS:
-        plant = BUILDERS[source.model]((*names, *held), **options)
-        return with_fixed(plant, held) if held else plant
-    assert source.model is not None
-    return build_plant(fixed_model(MODELS[source.model], held), names, options)
+    model, held = model_named(source.model), source.held
+    assert model is not None
+    plant = model.build((*names, *held), **dict(source.options))
+    return with_fixed(plant, held) if held else plant
 
 
 @lru_cache(maxsize=8)

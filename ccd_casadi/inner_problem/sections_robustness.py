@@ -20,7 +20,8 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.process_pool import Pool
 
 AT_ONCE = 3  # plants added in a round

@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.plants.modal import ModalPlant
-from ccd_casadi.plants.scaling import ScaledPlant, transmission_zeros
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -105,10 +105,10 @@ def _zeros(plant: ScaledPlant, effort_hz: float, free: ScaledPlant | None) -> tu
     """Zeros up to three times the frequency at which effort ends, one of each conjugate pair."""
     own = None
     if free is not None:
-        own = transmission_zeros(free.A, free.B, free.C) * (free.omega_0 / plant.omega_0)
+        own = free.system.zeros() * (free.omega_0 / plant.omega_0)
     limit = 3.0 * effort_hz * HZ / plant.omega_0
     found = []
-    for zero in transmission_zeros(plant.A, plant.B, plant.C):
+    for zero in plant.system.zeros():
         size = abs(zero)
         if zero.imag < 0.0 or not 1e-3 * limit < size < limit:
             continue

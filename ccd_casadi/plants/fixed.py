@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.plants.pictures import Drawing, ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -66,11 +67,19 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     free = ca.MX.sym("theta", len(place))
     entries = iter(ca.vertsplit(free))
     theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
-    nearby, domain = plant.nearby, plant.domain
+    nearby, domain, shapes, drawing = plant.nearby, plant.domain, plant.shapes, plant.drawing
 
     def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
         assert nearby is not None
         return of(nearby(own.at(theta), reach, pool))
+
+    def shown(theta: Sequence[float], count: int) -> ModeShapes:
+        assert shapes is not None
+        return shapes(own.at(theta), count)
+
+    def drawn(thetas: Mapping[str, Sequence[float]]) -> Drawing:
+        assert drawing is not None
+        return drawing({name: own.at(theta) for name, theta in thetas.items()})
 
     return replace(
         plant,
@@ -83,4 +92,6 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
         nearby=None if nearby is None else near,
         domain=None if domain is None else (domain[0][place], domain[1][place]),
         doubt=lambda theta: plant.doubt(own.at(theta)),
+        shapes=None if shapes is None else shown,
+        drawing=None if drawing is None else drawn,
     )

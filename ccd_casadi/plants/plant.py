@@ -14,6 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.plants.pictures import Drawing, ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool
@@ -57,7 +58,8 @@ class Plant:
     known. `nearby` makes, of θ and a relative reach, a cheaper `values` that holds within it and is
     to be checked by the true one. `doubt` says what is wrong with the derivatives at θ, empty where
     nothing is. Without `exact_hessian` second derivatives of `hardware` cost too much to be asked
-    for.
+    for. `shapes` are so many of the lowest flexible modes at θ as pictures need them, `drawing` is
+    of several θ by name; None where the plant has no such picture.
     """
 
     names: tuple[str, ...]
@@ -73,6 +75,8 @@ class Plant:
     nearby: Callable[[Sequence[float], float, Pool], Evaluate] | None = None
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
+    shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
+    drawing: Callable[[Mapping[str, Sequence[float]]], Drawing] | None = None
 
     @cached_property
     def slopes(self) -> ca.Function:

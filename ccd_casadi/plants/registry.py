@@ -1,23 +1,69 @@
-"""The plants of the case studies as the case file names them.
+"""The plants that a case file may name: the package's, and those of installed packages.
 
-A model function speaks CasADi; a plant builder takes the names of θ and evaluates by numbers.
+A package offers a plant of its own as an entry point of the group "ccd_casadi.plants", as
+`case_studies` does the rib stage: a `Model`, or its builder alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from ccd_casadi.plants.cad.plant import cad_stage
 from ccd_casadi.plants.imported.plant import modal_table, sampled_matrices
-from ccd_casadi.plants.plant import ModelFunction, Plant
-from ccd_casadi.plants.rib_stage.plant import rib_stage
-from ccd_casadi.plants.two_mass import two_mass
+from ccd_casadi.plants.plant import Plant
+from ccd_casadi.plants.two_mass import two_mass_plant
 
-MODELS: dict[str, ModelFunction] = {"two_mass": two_mass}
-BUILDERS: dict[str, Callable[..., Plant]] = {
-    "rib_stage": rib_stage,
-    "modal_table": modal_table,
-    "sampled_matrices": sampled_matrices,
-    "cad_stage": cad_stage,
+GROUP = "ccd_casadi.plants"
+
+
+@dataclass(frozen=True)
+class Model:
+    """`build(names of θ, **options)` gives the plant, and raises PlantError.
+
+    theta: the parameters that it needs; None: any. checks: what is wrong with an option's value,
+    None where nothing is. data: the option that names its data, relative to the case file. sound:
+    known to be, not diagnosed on loading.
+    """
+
+    build: Callable[..., Plant]
+    theta: tuple[str, ...] | None = None
+    checks: Mapping[str, Callable[[Any], str | None]] = field(default_factory=dict)
+    data: str = ""
+    sound: bool = False
+
+
+OWN: dict[str, Model] = {
+    "two_mass": Model(two_mass_plant, theta=("m1", "m2"), sound=True),
+    "modal_table": Model(modal_table, data="table"),
+    "sampled_matrices": Model(sampled_matrices, data="folder"),
+    "cad_stage": Model(cad_stage, data="morph"),
 }
-# The option of a model that names its data, relative to the case file.
-DATA: dict[str, str] = {"modal_table": "table", "sampled_matrices": "folder", "cad_stage": "morph"}
-SHIPPED = frozenset({"two_mass", "rib_stage"})  # known to be sound: not diagnosed on loading
+
+
+def data_option(name: str | None) -> str:
+    """The option of that model that names its data; empty where there is none."""
+    found = model_named(name)
+    return "" if found is None else found.data
+
+
+@cache
+def _offered() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def model_names() -> list[str]:
+    """All names, those of installed packages among them; nothing of these is imported."""
+    return sorted({*OWN, *_offered()})
+
+
+@cache
+def model_named(name: str | None) -> Model | None:
+    """The model of that name; None where there is none."""
+    if name is None or name in OWN:
+        return OWN.get(name or "")
+    if name not in _offered():
+        return None
+    found = _offered()[name].load()
+    return found if isinstance(found, Model) else Model(found)

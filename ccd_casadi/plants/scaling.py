@@ -8,23 +8,16 @@ plant M_K G(jω₀ω) has no units and does not change when the user's units do.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eig, matrix_balance
 
 from ccd_casadi.kernels.gamma import plant_gain
+from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.channels import Channel, find_channels
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-
-@dataclass(frozen=True)
-class StateSpace:
-    """ẋ = A x + B v, z = C x + D v."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+FLANKS = np.array([-4.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])  # in half widths of a root
 
 
 @dataclass(frozen=True)
@@ -84,6 +77,11 @@ class ScaledPlant:
     def members(self) -> "tuple[ScaledPlant, ...]":
         """The plants that a design on it is judged on: itself, and those of its family."""
         return (self, *(() if self.family is None else self.family.perturbed))
+
+    @property
+    def system(self) -> StateSpace:
+        """The scaled plant, time in 1/ω₀."""
+        return _system(self.A, self.B, self.C)
 
     def plant_si(self) -> StateSpace:
         """The plant, force to displacement, time in s."""
@@ -170,20 +168,6 @@ def scale_state_space(system: StateSpace, M_K: float) -> ScaledPlant:
     return ScaledPlant(A, B, C, omega_0, M_K, grid, gain, natural, *none)
 
 
-def balanced(A: Array, B: Array, C: Array) -> tuple[Array, Array, Array]:
-    """T⁻¹AT, T⁻¹B, CT with a diagonal T of powers of two that evens out the states' scales.
-
-    Inputs and outputs keep their units: balancing leaves alone what has an empty row or column.
-    """
-    n, m, p = len(A), B.shape[1], C.shape[0]
-    system = np.zeros((n + m + p, n + m + p))
-    system[:n, :n], system[:n, n : n + m], system[n + m :, :n] = A, B, C
-    even, _ = matrix_balance(system, permute=False)
-    parts = (even[:n, :n], even[:n, n : n + m], even[n + m :, :n])
-    A, B, C = (np.ascontiguousarray(part) for part in parts)
-    return A, B, C
-
-
 def _scaled_channels(
     channels: tuple[Channel, ...], A: Array, B: Array, C: Array
 ) -> tuple[ScaledChannel, ...]:
@@ -209,24 +193,12 @@ def _gains(A: Array, B: Array, C: Array) -> tuple[Array, Array]:
 
 def _frequency_grid(A: Array, B: Array, C: Array) -> Array:
     """A logarithmic grid with points crowded around lightly damped poles and zeros."""
-    roots = np.concatenate([np.linalg.eigvals(A), transmission_zeros(A, B, C)])
+    system = _system(A, B, C)
+    roots = np.concatenate([system.poles, system.zeros()])
     roots = roots[(roots.imag > 0.0) & (np.abs(roots) > 1e-5) & (np.abs(roots) < 1e5)]
-    pieces = [np.geomspace(1e-5, 1e5, 121)]
-    flanks = np.array([0.0, 0.5, 1.0, 2.0, 4.0])
-    for root in roots:
-        half = max(abs(root.real), 1e-9 * root.imag)
-        pieces += [root.imag + half * flanks, root.imag - half * flanks[1:]]
-    grid = np.unique(np.concatenate(pieces))
-    return np.ascontiguousarray(grid[(grid >= 1e-5) & (grid <= 1e5)])
+    wide = np.maximum(np.abs(roots.real), 1e-9 * roots.imag) + 1j * roots.imag
+    return np.ascontiguousarray(frequency_grid(1e-5, 1e5, 121, around(wide, FLANKS)))
 
 
-def transmission_zeros(A: Array, B: Array, C: Array) -> np.ndarray:
-    """Finite invariant zeros of a square plant in its own unit of time; none if not square."""
-    n, m = B.shape
-    if C.shape[0] != m:
-        return np.empty(0, complex)
-    system = np.block([[A, B], [C, np.zeros((m, m))]])
-    shape = np.zeros_like(system)
-    shape[:n, :n] = np.eye(n)
-    values = eig(system, shape, right=False)
-    return values[np.isfinite(values) & (np.abs(values) < 1e5)]
+def _system(A: Array, B: Array, C: Array) -> StateSpace:
+    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))

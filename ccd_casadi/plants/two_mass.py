@@ -1,9 +1,11 @@
 """Case study 1: two masses and a spring whose stiffness follows the masses."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
+
+from ccd_casadi.plants.plant import Plant, build_plant
 
 
 def two_mass(theta: Mapping[str, Any], zeta: float = 0.01) -> dict[str, Any]:
@@ -24,3 +26,8 @@ def two_mass(theta: Mapping[str, Any], zeta: float = 0.01) -> dict[str, Any]:
         "output": ca.DM([[1, 0]]),
         "hardware_cost": m1 + m2,
     }
+
+
+def two_mass_plant(names: Sequence[str], zeta: float = 0.01) -> Plant:
+    """The plant of `two_mass`, θ in the order of `names`."""
+    return build_plant(two_mass, names, {"zeta": zeta})

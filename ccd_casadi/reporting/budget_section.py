@@ -7,7 +7,7 @@ import numpy as np
 from ccd_casadi.budget import BudgetFigures
 from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
 from ccd_casadi.reporting.page import (
     Section,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccd_casadi.deployment.on_hardware import OnHardware
+from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, figure_html, number, paragraph
 from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
@@ -45,8 +45,8 @@ def move_html(found: OnHardware) -> str:
             way.words,
             "not" if np.isinf(way.move.settled) else number(1e3 * way.move.settled),
             1e6 * way.move.peak_error,
-            1e6 * way.move.restless,
-            float(np.abs(way.move.force).max()),
+            1e6 * way.move.last_error(WATCHED),
+            float(way.move.peak_force.max()),
             f"{100.0 * way.move.saturated:.3g} %",
         )
         for way in found.ways
@@ -70,7 +70,7 @@ def _limit_words(found: OnHardware) -> str:
             "The unlimited move itself does not end in its window within the time watched: ask for "
             "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
         )
-    peak = max(float(np.abs(way.move.force).max()) for way in found.ways[:2])
+    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
     if found.least_limit == 1.0:
         return (
             words + "Of the limits tried none below the peak force lets the move end in its window."

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import cont2discrete
 
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.signals import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
@@ -12,10 +13,11 @@ from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
-from ccd_casadi.deployment.simulation import step_errors
 from ccd_casadi.deployment.words import against, reason_words, short_status
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import largest, sensitivity
+from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index
@@ -36,7 +38,6 @@ from ccd_casadi.reporting.page import (
 from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import verdict_html, worst
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import responses
 from surrogates.files import write_whole
@@ -106,17 +107,16 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
     nyquist = 0.5 * found.rate_hz
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     around = run.plant.grid * run.plant.omega_0 / HZ
-    hz = np.unique(np.concatenate([np.geomspace(low, high, POINTS), around]))
-    hz = hz[(hz >= low) & (hz <= high)]
+    hz = frequency_grid(low, high, POINTS, around)
     gains, controllers = [], []
     for K in (run.controller, found.reduced):
         _, k, S = responses(run.plant, K, HZ * hz)
-        gains.append(_gain(S))
-        controllers.append(_gain(k))
+        gains.append(largest(S))
+        controllers.append(largest(k))
     k = found.realisation.system.response(HZ * hz)
     G = found.plant.response(HZ * hz)
-    gains.append(_gain(np.linalg.inv(np.eye(G.shape[1]) + G @ k)))
-    controllers.append(_gain(k))
+    gains.append(largest(sensitivity(G @ k)))
+    controllers.append(largest(k))
     colours = (BLUE, GREEN, ORANGE)
     labels = ("full, continuous", "reduced, continuous", f"sampled at {number(found.rate_hz)} Hz")
     lines = ("-", "--", "-")
@@ -167,10 +167,6 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
     return figure_html(svg, caption, table)
 
 
-def _gain(response: np.ndarray) -> Array:
-    return np.asarray(np.linalg.norm(response, 2, axis=(1, 2)))
-
-
 def _facts(run: FinishedRun, found: Deployment) -> str:
     full, small, sampled = run.figures, found.reduced_figures, found.sampled
     S_max = run.problem.inner.S_max
@@ -209,16 +205,19 @@ def _facts(run: FinishedRun, found: Deployment) -> str:
 def _step(run: FinishedRun, found: Deployment) -> str:
     direction = found.orders[0].channel.outputs[:, 0]
     seconds = PERIODS * HZ / run.figures.bandwidth
-    t, errors = step_errors(found.plant, found.realisation.system, direction, seconds)
-    y = 1.0 - errors @ direction
-    curves = [
-        Curve(t_c, y_c, label, colour, line)
-        for (t_c, y_c), label, colour, line in (
-            (_continuous(run, run.controller, direction, seconds), "full", BLUE, "-"),
-            (_continuous(run, found.reduced, direction, seconds), "reduced", GREEN, "--"),
-            ((1e3 * t, y), "sampled", ORANGE, "-"),
-        )
-    ]
+    G, delay = run.plant.plant_si(), found.delay
+    sampled = found.realisation.system
+    at = Sampling(1.0 / sampled.period, 1e6 * delay)
+    loops = (
+        (Loop(G, run.controller), "full", BLUE, "-"),
+        (Loop(G, found.reduced), "reduced", GREEN, "--"),
+        (Loop(G, sampled, at), "sampled", ORANGE, "-"),
+    )
+    curves = []
+    for loop, label, colour, line in loops:
+        t, outputs = step_response(loop, direction, seconds, POINTS)
+        y = outputs @ direction
+        curves.append(Curve(1e3 * t, y, label, colour, line))
     where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
     panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves), legend="lower right")
     svg = figure_lines(
@@ -227,24 +226,6 @@ def _step(run: FinishedRun, found: Deployment) -> str:
     table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
     return figure_html(svg, caption, table)
-
-
-def _continuous(
-    run: FinishedRun, K: StateSpace, direction: Array, seconds: float
-) -> tuple[Array, Array]:
-    """Times in ms and the step of the continuous loop, exact at these times."""
-    G = run.plant.plant_si()
-    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-    B = np.vstack([G.B @ K.D, K.B]) @ direction[:, None]
-    C = direction[None, :] @ np.hstack([G.C, np.zeros((len(G.C), len(K.A)))])
-    step = seconds / POINTS
-    times = np.array([1e3 * step * i for i in range(POINTS)])
-    Ad, Bd, _, _, _ = cont2discrete((A, B, C, np.zeros((1, 1))), step, "zoh")
-    x, y = np.zeros((len(A), 1)), []
-    for _ in range(POINTS):
-        y.append(float((C @ x)[0, 0]))
-        x = Ad @ x + Bd
-    return times, np.array(y)
 
 
 def _rates(found: Deployment) -> str:

@@ -5,13 +5,11 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front, FrontPoint
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden, synthesised_loop
 from ccd_casadi.reporting.page import number
-from ccd_casadi.reporting.stage_drawing import draw_stages
 from ccd_casadi.reporting.steps import steps_html
 from ccd_casadi.reporting.svg import GREEN, GREY
 from ccd_casadi.support.units import HZ
@@ -49,11 +47,8 @@ def _loop(problem: CoDesignProblem, point: FrontPoint) -> Loop:
 
 
 def _machine(problem: CoDesignProblem, point: FrontPoint) -> str:
-    found = stage_of(plant_of(problem), point.theta)
-    if found is None:
-        return machine(problem, point.theta)
-    stage, theta = found
-    return draw_stages(stage.geometry, {"": theta})
+    drawing = plant_of(problem).drawing
+    return machine(problem, point.theta) if drawing is None else drawing({"": point.theta}).svg
 
 
 def _sensitivity(problem: CoDesignProblem, loop: Loop, y_range: tuple[float, float]) -> Panel:

@@ -5,19 +5,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop as ClosedLoop
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.signals import LIMITS, signals_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.plants.modal import modal_plant
+from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden, marked
-from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, stage_modes_html
+from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, surface_modes_html
 from ccd_casadi.reporting.nyquist import around_resonances, loci_of, nyquist_panel
 from ccd_casadi.reporting.page import Section, Table, figure_html, number
 from ccd_casadi.reporting.sections_loops import Loops, gain_panels
-from ccd_casadi.reporting.signals import Moved, signals_of
 from ccd_casadi.reporting.svg import GREEN, GREY
 from ccd_casadi.reporting.tables import over_frequency, over_time
-from ccd_casadi.robust.demands import Demands
 from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.classical_margins import least_margins
 from ccd_casadi.synthesis.closed_loop import responses
@@ -39,7 +40,8 @@ def glance(problem: CoDesignProblem, verified: "VerifiedDesign", bandwidth_hz: f
         omega_low=inner.omega_low,
     )  # fmt: skip
     system = mechanics(plant_of(problem), verified.theta)
-    move = signals_of(problem, system, plant, K, None, bandwidth_hz).move
+    modal = modal_plant(system, Suspension(0.0, 0.0))
+    move = signals_of(ClosedLoop(plant.plant_si(), K), modal, bandwidth_hz).move
     fine = np.unique(np.concatenate([loop.hz, around_resonances(plant, K)]))
     fine = fine[(fine >= loop.hz[0]) & (fine <= loop.hz[-1])]
     G, k, _ = responses(plant, K, HZ * fine)
@@ -97,8 +99,8 @@ def glance_of_sections(
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> str:
-    """Masses and springs with their modes, the first modes of a rib stage, or a table of modes."""
-    stage = stage_modes_html(problem, theta)
+    """Masses and springs with their modes, the first modes of a surface, or a table of modes."""
+    stage = surface_modes_html(problem, theta)
     if stage:
         return stage
     system = mechanics(plant_of(problem), theta)
@@ -128,17 +130,16 @@ def _sensitivity(problem: CoDesignProblem, loop: Loop) -> Panel:
     )  # fmt: skip
 
 
-def _move(move: Moved) -> Panel:
+def _move(move: Move) -> Panel:
     at = np.unique(np.linspace(0, len(move.time) - 1, 700).astype(int))
-    end = (Level(1e3 * move.end, "end of the move", True, GREY),)
+    end = (Level(1e3 * move.duration, "end of the move", True, GREY),)
     curve = Curve(1e3 * move.time[at], 1e6 * move.error[at], width=1.6)
     return Panel("time (ms)", "error of a move (µm)", (curve,), levels=end)
 
 
-def _move_words(move: Moved) -> str:
-    limits = Demands().limits
+def _move_words(move: Move) -> str:
     return (
-        f" A move of {number(1e3 * limits.stroke)} mm in {number(1e3 * move.end, 4)} ms "
+        f" A move of {number(1e3 * LIMITS.stroke)} mm in {number(1e3 * move.duration, 4)} ms "
         f"({move.words}) errs by at most {number(1e6 * float(np.abs(move.error).max()), 3)} µm on "
         "the model (other moves: robustness)."
     )
@@ -154,5 +155,5 @@ def _table(loop: Loop) -> Table:
     )
 
 
-def _move_table(move: Moved) -> Table:
+def _move_table(move: Move) -> Table:
     return over_time(("ms", "error µm"), 1e3 * move.time, 1e6 * move.error)

@@ -1,4 +1,4 @@
-"""The machine as a picture: masses and springs, or the rib stage; and the shapes of its modes.
+"""The machine as a picture: masses and springs, or its own drawing; and the shapes of its modes.
 
 Pictures are inline SVG of their own, without a script. Words in them take the page's colour.
 """
@@ -11,13 +11,9 @@ import numpy as np
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rib_stage.pictures import mode_shape
-from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting import svg
 from ccd_casadi.reporting.page import escape, number
-from ccd_casadi.reporting.stage_drawing import draw_stages
-from ccd_casadi.reporting.stage_pictures import surface_of
-from ccd_casadi.reporting.turntable import Picture, still
+from ccd_casadi.reporting.turntable import still
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -144,17 +140,14 @@ def machine_html(
     modal: ModalPlant,
     reference: float,
 ) -> str:
-    """The machine at θ: the stage beside the stage of the start, masses and springs, or its modes.
+    """The machine at θ: its drawing beside that of the start, masses and springs, or its modes.
 
     `system` and `modal` are of θ, or of what stands for it; `reference`: see `lumped_svg`.
     """
     plant = plant_of(problem)
-    stage = stage_of(plant, theta)
-    if stage is not None:
-        before = stage_of(plant, start)
-        assert before is not None
-        drawn = draw_stages(stage[0].geometry, {"this design": stage[1], "the start": before[1]})
-        return f'<div style="background:#fff;color:#1a1a1a">{drawn}</div>'
+    if plant.drawing is not None:
+        drawn = plant.drawing({"this design": theta, "the start": start})
+        return f'<div style="background:#fff;color:#1a1a1a">{drawn.svg}</div>'
     found = lumped(system)
     if found is None:
         return modes_html(modal)
@@ -175,19 +168,14 @@ def modes_html(modal: ModalPlant) -> str:
     return f"<table>{head}{''.join(rows)}</table>"
 
 
-def stage_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
-    """The first flexible modes of a rib stage by finite elements; empty for another plant."""
-    found = stage_of(plant_of(problem), theta)
-    if found is None:
+def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
+    """The first flexible modes on the plant's surface; empty for a plant that has none."""
+    plant = plant_of(problem)
+    if plant.shapes is None:
         return ""
-    stage, here = found
-    modes = stage.frequencies(here)[3:]
-    order = sorted(range(len(modes)), key=lambda i: modes[i].frequency)
+    shapes = plant.shapes(theta, SHOWN_MODES)
     parts = []
-    for i in order[:SHOWN_MODES]:
-        shape = mode_shape(stage, here, 3 + i)
-        surface = surface_of(stage, here, shape)
-        words = f"{number(shape.frequency, 4)} Hz"
-        drawn = still(surface, Picture(shape.displacement[surface.source], words))
-        parts.append(f'<div style="flex:1 1 85px">{words}{drawn}</div>')
+    for mode in shapes.modes:
+        words = f"{number(mode.frequency, 4)} Hz"
+        parts.append(f'<div style="flex:1 1 85px">{words}{still(shapes, mode, words)}</div>')
     return f'<div style="display:flex;flex-wrap:wrap">{"".join(parts)}</div>'

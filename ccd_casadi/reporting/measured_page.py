@@ -8,7 +8,7 @@ import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.measured import clearances, controller_response
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import forbidden

@@ -16,7 +16,8 @@ from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.facts import conclusion, theta_table
 from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
 from ccd_casadi.reporting.page import (

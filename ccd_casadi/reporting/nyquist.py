@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
 from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
 from ccd_casadi.support.arrays import Array

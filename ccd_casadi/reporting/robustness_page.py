@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
@@ -21,7 +22,6 @@ from ccd_casadi.reporting.page import (
 )
 from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
-from ccd_casadi.robust.move import Move
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.units import HZ, metres
@@ -130,7 +130,7 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
     way = "with mass feedforward" if move.feedforward else "without feedforward"
-    way += f", {'its rigid bodies free' if found.free else 'on its soft suspension'}"
+    way += f", {'its rigid bodies free' if found.moves[0].free else 'on its soft suspension'}"
     settled = (
         f"settles {_time(move.settling)} after its end"
         if np.isfinite(move.settling)
@@ -309,7 +309,7 @@ def _structured(found: Study) -> list[Section]:
 def _move(found: Study) -> Section:
     plant = (
         "with its rigid bodies free"
-        if found.free
+        if found.moves[0].free
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [

@@ -5,24 +5,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.given_controller import Sampled
-from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.move import Move, mass_feedforward, moves
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, figure_html, number
 from ccd_casadi.reporting.svg import BLUE, GREY
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.robust.demands import Demands
-from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
-from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import closed_loop
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:
@@ -43,20 +37,20 @@ def move_panels(verified: "VerifiedSections") -> tuple[list[Panel], str, Table]:
     modal = modal_plant(mechanics(plant_of(problem), verified.theta), released.suspension)
     ahead = mass_feedforward(modal, demands.axis)
     ways = {"without feedforward": None} | ({} if ahead is None else {"mass feedforward": ahead})
-    plants = plants_of(released, verified.theta)
-    free = all(_stable(plant, made.controller, sampling, made.bandwidth) for plant in plants)
-    plants = plants if free else plants_of(problem, verified.theta)
+    suspended, free = (
+        [Loop(plant.plant_si(), made.controller, sampling)
+         for plant in plants_of(of, verified.theta)]
+        for of in (problem, released)
+    )  # fmt: skip
+    found = moves(suspended, free, tuple(ways.values()), profile, axis=demands.axis,
+                  window=demands.window, bandwidth_hz=made.bandwidth / HZ)  # fmt: skip
     end = profile.duration
     time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)
     panels, words = [], []
     columns = [1e3 * time]
     heads = ["ms"]
-    for name, forces in ways.items():
-        moves = [
-            moved(plant, made.controller, sampling, profile, forces, made.bandwidth / HZ)
-            for plant in plants
-        ]
-        error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in moves])
+    for name, made_so in zip(ways, found, strict=True):
+        error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made_so])
         panels.append(Panel(
             "time (ms)", f"error (µm), {name}", (Curve(1e3 * time, error[0], "the model", BLUE),),
             (Band(1e3 * time, error.min(axis=0), error.max(axis=0), "all plants"),),
@@ -64,10 +58,10 @@ def move_panels(verified: "VerifiedSections") -> tuple[list[Panel], str, Table]:
         ))  # fmt: skip
         columns += [error[0], error.min(axis=0), error.max(axis=0)]
         heads += [f"µm, {name}", "least", "largest"]
-        words.append(_words(name, moves))
+        words.append(_words(name, made_so))
     how = "continuous loop" if sampling is None else "hold and delay exact, at the instants"
     stroke = number(1e3 * demands.limits.stroke)
-    where = "on plants without the suspension" if free else "on the suspended plants"
+    where = "on plants without the suspension" if found[0][0].free else "on the suspended plants"
     caption = (
         f"{stroke} mm in {number(1e3 * end, 4)} ms {where} ({how}; for other moves the options of "
         f"robustness). {' '.join(words)}"
@@ -80,38 +74,6 @@ def move_html(panels: list[Panel], caption: str, table: Table) -> str:
     svg = figure_lines([panels], key="sections-move", heights=(3.2,),
                        title="Error of a move on every plant of the set")  # fmt: skip
     return figure_html(svg, caption, table)
-
-
-def moved(
-    plant: ScaledPlant,
-    K: StateSpace,
-    sampling: Sampling | None,
-    profile: Setpoint,
-    forces: Array | None,
-    bandwidth_hz: float,
-) -> Move:
-    """The move of the first axis as the loop runs: sampled by Tustin's rule where it is sampled."""
-    demands = Demands()
-    if sampling is None:
-        return simulate(
-            closed_loop(plant.plant_si(), K), profile, axis=demands.axis, forces=forces,
-            window=demands.window, bandwidth_hz=bandwidth_hz,
-        )  # fmt: skip
-    return simulate_sampled(
-        _in_discrete_time(K, sampling, HZ * bandwidth_hz), plant, profile, axis=demands.axis,
-        forces=forces, window=demands.window, bandwidth_hz=bandwidth_hz,
-    )  # fmt: skip
-
-
-def _stable(plant: ScaledPlant, K: StateSpace, sampling: Sampling | None, bandwidth: float) -> bool:
-    if sampling is not None:
-        return _in_discrete_time(K, sampling, bandwidth).judge(plant)[0]
-    return bool(np.linalg.eigvals(closed_loop(plant.plant_si(), K).A).real.max() < 0.0)
-
-
-def _in_discrete_time(K: StateSpace, sampling: Sampling, bandwidth: float) -> Sampled:
-    tustin = Conversion(Discretisation.TUSTIN, False, bandwidth)
-    return Sampled(discretise(K, tustin, sampling.period, sampling.delay), sampling.delay)
 
 
 def _words(name: str, moves: list[Move]) -> str:

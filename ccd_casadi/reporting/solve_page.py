@@ -14,7 +14,6 @@ from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.plants.rib_stage.plant import stage_of
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
@@ -36,6 +35,7 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
 from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
 from ccd_casadi.reporting.maps import ThetaPath, figure_landscape, figure_sweep
+from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -54,7 +54,6 @@ from ccd_casadi.reporting.slices import (
     slices_data,
     tables_slices,
 )
-from ccd_casadi.reporting.stage_pictures import dimensions_figure, mode_shape_figure
 from ccd_casadi.reporting.start import start_section
 from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
@@ -207,17 +206,17 @@ def _theta(
 def stage_sections(
     problem: CoDesignProblem, thetas: Mapping[str, Sequence[float]]
 ) -> list[Section]:
-    """Drawing and mode shapes of a rib stage, the last of `thetas` in motion; else nothing."""
-    found = {name: stage_of(plant_of(problem), theta) for name, theta in thetas.items()}
-    stages = {name: item for name, item in found.items() if item is not None}
-    if not stages:
-        return []
-    stage, theta = list(stages.values())[-1]
-    drawn = dimensions_figure(stage.geometry, {name: own for name, (_, own) in stages.items()})
-    return [
-        Section("The stage, before and after", drawn),
-        Section(f"Mode shapes: {list(stages)[-1]}", mode_shape_figure(stage, theta)),
-    ]
+    """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
+    plant, found = plant_of(problem), []
+    if plant.drawing is not None and thetas:
+        drawn = plant.drawing(thetas)
+        figure = figure_html(drawn.svg, drawn.caption, Table(drawn.head, drawn.rows))
+        found.append(Section("The stage, before and after", figure))
+    if plant.shapes is not None and thetas:
+        name, theta = list(thetas.items())[-1]
+        figure = mode_shape_figure(plant.shapes(theta, SHOWN))
+        found.append(Section(f"Mode shapes: {name}", figure))
+    return found
 
 
 def _loop(

@@ -11,12 +11,12 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_inner,
 )
+from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Section, Table, figure_html, number, paragraph, table_html
 from ccd_casadi.reporting.svg import BLUE, GREY, ORANGE
 from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.loop_responses import Loop, loop_data
 from ccd_casadi.synthesis.synthesis import Design, synthesise

@@ -1,20 +1,11 @@
 """What a finished design is put through, in SI: the options of `robustness` and of `deploy`."""
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
+from ccd_casadi.analysis.setpoint import Limits
+from ccd_casadi.analysis.signals import LIMITS, WINDOW
 from surrogates.options import positive
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Stroke and bounds of velocity, acceleration, jerk and snap; unit of y and s."""
-
-    stroke: float
-    velocity: float
-    acceleration: float
-    jerk: float
-    snap: float
 
 
 @dataclass(frozen=True)
@@ -30,8 +21,8 @@ class Demands:
     samples: int = 200
     sensor: float = 1.0
     disturbance: float = 1.0
-    limits: Limits = field(default_factory=lambda: Limits(0.01, 0.1, 2.0, 100.0, 1e4))
-    window: float = 1e-6
+    limits: Limits = LIMITS
+    window: float = WINDOW
     axis: int = 0
 
 

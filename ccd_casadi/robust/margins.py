@@ -15,10 +15,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ccd_casadi.lti.closed_loop import open_alone, sensitivity
 from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import Responses, classical_margins, loop_alone
+from ccd_casadi.synthesis.classical_margins import Responses, classical_margins
 
 FINE = 61  # points between the neighbours of the least disk margin found
 
@@ -88,7 +89,7 @@ def _broken(respond: Responses, name: str, omega: Array) -> NDArray:
 
 
 def _alone(L: Callable[[Array], NDArray], i: int, omega: Array) -> NDArray:
-    return loop_alone(L(omega), i)
+    return open_alone(L(omega), i)
 
 
 def _loop(name: str, L: Callable[[Array], NDArray], hz: Array) -> LoopMargins:
@@ -107,7 +108,7 @@ def _least(L: Callable[[Array], NDArray], hz: Array) -> DiskMargin:
     """The least disk margin of all channels at once on the grid, then on a finer one around it."""
     for last in (False, True):
         eye = np.eye((response := L(HZ * hz)).shape[1])
-        alpha = 1.0 / mu_bound(np.linalg.inv(eye + response) - 0.5 * eye)
+        alpha = 1.0 / mu_bound(sensitivity(response) - 0.5 * eye)
         worst = int(alpha.argmin())
         found = DiskMargin(float(alpha[worst]), float(hz[worst]))
         if not last:

@@ -7,29 +7,18 @@ White noise of one-sided density s (unit/√Hz) through H has the variance s² �
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov
-from scipy.optimize import minimize_scalar
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.closed_loop import ClosedLoop, largest, responses_of
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.peaks import climbed
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.norms import hinf_norm
 
 REST = 1e-3  # of the lowest frequency of a grid: what counts as constant
-
-
-@dataclass(frozen=True)
-class ClosedLoop:
-    """ẋ = A x + B_r r + B_d d, y = C_y x, u = C_u x + D_u r; sensor noise n enters as -r does."""
-
-    A: Array
-    B_r: Array
-    B_d: Array
-    C_y: Array
-    C_u: Array
-    D_u: Array
 
 
 @dataclass(frozen=True)
@@ -42,39 +31,15 @@ class Noise:
     force_by_disturbance: Array
 
 
-def closed_loop(plant: StateSpace, controller: StateSpace) -> ClosedLoop:
-    """The loop of a strictly proper plant (u to y) and a controller (e = r - y - n to u), SI."""
-    A, B, C = plant.A, plant.B, plant.C
-    k = controller
-    N = k.A.shape[0]
-    return ClosedLoop(
-        A=np.block([[A - B @ k.D @ C, B @ k.C], [-k.B @ C, k.A]]),
-        B_r=np.vstack([B @ k.D, k.B]),
-        B_d=np.vstack([B, np.zeros((N, B.shape[1]))]),
-        C_y=np.hstack([C, np.zeros((C.shape[0], N))]),
-        C_u=np.hstack([-k.D @ C, k.C]),
-        D_u=k.D,
-    )
-
-
 def gains(G: NDArray, K: NDArray) -> Array:
     """σ_max of S, T, GS (disturbance force to position) and KS (noise to force), rows (4, k)."""
-    S = np.linalg.inv(np.eye(G.shape[1]) + G @ K)
-    parts = (S, G @ K @ S, S @ G, K @ S)
-    return np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in parts])
+    found = responses_of(G, K)
+    return np.array([largest(found[name]) for name in ("S", "T", "GS", "KS")])
 
 
 def norms(loop: ClosedLoop) -> tuple[tuple[float, float], ...]:
     """‖·‖∞ of S, T, GS and KS, each with its frequency in rad/s (0: at rest), without a grid."""
-    p, m = len(loop.C_y), loop.B_d.shape[1]
-    nothing = np.zeros((p, p))
-    parts = (
-        StateSpace(loop.A, loop.B_r, -loop.C_y, np.eye(p)),
-        StateSpace(loop.A, loop.B_r, loop.C_y, nothing),
-        StateSpace(loop.A, loop.B_d, loop.C_y, np.zeros((p, m))),
-        StateSpace(loop.A, loop.B_r, loop.C_u, loop.D_u),
-    )
-    return tuple(hinf_norm(part) for part in parts)
+    return tuple(hinf_norm(part) for part in (loop.S, loop.T, loop.GS, loop.KS))
 
 
 def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, float], ...]:
@@ -86,13 +51,14 @@ def highest(gain: Callable[[Array], Array], omega: Array) -> tuple[tuple[float, 
     values, found = gain(omega), []
     for row, i in enumerate(values.argmax(axis=1)):
         ends = omega[max(i - 1, 0)], omega[min(i + 1, len(omega) - 1)]
-        top = minimize_scalar(
-            lambda x, row=row: -float(gain(np.exp([x]))[row, 0]), bounds=np.log(ends),
-            method="bounded", options={"xatol": 1e-10},
-        )  # fmt: skip
+        top = climbed(partial(_of_row, gain, row), *ends)
         tops = (float(values[row, i]), 0.0 if i == 0 else float(omega[i]))
-        found.append(max(tops, (-float(top.fun), float(np.exp(top.x)))) if i else tops)
+        found.append(max(tops, top[::-1]) if i else tops)
     return tuple(found)
+
+
+def _of_row(gain: Callable[[Array], Array], row: int, omega: float) -> float:
+    return float(gain(np.array([omega]))[row, 0])
 
 
 def noise(loop: ClosedLoop, sensor: float, disturbance: float) -> Noise:

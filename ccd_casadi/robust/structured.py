@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.mu_bound import balanced_bound, mu_bound
-from ccd_casadi.robust.signals import closed_loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import responses
 

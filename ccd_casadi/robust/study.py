@@ -1,22 +1,21 @@
 """Everything that a finished design is put through, and its figures for robustness.json."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
+from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.later_lines import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.plants.modal import Suspension, modal_plant
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
 from ccd_casadi.robust.margins import DiskMargin, Margins, margins
-from ccd_casadi.robust.move import Move, mass_feedforward, simulate, simulate_sampled
 from ccd_casadi.robust.perturbed import (
     Judged,
     Line,
@@ -26,8 +25,7 @@ from ccd_casadi.robust.perturbed import (
     system_of,
     worst_in_box,
 )
-from ccd_casadi.robust.setpoint import Setpoint, setpoint
-from ccd_casadi.robust.signals import Noise, closed_loop, gains, highest, noise, norms
+from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
@@ -41,8 +39,8 @@ from ccd_casadi.synthesis.statics import Statics, statics
 @dataclass(frozen=True)
 class Study:
     """The results; `gains` are σ_max of S, T, GS, KS over `hz`, `peaks` their largest values with
-    the frequencies in rad/s (0: at rest), which the grid does not decide; `free` whether the moves
-    are those of the plant without its suspension, `moves` the move without and with feedforward.
+    the frequencies in rad/s (0: at rest), which the grid does not decide; `moves` the move without
+    and with feedforward.
 
     `structured` is None where no flexible mode is in the loop, and where the bound was not computed
     within the `overrun` seconds that it was given. Of a controller in discrete time there is no
@@ -63,7 +61,6 @@ class Study:
     tolerances: Tolerances
     structured: StructuredBound | None
     setpoint: Setpoint
-    free: bool
     moves: tuple[Move, ...]
     overrun: float | None = None
 
@@ -120,8 +117,7 @@ def tried(
     )  # fmt: skip
     system, d = system_of(run), demands
     profile = setpoint(d.limits)
-    free, moves = _moves(run, profile, d)
-    closed = closed_loop(run.plant.plant_si(), run.controller)
+    closed = loop_of(run).closed
     return Study(
         demands=d,
         hz=loop.hz,
@@ -137,8 +133,7 @@ def tried(
         tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
         structured=None,
         setpoint=profile,
-        free=free,
-        moves=moves,
+        moves=_moves(run, profile, d),
     )
 
 
@@ -150,9 +145,8 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
     around = run.plant.grid * run.plant.omega_0 / HZ
     hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
     hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
-    respond = partial(run.sampled.responses, run.plant)
+    respond = loop_of(run).responses
     profile = setpoint(d.limits)
-    free, moves = _moves(run, profile, d)
     return Study(
         demands=d,
         hz=hz,
@@ -168,8 +162,7 @@ def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool
         tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
         structured=None,
         setpoint=profile,
-        free=free,
-        moves=moves,
+        moves=_moves(run, profile, d),
     )
 
 
@@ -181,33 +174,24 @@ def _statics(run: FinishedRun) -> Statics:
     )  # fmt: skip
 
 
-def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[bool, tuple[Move, ...]]:
+def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move, ...]:
     """On the plant with free rigid bodies, or on the suspended one where that is not stable."""
-    released = replace(run.problem, suspension=Suspension(0.0, 0.0), robust=None)
-    plants = ((True, scaled_plant(released, run.theta)), (False, run.plant))
-    # a run that could be read is stable on the suspended plant
-    free, plant = next(item for item in plants if not item[0] or _stable(run, item[1]))
-    modal = modal_plant(system_of(run), released.suspension)
+    modal = modal_plant(system_of(run), Suspension(0.0, 0.0))
     ahead = mass_feedforward(modal, demands.axis)
-    ways = (None,) if ahead is None else (None, ahead)
-    hz, axis, window = run.figures.bandwidth / HZ, demands.axis, demands.window
-    made = []
-    for forces in ways:
-        if run.sampled is None:
-            loop = closed_loop(plant.plant_si(), run.controller)
-            made.append(simulate(loop, profile, axis=axis, forces=forces, window=window,
-                                 bandwidth_hz=hz))  # fmt: skip
-        else:
-            made.append(simulate_sampled(run.sampled, plant, profile, axis=axis, forces=forces,
-                                         window=window, bandwidth_hz=hz))  # fmt: skip
-    return free, tuple(made)
+    loop = loop_of(run)
+    found = moves(
+        [loop], [replace(loop, plant=free_plant(modal))],
+        (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
+        window=demands.window, bandwidth_hz=run.figures.bandwidth / HZ,
+    )  # fmt: skip
+    return tuple(made for (made,) in found)
 
 
-def _stable(run: FinishedRun, plant: ScaledPlant) -> bool:
+def loop_of(run: FinishedRun) -> Loop:
+    """The run's loop on its plant, as it runs."""
     if run.sampled is not None:
-        return run.sampled.judge(plant)[0]
-    loop = closed_loop(plant.plant_si(), run.controller)
-    return bool(np.linalg.eigvals(loop.A).real.max() < 0.0)
+        return run.sampled.loop(run.plant)
+    return Loop(run.plant.plant_si(), run.controller)
 
 
 def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
@@ -283,7 +267,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "reached": {
                 key: getattr(found.setpoint, key) for key in ("velocity", "acceleration", "jerk")
             },
-            "without_suspension": found.free,
+            "without_suspension": found.moves[0].free,
             "runs": [_move(move) for move in found.moves],
         },
     }

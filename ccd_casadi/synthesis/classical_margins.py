@@ -5,12 +5,13 @@ where it crosses, for several crossings at a time, and does not import plotting 
 takes longer than all of a small co-design's margins together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.support.arrays import Array
 
 Responses = Callable[[Array], tuple[NDArray, NDArray]]  # G (k, p, m) and K (k, m, p) at ω
@@ -60,24 +61,22 @@ def classical_margins(
     )
 
 
-def loop_alone(L: NDArray[np.complex128], i: int) -> NDArray[np.complex128]:
-    """1/S_ii - 1 of S = (I + L)⁻¹, L (k, p, p): what channel i sees while the others are closed."""
-    S = np.linalg.inv(np.eye(L.shape[1]) + L)
-    return np.asarray(1.0 / S[:, i, i] - 1.0)
-
-
 def least_margins(respond: Responses, omega: Array) -> ClassicalMargins:
     """The least of all loops broken one at a time at the plant's inputs."""
 
     def broken(i: int) -> Callable[[Array], NDArray[np.complex128]]:
         def L(at: Array) -> NDArray[np.complex128]:
             G, K = respond(at)
-            return loop_alone(K @ G, i)
+            return open_alone(K @ G, i)
 
         return L
 
     inputs = respond(omega[:1])[0].shape[2]
-    each = [classical_margins(broken(i), omega) for i in range(inputs)]
+    return least_of([classical_margins(broken(i), omega) for i in range(inputs)])
+
+
+def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
+    """Of several loops the margins nearest to instability, and the lowest crossover."""
     return ClassicalMargins(
         gain_down=max(m.gain_down for m in each),
         gain_up=min(m.gain_up for m in each),

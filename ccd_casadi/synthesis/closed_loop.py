@@ -3,13 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.kernels.frequency import prepare, response
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.closed_loop import sensitivity
+from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures, Outcome, figures_from_row
 from ccd_casadi.synthesis.weights import Weights
@@ -79,16 +81,13 @@ def local_peaks(plant: ScaledPlant, controller: StateSpace) -> list[tuple[float,
     G, K, Dk = _prepared(plant, controller)
     grid = np.geomspace(1e-3, 1e3, 3001)
     gain = np.array([sensitivity_gain(G, K, Dk, omega) for omega in grid])
-    tops = np.flatnonzero((gain[1:-1] > gain[:-2]) & (gain[1:-1] >= gain[2:]) & (gain[1:-1] > 1.0))
     found = []
-    for i in tops + 1:
-        best = minimize_scalar(
-            lambda x: -sensitivity_gain(G, K, Dk, np.exp(x)),
-            bounds=np.log([grid[i - 1], grid[i + 1]]),
-            method="bounded",
-            options={"xatol": 1e-9},
-        )
-        found.append((float(np.exp(best.x)) * plant.omega_0, float(-best.fun)))
+    for i in local_maxima(gain):
+        if gain[i] > 1.0:
+            omega, top = climbed(
+                lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1], 1e-9
+            )
+            found.append((omega * plant.omega_0, top))
     return found
 
 
@@ -100,8 +99,7 @@ def responses(
     scaled = np.asarray(omega, float) / plant.omega_0
     g = np.array([response(G, w) for w in scaled])
     k = np.array([response(K, w) + Dk for w in scaled])
-    S = np.linalg.inv(np.eye(g.shape[1]) + g @ k)
-    return g / plant.force, k * plant.force, S
+    return g / plant.force, k * plant.force, sensitivity(g @ k)
 
 
 def _prepared(plant: ScaledPlant, controller: StateSpace) -> tuple:

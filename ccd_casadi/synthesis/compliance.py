@@ -9,10 +9,12 @@ At ω = 0 the rigid bodies stand on their suspension. The largest gain is found 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
-from ccd_casadi.synthesis.norms import gains, hinf_norm
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.norms import gains, hinf_norm
+from ccd_casadi.lti.peaks import climbed
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 
 WITHIN = 1e-3  # relative: where the maximum is, from where the norm was found
 
@@ -26,29 +28,18 @@ class Compliance:
     plant: ScaledPlant
 
 
-def force_to_position(plant: StateSpace, controller: StateSpace) -> StateSpace:
-    """GS as a state space, states [x; x_K]: a force beside u in, y out; r = 0, D = 0."""
-    G, K = plant, controller
-    A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
-    B = np.vstack([G.B, np.zeros((len(K.A), G.B.shape[1]))])
-    C = np.hstack([G.C, np.zeros((len(G.C), len(K.A)))])
-    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
-
-
 def compliance_of(plant: ScaledPlant, controller: StateSpace) -> Compliance:
     """‖GS‖∞ with a controller in SI (e in, u out); infinite where the loop is not stable."""
-    loop = force_to_position(plant.plant_si(), controller)
+    loop = closed_loop(plant.plant_si(), controller).GS
     gain, omega = hinf_norm(loop)
     if not np.isfinite(gain) or omega <= 0.0:
         return Compliance(gain, omega, plant)
-    found = minimize_scalar(
-        lambda x: -float(gains(loop, np.exp([x]))[0]),
-        bounds=(np.log(omega) - WITHIN, np.log(omega) + WITHIN),
-        method="bounded",
-        options={"xatol": 1e-10},
-    )
-    if -found.fun >= gain:
-        gain, omega = float(-found.fun), float(np.exp(found.x))
+    at, top = climbed(
+        lambda w: float(gains(loop, np.array([w]))[0]),
+        omega * np.exp(-WITHIN), omega * np.exp(WITHIN),
+    )  # fmt: skip
+    if top >= gain:
+        gain, omega = top, at
     return Compliance(gain, omega, plant)
 
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.io
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, scale_state_space
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 

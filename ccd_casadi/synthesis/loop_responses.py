@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, transmission_zeros
+from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.grid import frequency_grid, light
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import local_peaks, responses
 from ccd_casadi.synthesis.weights import Weights
 
 POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
-LIGHT = 0.3  # damping ratio below which a pole or zero counts as a resonance
 
 
 @dataclass(frozen=True)
@@ -46,20 +48,18 @@ def loop_data(
     label: str = "",
 ) -> Loop:
     """Frequency responses of a design; `omega_low` in rad/s sets where the plots begin."""
-    poles = _light(np.linalg.eigvals(plant.A) * plant.omega_0)
-    zeros = _light(transmission_zeros(plant.A, plant.B, plant.C) * plant.omega_0)
+    poles = _light(plant.system.poles * plant.omega_0)
+    zeros = _light(plant.system.zeros() * plant.omega_0)
     peaks = tuple((omega / HZ, gain) for omega, gain in local_peaks(plant, controller))
     tops = [hz for hz, gain in peaks if gain > 1.05]
     low = min(omega_low / HZ, bandwidth_hz / 10.0) / 5.0
     high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
     around = plant.grid * plant.omega_0 / HZ
     special = [*poles, *zeros, bandwidth_hz, *(hz for hz, _ in peaks)]
-    grid = np.unique(np.concatenate([np.geomspace(low, high, POINTS), around, special]))
-    hz = grid[(grid >= low) & (grid <= high)]
+    hz = frequency_grid(low, high, POINTS, around, np.array(special))
     G, K, S = responses(plant, controller, HZ * hz)
     KS = K @ S
-    stack = (S, KS, G @ KS)
-    gains = np.array([np.linalg.norm(part, 2, axis=(1, 2)) for part in stack])
+    gains = np.array([largest(part) for part in (S, KS, G @ KS)])
     return Loop(
         label=label,
         hz=hz,
@@ -76,6 +76,4 @@ def loop_data(
 
 def _light(roots: NDArray[Any]) -> tuple[float, ...]:
     """Frequencies in Hz of lightly damped pairs, ascending."""
-    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
-    light = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
-    return tuple(sorted(float(value) for value in np.abs(light) / HZ))
+    return tuple(float(value) for value in np.abs(light(roots)) / HZ)

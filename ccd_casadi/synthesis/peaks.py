@@ -7,12 +7,15 @@ envelope theorem the derivative of a local maximum is that of σ_max(S(jω)) at 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import DesignPlant, Loop, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -20,7 +23,8 @@ from ccd_casadi.synthesis.weights import Weights
 
 # Around each closed-loop pole in multiples of its width, and over the decades about ω₀: what no
 # pole of plant or loop points at is as broad as the distance between two of these.
-FLANKS = np.array([0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0])
+HALF = np.array([0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0])
+FLANKS = np.concatenate([-HALF[::-1], [0.0], HALF])
 BROAD = np.geomspace(1e-2, 1e2, 1201)
 APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
 
@@ -89,26 +93,20 @@ def _peaks(
     """Local maxima of σ_max(S) of at least `least`, (ω over ω₀, gain)."""
     Ak, Bk, Ck = (np.ascontiguousarray(part) for part in controller)
     Dk = np.zeros((Ck.shape[0], Bk.shape[1]))
-    A = np.block([[plant.A, plant.B @ Ck], [-Bk @ plant.C, Ak]])
-    poles = np.linalg.eigvals(A)
-    poles = poles[poles.imag > 0.0]
-    pieces = [plant.grid, BROAD]
-    for sign in (1.0, -1.0):
-        pieces += [poles.imag + sign * np.abs(poles.real) * flank for flank in FLANKS]
-    grid = np.unique(np.concatenate(pieces))
-    grid = grid[(grid >= plant.grid[0]) & (grid <= plant.grid[-1])]
-    grid = np.ascontiguousarray(grid[np.append(True, np.diff(grid) > APART * grid[1:])])
+    poles = closed_loop(plant.system, StateSpace(Ak, Bk, Ck, Dk)).S.poles
+    near = around(poles[poles.imag > 0.0], FLANKS)
+    low, high = float(plant.grid[0]), float(plant.grid[-1])
+    grid = np.ascontiguousarray(
+        frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=APART)
+    )
     G, K = prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck)
     gain = sensitivity_gains(G, K, Dk, grid)
-    tops = np.flatnonzero((gain[1:-1] > gain[:-2]) & (gain[1:-1] >= gain[2:])) + 1
     found = []
-    for i in tops[gain[tops] >= 0.98 * least]:
-        best = minimize_scalar(
-            lambda x: -sensitivity_gain(G, K, Dk, np.exp(x)),
-            bounds=np.log([grid[i - 1], grid[i + 1]]),
-            method="bounded",
-            options={"xatol": 1e-10},
-        )
-        if -best.fun >= least:
-            found.append((float(np.exp(best.x)), float(-best.fun)))
+    for i in local_maxima(gain):
+        if gain[i] >= 0.98 * least:
+            omega, top = climbed(
+                lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1]
+            )
+            if top >= least:
+                found.append((omega, top))
     return found

@@ -7,11 +7,11 @@ decades below the last frequency that a grid shows. With an integrator GS(0) is 
 what rounding left of a pole; what such a loop gives way is then told at ω_low.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ, metres
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
@@ -78,10 +78,10 @@ def statics(
     """
 
     def at(omega: float) -> np.ndarray:
-        return _response(controller, 1j * omega if period == 0.0 else np.exp(1j * omega * period))
+        return replace(controller, period=period).response(np.array([omega]))[0]
 
     def compliance(omega: float, K: np.ndarray) -> float:
-        G = _response(plant, 1j * omega)
+        G = plant.response(np.array([omega]))[0]
         return float(np.linalg.norm(np.linalg.solve(np.eye(len(G)) + G @ K, G), 2))
 
     low = compliance(omega_low, at(omega_low))
@@ -104,8 +104,3 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     rest = f"{1e6 * at_rest:.4g} um/N at rest" if at_rest else "none at rest (an integrator)"
     return f"{1e6 * most:.4g} um/N at most, {1e6 * low:.4g} um/N at {low_hz:.3g} Hz, {rest}"
 
-
-def _response(system: StateSpace, z: complex) -> np.ndarray:
-    """C (z - A)⁻¹ B + D."""
-    inside = z * np.eye(len(system.A)) - system.A
-    return np.asarray(system.C @ np.linalg.solve(inside, system.B + 0j) + system.D)

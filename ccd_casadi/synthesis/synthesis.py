@@ -14,7 +14,8 @@ import numpy as np
 from ccd_casadi.kernels.design import design, judge
 from ccd_casadi.kernels.design import sweep as _sweep
 from ccd_casadi.kernels.figures import Code, Figure
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import Shown
 from ccd_casadi.synthesis.compliance import compliance_over_family

@@ -14,17 +14,22 @@ sensors F, whose number is smaller than that of the modes.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from ccd_casadi.plants.cad.elements import Body
 from ccd_casadi.plants.eigenpairs import (
+    Pencil,
     build_pencil,
     build_resolvent,
     flexible_modes,
     orthonormal,
 )
+from ccd_casadi.plants.pictures import ModeShape, ModeShapes
 from ccd_casadi.support.arrays import Array
 
 EXTRA = 2  # modes solved beyond those kept: the resolvent converges the faster
+# corners of a tetrahedron's four faces, counter-clockwise from outside
+OUTWARD = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 SHIFT = 1e-3  # of E/(ρ L²), the square of a longitudinal wave's time through the body
 
 
@@ -51,15 +56,8 @@ def reduced(
     `held` (3N,) marks unknowns that are zero; a body with none floats.
     """
     free = np.flatnonzero(~held)
-    K, M = (item[free][:, free] for item in body.matrices())
     F, dF = F[free], dF[:, free]
-    length = float(np.linalg.norm(np.ptp(body.points, axis=0)))
-    shift = SHIFT * body.material.young / (body.material.density * length**2)
-    none = np.zeros((len(free), 0))
-    pencil = build_pencil([(K + shift * M).tocsr()], [M.tocsr()], shift, none, np.zeros(0))
-    R = none if held.any() else _motions(body.places - _centre(M, body.places), True)
-    rigid = orthonormal(pencil, R)
-    values, vectors = flexible_modes(pencil, rigid, count + EXTRA)
+    pencil, M, R, rigid, values, vectors = _solved(body, count, held)
     lam, kept, more = values[:count], vectors[:, :count], vectors[:, count:]
     first = R.shape[1]
     size, flexible = first + count, slice(first, None)
@@ -93,6 +91,39 @@ def reduced(
             out.dM[t, :first, :first] = moved + moved.T + R.T @ (dM @ R)
             out.dF[t, :first] = R.T @ dF[t] + dR.T @ F
     return out
+
+
+def mode_shapes(body: Body, count: int, held: np.ndarray) -> ModeShapes:
+    """The `count` lowest flexible modes on the body's surface; `held` as in `reduced`."""
+    values, vectors = _solved(body, count, held)[-2:]
+    faces = np.concatenate([body.tets[:, list(corners)] for corners in OUTWARD])
+    _, first, times = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    used, outer = np.unique(faces[first[times == 1]], return_inverse=True)
+    modes = []
+    for i in range(count):
+        field = np.zeros(len(held))
+        field[~held] = vectors[:, i]
+        moved = field.reshape(3, -1).T[used]  # the corners of the elements come first
+        modes.append(ModeShape(moved, float(np.sqrt(values[i])) / (2.0 * np.pi), (i + 1,)))
+    faces = outer.reshape(-1, 3)[:, [0, 1, 2, 2]]
+    return ModeShapes(body.points[used], faces, tuple(modes))
+
+
+def _solved(
+    body: Body, count: int, held: np.ndarray
+) -> tuple[Pencil, sparse.csc_matrix, Array, Array, Array, Array]:
+    """The pencil and M of what is free, rigid motions as they are and orthonormal, λ and modes."""
+    free = np.flatnonzero(~held)
+    K, M = (item[free][:, free] for item in body.matrices())
+    length = float(np.linalg.norm(np.ptp(body.points, axis=0)))
+    shift = SHIFT * body.material.young / (body.material.density * length**2)
+    none = np.zeros((len(free), 0))
+    pencil = build_pencil([(K + shift * M).tocsr()], [M.tocsr()], shift, none, np.zeros(0))
+    R = none if held.any() else _motions(body.places - _centre(M, body.places), True)
+    rigid = orthonormal(pencil, R)
+    return pencil, M, R, rigid, *flexible_modes(pencil, rigid, count + EXTRA)
 
 
 def _motions(arms: Array, shifts: bool) -> Array:

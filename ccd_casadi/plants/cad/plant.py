@@ -9,9 +9,10 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.plants.cad.elements import Body, Material
-from ccd_casadi.plants.cad.modes import Reduced, reduced
+from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
+from ccd_casadi.plants.pictures import ModeShapes
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
@@ -115,10 +116,19 @@ class CadStage:
         for k, (face, axis) in enumerate(ports):
             block = slice(axis * count, (axis + 1) * count)
             F[block, k], dF[:, block, k] = body.mean(self.morph.faces[face], velocities)
-        held = np.zeros((3, count), dtype=bool)
+        return reduced(body, velocities, F, dF, self.modes, self._held(body))
+
+    def _held(self, body: Body) -> np.ndarray:
+        """(3N,) the unknowns that are zero."""
+        held = np.zeros((3, len(body.places)), dtype=bool)
         for face in self.held:
             held[:, body.on(self.morph.faces[face])] = True
-        return reduced(body, velocities, F, dF, self.modes, held.ravel())
+        return held.ravel()
+
+    def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
+        """The lowest flexible modes on the surface."""
+        body = Body(self.morph.points(theta), self.morph.tets, self.material)
+        return mode_shapes(body, count, self._held(body))
 
     def frequencies(self, theta: Sequence[float]) -> Array:
         """Of the flexible modes, in Hz."""
@@ -180,6 +190,7 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         values=evaluator(stage, False),
         notes=lambda theta: notes,
         domain=(morph.lower[back], morph.upper[back]),
+        shapes=lambda theta, count: stage.shapes([float(theta[i]) for i in place], count),
     )
 
 

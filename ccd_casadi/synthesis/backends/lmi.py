@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.synthesis.backends.attempt import Attempt

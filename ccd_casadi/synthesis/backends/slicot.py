@@ -11,7 +11,7 @@ import warnings
 
 import numpy as np
 
-from ccd_casadi.plants.scaling import StateSpace
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.optional_packages import require
 from ccd_casadi.synthesis.backends.attempt import Attempt
 from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, balance

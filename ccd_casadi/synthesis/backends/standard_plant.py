@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.kernels.generalized_plant import first_order_weights, generalized_plant
-from ccd_casadi.plants.scaling import ScaledPlant, StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.plants.rib_stage.geometry import Geometry, has_square_symmetry
-from ccd_casadi.plants.rib_stage.modes import (
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.modes import (
     EXTRA,
     SHIFT,
     SQUARE_GROUPS,

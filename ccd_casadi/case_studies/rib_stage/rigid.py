@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Point, mass_properties
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Point, mass_properties
 from ccd_casadi.support.arrays import Array
 
 RIGID_NAMES = ("z", "tip", "tilt")
@@ -36,21 +36,6 @@ def rigid_values(function: ca.Function, theta: Array) -> tuple[Array, Array]:
     """(3, points) and (θ, 3, points) from `rigid_fields`."""
     field, slope = (np.array(value) for value in function(theta))
     return field, slope.reshape(field.shape[1], field.shape[0], len(theta)).transpose(2, 1, 0)
-
-
-def rigid_motion(geometry: Geometry, theta: Array, coordinates: Array) -> Array:
-    """(3, n, 3) displacements of the three modes at coordinates (n, 3), yaw included."""
-    body = mass_properties(geometry, [float(value) for value in theta])
-    modes = np.array(ca.evalf(_coefficients(geometry, ca.SX(theta))))
-    J = np.array(body.inertia, float)
-    out = np.zeros((3, *coordinates.shape))
-    for mode, (z, a, b) in enumerate(modes):
-        turn = np.array([a, -b, 0.0])
-        turn[2] = -(J[2] @ turn) / J[2, 2]
-        out[mode] = np.cross(turn, coordinates)
-        out[mode, :, 2] += z
-        out[mode, :, :2] -= np.cross(turn, np.array(body.centre, float))[:2]
-    return out
 
 
 def _coefficients(geometry: Geometry, theta: ca.SX) -> ca.SX:

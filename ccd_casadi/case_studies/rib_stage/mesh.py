@@ -11,8 +11,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from ccd_casadi.plants.rib_stage.geometry import IS_RIB, Geometry, axis_lengths, height_lengths
-from ccd_casadi.plants.rib_stage.reference import line_nodes, line_values
+from ccd_casadi.case_studies.rib_stage.geometry import (
+    IS_RIB,
+    Geometry,
+    axis_lengths,
+    height_lengths,
+)
+from ccd_casadi.case_studies.rib_stage.reference import line_nodes, line_values
 from ccd_casadi.support.arrays import Array
 
 Cells = tuple[tuple[float, int], ...]

@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, axis_lengths, mass
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, axis_lengths, bays, mass
+from ccd_casadi.plants.pictures import Drawing
 from ccd_casadi.reporting.page import escape, number
 from ccd_casadi.reporting.svg import BLACK, LONGEST_LABEL
+from ccd_casadi.support.arrays import Array
 
 WIDTH = 960.0  # of the drawing; a page column shows a unit as about a pixel
 TALLER = 3.0  # heights in the cut against lengths
@@ -18,6 +20,22 @@ GAP = 46.0  # between plan and cut: x_i stands there
 BELOW = 50.0  # under the cut: the side stands there
 ARROW, TAIL = 6.0, 14.0
 DIGITS = 4  # of a dimension; the table has more
+MEANINGS = (
+    "plate thickness",
+    "outer rib, width",
+    "inner ribs, width",
+    "centre rib, width",
+    "rib height above the plate",
+    "inner ribs, from the centre",
+)
+
+
+def drawing(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> Drawing:
+    """Stages by name at equal scale with their dimensions in mm; θ in m."""
+    head = ("length", "what it is", "unit", *thetas)
+    return Drawing(
+        draw_stages(geometry, thetas), _caption(geometry, thetas), head, _rows(geometry, thetas)
+    )
 
 
 def draw_stages(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> str:
@@ -175,3 +193,50 @@ class _Drawing:
             f'<path d="M{x:.2f} {y:.2f}L{bx - wide * dy:.2f} {by + wide * dx:.2f}'
             f'L{bx + wide * dy:.2f} {by - wide * dx:.2f}Z" fill="{INK}"/>'
         )
+
+
+def _caption(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> str:
+    """How the mass changes from the first stage to the last, and which parameters with it."""
+    names, values = list(thetas), list(thetas.values())
+    words = "All at one scale: " if len(names) > 1 else ""
+    words += (
+        "the ribbed side above (ribs dark), below it a cut through the bays (cut faces dark), "
+        f"heights drawn {TALLER:g} times as large as lengths. "
+    )
+    if geometry.point_masses:
+        words += "Dashed circles: masses fixed to the lower face. "
+    masses = [float(mass(geometry, theta)) for theta in values]
+    if len(names) == 1:
+        return words + f"{names[0]} weighs {number(masses[0])} kg."
+    words += f"From {names[0]} to {names[-1]} the mass goes from {number(masses[0])} to "
+    words += f"{number(masses[-1])} kg ({_percent(masses[-1] / masses[0])}). "
+    changes = _changes(np.array(values[0]), np.array(values[-1]))
+    return words + (f"Changed: {changes}." if changes else "No parameter changes.")
+
+
+def _changes(first: Array, last: Array) -> str:
+    """`t_c (-49 %), x_i (+11 %)`, the largest change first."""
+    ratio = last / first
+    order = np.argsort(-np.abs(np.log(ratio)), kind="stable")
+    return ", ".join(
+        f"{NAMES[i]} ({_percent(ratio[i])})" for i in order if abs(np.log(ratio[i])) > 5e-4
+    )
+
+
+def _percent(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.3g} %".replace("-", "−")
+
+
+def _rows(
+    geometry: Geometry, thetas: Mapping[str, Sequence[float]]
+) -> tuple[tuple[object, ...], ...]:
+    """The six parameters and both bays in mm, and the mass in kg, a column a stage."""
+    values = [tuple(float(v) for v in theta) for theta in thetas.values()]
+    rows: list[tuple[object, ...]] = [
+        (name, meaning, "mm", *(1e3 * theta[i] for theta in values))
+        for i, (name, meaning) in enumerate(zip(NAMES, MEANINGS, strict=True))
+    ]
+    for i, (name, meaning) in enumerate((("b_1", "outer bay"), ("b_2", "inner bay"))):
+        rows.append((name, meaning, "mm", *(1e3 * bays(geometry, theta)[i] for theta in values)))
+    rows.append(("mass", "", "kg", *(float(mass(geometry, theta)) for theta in values)))
+    return tuple(rows)

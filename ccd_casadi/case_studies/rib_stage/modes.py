@@ -11,17 +11,15 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import qr
 
-from ccd_casadi.plants.eigenpairs import (
-    Pencil,
-    build_pencil,
-    build_resolvent,
-    flexible_modes,
-    orthonormal,
+from ccd_casadi.case_studies.rib_stage.assembly import (
+    Assembler,
+    Sector,
+    build_assembler,
+    build_sector,
 )
-from ccd_casadi.plants.rib_stage.assembly import Assembler, Sector, build_assembler, build_sector
-from ccd_casadi.plants.rib_stage.geometry import Geometry, Material, Point, PointMass
-from ccd_casadi.plants.rib_stage.mesh import MeshOrder, build_mesh
-from ccd_casadi.plants.rib_stage.symmetry import (
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Material, Point, PointMass
+from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder, build_mesh
+from ccd_casadi.case_studies.rib_stage.symmetry import (
     ALL,
     AS,
     SA,
@@ -29,6 +27,13 @@ from ccd_casadi.plants.rib_stage.symmetry import (
     Symmetry,
     point_functional,
     swap_displacements,
+)
+from ccd_casadi.plants.eigenpairs import (
+    Pencil,
+    build_pencil,
+    build_resolvent,
+    flexible_modes,
+    orthonormal,
 )
 from ccd_casadi.support.arrays import Array
 

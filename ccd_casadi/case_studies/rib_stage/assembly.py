@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from ccd_casadi.plants.rib_stage.geometry import Material
-from ccd_casadi.plants.rib_stage.mesh import Block, Mesh
-from ccd_casadi.plants.rib_stage.reference import PAIRS, cube_mass, cube_stiffness
-from ccd_casadi.plants.rib_stage.symmetry import Fold, Symmetry, fold, swap_displacements
+from ccd_casadi.case_studies.rib_stage.geometry import Material
+from ccd_casadi.case_studies.rib_stage.mesh import Block, Mesh
+from ccd_casadi.case_studies.rib_stage.reference import PAIRS, cube_mass, cube_stiffness
+from ccd_casadi.case_studies.rib_stage.symmetry import Fold, Symmetry, fold, swap_displacements
 from ccd_casadi.support.arrays import Array
 
 # exponents of (l_x, l_y, l_z) in the coefficients: the six of K, then that of M

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
-from ccd_casadi.plants.rib_stage.geometry import Point
-from ccd_casadi.plants.rib_stage.mesh import Mesh
+from ccd_casadi.case_studies.rib_stage.geometry import Point
+from ccd_casadi.case_studies.rib_stage.mesh import Mesh
 from ccd_casadi.support.arrays import Array
 
 

@@ -7,7 +7,7 @@ Balakrishnan & Kabamba 1989; Bruinsma & Steinbuch 1990.)
 import numpy as np
 from scipy.linalg import eigvals, solve
 
-from ccd_casadi.plants.scaling import StateSpace, balanced
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
 NEAR_AXIS = 1e-3  # |Re λ|/|λ| of a candidate: a spurious one costs an evaluation, no more
@@ -35,8 +35,7 @@ def gains(system: StateSpace, omega: Array) -> Array:
 
 
 def _gains(system: StateSpace, omega: Array) -> Array:
-    shifted = 1j * omega[:, None, None] * np.eye(len(system.A)) - system.A
-    response = system.C @ np.linalg.solve(shifted, system.B + 0j) + system.D
+    response = system.at(1j * omega)
     known = np.asarray(np.isfinite(response).all(axis=(1, 2)))
     sizes = np.linalg.norm(np.where(known[:, None, None], response, 0.0), 2, axis=(1, 2))
     return np.where(known, sizes, np.inf)

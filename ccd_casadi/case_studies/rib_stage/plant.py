@@ -1,19 +1,22 @@
 """Case study 2 as the case file names it: the options of `rib_stage`, and the plant they make."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import casadi as ca
 
+from ccd_casadi.case_studies.rib_stage import nearby
+from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
+from ccd_casadi.case_studies.rib_stage.mesh import COARSE, FINE, MeshOrder
+from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
+from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
+from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
+from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.fixed import WithFixed
+from ccd_casadi.plants.pictures import Drawing
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
-from ccd_casadi.plants.rib_stage import nearby
-from ccd_casadi.plants.rib_stage.geometry import NAMES, Geometry, Material, Point, PointMass
-from ccd_casadi.plants.rib_stage.mesh import COARSE, FINE, MeshOrder
-from ccd_casadi.plants.rib_stage.model import RibStage
-from ccd_casadi.plants.rib_stage.truncation import TWENTY, ModeCount
+from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.process_pool import Pool
 
 MESHES = {"coarse": COARSE, "shipped": MeshOrder(), "fine": FINE}
@@ -93,7 +96,18 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
         references={name: evaluator(variant, False) for name, variant in references.items()},
         values=evaluator(stage, False),
         nearby=partial(_nearby, evaluator(stage, False)) if nearby.applies(stage) else None,
+        shapes=lambda theta, count: mode_shapes(stage, [theta[i] for i in place], count),
+        drawing=partial(_drawing, stage, place),
     )
+
+
+def _drawing(
+    stage: RibStage, place: Sequence[int], thetas: Mapping[str, Sequence[float]]
+) -> Drawing:
+    from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
+
+    stages = {name: [theta[i] for i in place] for name, theta in thetas.items()}
+    return drawing(stage.geometry, stages)
 
 
 class StageEvaluator:
@@ -127,16 +141,6 @@ def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Poo
     return lambda values: evaluate([float(values[i]) for i in own.place])
 
 
-def stage_of(plant: Plant, theta: Sequence[float]) -> tuple[RibStage, tuple[float, ...]] | None:
-    """The stage behind a plant and θ in the stage's own order; None for another plant."""
-    found = plant.evaluate
-    if isinstance(found, WithFixed):
-        theta, found = found.at(theta), found.evaluate
-    if not isinstance(found, StageEvaluator):
-        return None
-    return found.stage, tuple(float(theta[i]) for i in found.place)
-
-
 def _points(points: Points) -> tuple[Point, ...] | None:
     return tuple((float(x), float(y)) for x, y in points) or None
 
@@ -147,3 +151,23 @@ def _point_mass(x: float, y: float, mass: float, side: float) -> PointMass:
     if max(abs(x), abs(y)) > 0.5 * side * (1.0 + 1e-12):
         raise StageError(f"point_masses: ({x:g}, {y:g}) is off the stage; move it inside")
     return PointMass(float(x), float(y), float(mass))
+
+
+MODEL = Model(
+    rib_stage,
+    theta=NAMES,
+    checks={
+        "zeta": FRACTION,
+        "outputs": choice(*OUTPUTS),
+        "mesh": choice(*MESHES),
+        "side": POSITIVE,
+        "young": POSITIVE,
+        "poisson": number(0.0, 0.5, "give a number between 0 and 0.5"),
+        "density": POSITIVE,
+        "least_bay": POSITIVE,
+        "actuators": rows(2),
+        "sensors": rows(2),
+        "point_masses": rows(3),
+    },
+    sound=True,
+)

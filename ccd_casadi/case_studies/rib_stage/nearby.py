@@ -16,16 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rib_stage.geometry import Point, has_square_symmetry
-from ccd_casadi.plants.rib_stage.model import (
+from ccd_casadi.case_studies.rib_stage.geometry import Point, has_square_symmetry
+from ccd_casadi.case_studies.rib_stage.model import (
     RibStage,
     assembled,
     discretisation,
     points_of,
     rigid_part,
 )
-from ccd_casadi.plants.rib_stage.modes import (
+from ccd_casadi.case_studies.rib_stage.modes import (
     EXTRA,
     SQUARE_GROUPS,
     Discretisation,
@@ -35,7 +34,8 @@ from ccd_casadi.plants.rib_stage.modes import (
     sign_functional,
     spectrum,
 )
-from ccd_casadi.plants.rib_stage.symmetry import Symmetry
+from ccd_casadi.case_studies.rib_stage.symmetry import Symmetry
+from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 
 SAME = 1e-9  # share of the largest singular value below which a direction is known already

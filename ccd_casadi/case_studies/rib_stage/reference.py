@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.polynomial import legendre
 
-from ccd_casadi.plants.rib_stage.geometry import Material
+from ccd_casadi.case_studies.rib_stage.geometry import Material
 from ccd_casadi.support.arrays import Array
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))

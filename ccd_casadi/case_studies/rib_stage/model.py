@@ -8,14 +8,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.case_studies.rib_stage import geometry as shape
+from ccd_casadi.case_studies.rib_stage.geometry import Geometry, Point
+from ccd_casadi.case_studies.rib_stage.mesh import MeshOrder
+from ccd_casadi.case_studies.rib_stage.modes import Discretisation, discretise, functionals, slopes
+from ccd_casadi.case_studies.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
+from ccd_casadi.case_studies.rib_stage.truncation import Mode, ModeCount, ModeSet, solve_modes
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rib_stage import geometry as shape
-from ccd_casadi.plants.rib_stage.geometry import Geometry, Point
-from ccd_casadi.plants.rib_stage.mesh import MeshOrder
-from ccd_casadi.plants.rib_stage.modes import Discretisation, discretise, functionals, slopes
-from ccd_casadi.plants.rib_stage.rigid import RIGID_NAMES, rigid_fields, rigid_values
-from ccd_casadi.plants.rib_stage.truncation import Mode, ModeCount, ModeSet, solve_modes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.threads import side_by_side
 

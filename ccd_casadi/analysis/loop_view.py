@@ -1,0 +1,152 @@
+"""One controller on its plants over frequency: what pages and the explorer draw of a loop."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.lti.closed_loop import largest, responses_of
+from ccd_casadi.lti.grid import around, frequency_grid, light
+from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
+# In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.
+FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))
+END = 0.998  # of half the sampling rate
+SAME = 1e-9  # relative distance of two frequencies below which they are one
+NAMES = ("S", "KS", "T")
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """What a loop has to keep: S_max, S_low up to `low_hz`, and bounds of S, KS, T over Hz.
+
+    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are.
+    """
+
+    S_max: float
+    S_low: float
+    low_hz: float
+    over: Callable[[Array], Array]
+    words: tuple[str, str, str]
+
+
+@dataclass(frozen=True)
+class LoopView:
+    """σ_max of S, KS (N/m), T and GS (m/N) of every plant, the model first, (4, P, k) over Hz.
+
+    G (k, p, m), K (k, m, p) as they run and `peaks`, local maxima of σ_max(S) above 1 as
+    (Hz, gain), are the model's; `open` is L = GK of every plant (P, k, p, p). `bounds` (3, k) of
+    S, KS, T: NaN where nothing is asked.
+    """
+
+    label: str
+    loop: Loop
+    hz: Array
+    plant: np.ndarray
+    controller: np.ndarray
+    sizes: Array
+    open: np.ndarray
+    bounds: Array
+    bounded: Bounded
+    bandwidth_hz: float
+    peaks: tuple[tuple[float, float], ...]
+    resonances_hz: tuple[float, ...]
+    antiresonances_hz: tuple[float, ...]
+
+    @property
+    def gains(self) -> Array:
+        """σ_max of S, KS and T (3, k) on the model."""
+        return self.sizes[:3, 0]
+
+    @property
+    def scalar(self) -> bool:
+        """Whether the loop has one channel."""
+        return self.plant.shape[1:] == (1, 1)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The least and the largest frequency, Hz."""
+        return float(self.hz[0]), float(self.hz[-1])
+
+    def named(self, name: str) -> str:
+        """`|S|`, or of several channels the largest singular value."""
+        return f"|{name}|" if self.scalar else f"σ_max({name})"
+
+    @cached_property
+    def shares(self) -> Array:
+        """The largest gain of any plant over its bound (3, k)."""
+        return np.asarray(self.sizes[:3].max(axis=1) / self.bounds)
+
+
+def loop_view(
+    loops: Sequence[Loop],
+    bounded: Bounded,
+    *,
+    bandwidth_hz: float,
+    label: str = "",
+    points: int = POINTS,
+    peaks: bool = True,
+) -> LoopView:
+    """The loops of one controller on plants in SI, the model first, on one grid.
+
+    It reaches from below ω_low and ω_b to beyond the modes, of a sampled loop to half its rate,
+    and is fine around light poles and zeros of every plant and of K.
+    """
+    model = loops[0]
+    poles, zeros = (_hz(of) for of in (model.plant.poles, model.plant.zeros(_unit(model))))
+    found = peaks_of(model) if peaks else ()
+    tops = [hz for hz, gain in found if gain > 1.05]
+    low = min(bounded.low_hz, bandwidth_hz / 10.0) / 5.0
+    high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
+    if model.sampling is not None:
+        high = END * 0.5 / model.sampling.period
+    roots = [light(loop.plant.poles) for loop in loops]
+    roots += [light(model.controller.rates), light(model.plant.zeros(_unit(model)))]
+    near = around(np.concatenate(roots), FLANKS) / HZ
+    special = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
+    hz = frequency_grid(low, high, points, near, special, apart=SAME)
+    sizes, opened, first = [], [], None
+    for loop in loops:
+        G, K = loop.responses(HZ * hz)
+        first = first or (G, K)
+        parts = responses_of(G, K)
+        sizes.append([largest(parts[name]) for name in (*NAMES, "GS")])
+        opened.append(G @ K)
+    assert first is not None
+    return LoopView(
+        label, model, hz, *first, np.array(sizes).swapaxes(0, 1), np.array(opened),
+        np.asarray(bounded.over(hz)), bounded, bandwidth_hz, found, poles, zeros,
+    )  # fmt: skip
+
+
+def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:
+    """Local maxima of σ_max(S) above 1 as (Hz, gain), ascending."""
+
+    def gain(omega: Array) -> Array:
+        return largest(loop.sensitivity(omega))
+
+    grid = loop.grid()
+    values = gain(grid)
+    tops = [i for i in local_maxima(values) if values[i] > 1.0]
+    found = [climbed(lambda w: float(gain(np.array([w]))[0]), grid[i - 1], grid[i + 1])
+             for i in tops]  # fmt: skip
+    return tuple((omega / HZ, height) for omega, height in found)
+
+
+def with_label(view: LoopView, label: str) -> LoopView:
+    """The same under another name."""
+    return replace(view, label=label)
+
+
+def _unit(loop: Loop) -> float:
+    return float(np.abs(loop.plant.poles).max())
+
+
+def _hz(roots: np.ndarray) -> tuple[float, ...]:
+    """Frequencies in Hz of lightly damped pairs, ascending."""
+    return tuple(float(value) for value in np.abs(light(roots)) / HZ)

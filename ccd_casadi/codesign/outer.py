@@ -1,0 +1,145 @@
+"""What the outer problem asks of one kind of inner problem; its search is written against this.
+
+A kind knows how its formulations run, how a design is polished on the truth and what the whole
+inner problem at θ has to say against it, and how the design that is left is judged.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import Learner
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.optim.kkt import KktCertificate
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a local solve on the truth ended: x, J, and whether it is a stationary point."""
+
+    x: Array
+    objective: float
+    stationary: bool
+
+
+@dataclass(frozen=True)
+class End:
+    """A polished design of the truth before it is judged.
+
+    `x` begins with θ. `gap`: by how much (relative) the whole inner problem at θ is better;
+    `objective` infinite where the design is not certified or breaks a bound.
+    """
+
+    x: Array
+    value: float
+    objective: float
+    kkt: KktCertificate
+    gap: float
+
+    @property
+    def feasible(self) -> bool:
+        """Whether its constraints are met."""
+        return bool(np.isfinite(self.objective))
+
+
+class Outer(ABC):
+    """The outer problem of one kind of inner problem, on a sampler's store and workers."""
+
+    kkt_level: float  # residual up to which an end counts as stationary
+    look_is_cheap: bool  # whether local solves may start from points that are no better
+
+    def __init__(self, sampler: Sampler) -> None:
+        self.sampler = sampler
+
+    @property
+    def problem(self) -> CoDesignProblem:
+        """The problem, with what a search has added to it."""
+        return self.sampler.problem
+
+    def theta_of(self, x: Array) -> Array:
+        """θ of a point."""
+        return np.asarray(x, float)[: len(self.problem.names)]
+
+    def prepared(self, seed: int) -> "Outer":
+        """With what every search needs before it begins."""
+        return self
+
+    @abstractmethod
+    def formulated(
+        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        """One formulation, from the surrogates that are given where there are any."""
+
+    @abstractmethod
+    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+        """A formulation that found nothing: a design to go on from, or why there is none."""
+
+    @abstractmethod
+    def ended(self, x: Array) -> End:
+        """Polish a point on the truth, and hold the whole inner problem there against it."""
+
+    def joined(self, end: End) -> "Outer | None":
+        """With what stood against an end, to be searched again; None where nothing did."""
+        return None
+
+    @abstractmethod
+    def resumed(
+        self,
+        formulation: Formulation,
+        outcome: FormulationResult,
+        x: Array,
+        sampled: Sequence[tuple[float, ...]],
+        seed: int,
+    ) -> FormulationResult:
+        """Go on from a design that the surrogates did not foresee: they learn it.
+
+        `sampled`: θ that the formulation had solved.
+        """
+
+    @abstractmethod
+    def solved_from(
+        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        """A local solve on the truth from a sample; none goes on near `known` stationary points.
+
+        `settled`: relative change of J at which it ends.
+        """
+
+    def excluding(
+        self, processes: tuple[GaussianProcess, ...], x: Array, seed: int
+    ) -> tuple[GaussianProcess, ...]:
+        """Those of the surrogates that may rule out parts of the box; none where none may."""
+        return ()
+
+    def explained(self, found: Solution, share: float | None) -> str:
+        """Why a solution is not verified; `share` of a robust set that was held on the way."""
+        return str(found.result["reason"])
+
+    @abstractmethod
+    def verified(self, end: End, rounds: int) -> Verified:
+        """The design judged on the truth, after so many `rounds` of the whole search."""
+
+    def point_of(self, run: FinishedRun) -> Array:
+        """x of a run's design."""
+        return np.array(run.theta)
+
+    @abstractmethod
+    def learner(self, samples: int, seed: int) -> Learner:
+        """Surrogates for the trade-off of hardware cost against the value."""
+
+    @abstractmethod
+    def responses(self, x: Array) -> PostOptimal:
+        """How an optimum at x answers to what was given."""

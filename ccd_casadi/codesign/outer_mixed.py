@@ -1,0 +1,265 @@
+"""The outer problem with mixed-sensitivity controllers, x = (θ, ln ω_S, ln ω_T).
+
+One synthesis with exact derivatives costs a millisecond: formulations and local solves go through
+x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what they end with.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.closer_models import check_references
+from ccd_casadi.codesign.design_plants import failure_words
+from ccd_casadi.codesign.direct import (
+    Direct,
+    acceptable,
+    polish,
+    solve_direct,
+    true_objective,
+)
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import LiftedLearner
+from ccd_casadi.codesign.kinked import SETTLED, descend
+from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.lifted import Lifted, solve_lifted
+from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.codesign.peak_constraints import HALF_POWER
+from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
+from ccd_casadi.codesign.robust_check import check_robust, other_damping, survived
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verified_mixed import VerifiedDesign
+from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
+from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.plants.modal import Suspension
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
+from ccd_casadi.synthesis.closed_loop import handed_out, measure
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
+from surrogates import GaussianProcess, design, quality_of
+
+POLISH_ROUNDS = 3
+INNER_GAP = 1e-6  # relative; the global inner problem may not beat the design by more
+BASIN = 1e-4  # residual of an end whose basin is not searched again
+COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to rule anything out
+NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
+
+
+def joint_point(sample: BandwidthSample) -> Array:
+    """(θ, ln ω_S, ln ω_T) of a sample of ω_b*(θ)."""
+    return np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+
+
+@dataclass(frozen=True)
+class MixedEnd(End):
+    """With the synthesis there and its derivatives."""
+
+    design: Sensitivities
+
+
+class MixedOuter(Outer):
+    """See the module."""
+
+    kkt_level = VerifiedDesign.kkt_level
+    look_is_cheap = True
+
+    def formulated(
+        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        sampler = self.sampler
+        if isinstance(formulation, Nested):
+            return solve_nested(sampler, formulation, seed=seed, given=given)
+        if isinstance(formulation, Lifted):
+            return solve_lifted(sampler, formulation, seed=seed, given=given)
+        with sampler.spent.on("search"):
+            return solve_direct(sampler, formulation, seed=seed)
+
+    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+        """The true inner problem at a few θ tells an infeasible case from a formulation that
+        failed."""
+        lower, upper = box(self.problem)
+        points = design("sobol", lower, upper, 8, seed)
+        with self.sampler.spent.on("rescue"):
+            samples = self.sampler.bandwidths(points, "looking for a feasible design")
+        feasible = [sample for sample in samples if sample.feasible]
+        if not feasible:
+            assert self.sampler.nearest is not None
+            words = self.sampler.nearest.shortfall
+            return FormulationResult(None, None, outcome.iterates, (), None, False, words)
+        best = max(feasible, key=lambda sample: sample.bandwidth)
+        return replace(outcome, x=joint_point(best), agreed=False)
+
+    def ended(self, x: Array) -> MixedEnd:
+        """Polished; where the inner problem has a better design at its θ, on from that one."""
+        problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
+        gap, made = np.inf, None
+        for _ in range(POLISH_ROUNDS):
+            polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
+            with polishing as progress, sampler.spent.on("polish"):
+                x, made, _ = polish(sampler, x)
+                progress.advance()
+            at_bounds = _snapped(problem, x)
+            if acceptable(problem, at_bounds, truth.at(at_bounds)):
+                x, made = at_bounds, truth.at(at_bounds)
+            with sampler.spent.on("checks"):
+                inner = sampler.bandwidths(self.theta_of(x), "verifying")[0]
+            gap = inner.bandwidth / made.figures.bandwidth - 1.0 if inner.feasible else 0.0
+            if gap <= INNER_GAP:
+                break
+            x = joint_point(inner)
+        assert made is not None
+        J = true_objective(problem, x, made) if acceptable(problem, x, made) else np.inf
+        kkt = kkt_certificate(problem, x, made)
+        return MixedEnd(x, made.figures.bandwidth, J, kkt, float(gap), made)
+
+    def resumed(
+        self,
+        formulation: Formulation,
+        outcome: FormulationResult,
+        x: Array,
+        sampled: Sequence[tuple[float, ...]],
+        seed: int,
+    ) -> FormulationResult:
+        sampler = self.sampler
+        if isinstance(formulation, Direct):
+            return replace(outcome, x=x, design=None, agreed=True)
+        if isinstance(formulation, Nested):
+            thetas = np.unique(np.array([*sampler.solved, tuple(self.theta_of(x))]), axis=0)
+            found = solve_nested(sampler, formulation, seed=seed, given=Surrogates((), thetas, ()))
+        else:
+            old = fitted_quantities(outcome.surrogates)
+            new = [sample for sample in sampler.quantities(x) if sample.certified]
+            samples = tuple({sample.x: sample for sample in (*old, *new)}.values())
+            thetas = np.array([sample.x[:-2] for sample in samples])
+            given = Surrogates(outcome.surrogates if old else (), thetas, samples)
+            first = new[0] if new else None
+            found = solve_lifted(sampler, formulation, seed=seed, given=given, incumbent=first)
+        if found.x is None:
+            return replace(outcome, x=x, surrogates=found.surrogates or outcome.surrogates)
+        return replace(found, iterates=(*outcome.iterates, *found.iterates))
+
+    def solved_from(
+        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        problem, truth = self.problem, self.sampler.truth
+        begin = joint_point(sample)
+        basins = [(place.x, place.objective) for place in known if place.stationary]
+        settled = SETTLED if settled is None else settled
+        end = descend(problem, truth, begin, ended=basins, settled=settled)
+        for x in (end, begin):
+            made = truth.at(x)
+            if acceptable(problem, x, made):
+                stationary = kkt_certificate(problem, x, made).stationarity <= BASIN
+                return Place(x, true_objective(problem, x, made), stationary)
+        return None
+
+    def excluding(
+        self, processes: tuple[GaussianProcess, ...], x: Array, seed: int
+    ) -> tuple[GaussianProcess, ...]:
+        """Where ω_b jumps (a peak below it reaches -3 dB) a smooth surrogate is sure of what is not
+        so; elsewhere where left-out samples lie within their bands."""
+        if len(processes) < 2 or self._may_jump(x):
+            return ()
+        middle = 0.5 * (processes[0].lower + processes[0].upper)
+        found = [quality_of(process, middle, seed=seed) for process in processes]
+        sound = all(q.smooth_enough and q.coverage >= COVERAGE for q in found)
+        return processes if sound else ()
+
+    def _may_jump(self, x: Array) -> bool:
+        """Whether a local maximum of S at x is near -3 dB."""
+        problem, made = self.problem, self.sampler.truth.at(x)
+        peaks = local_peaks_with_gradients(
+            scaled_plant(problem, tuple(self.theta_of(x))),
+            problem.weights.at(made.figures.omega_S, made.figures.omega_T),
+            made,
+            gamma_backoff=problem.inner.gamma_backoff,
+            least=float(np.exp(HALF_POWER - NEAR_SHELF)),
+        )
+        return any(abs(p.ln_gain - HALF_POWER) <= NEAR_SHELF for p in peaks if p.member == 0)
+
+    def explained(self, found: Solution, share: float | None) -> str:
+        return failure_words(self.sampler, found, share)
+
+    def verified(self, end: End, rounds: int) -> VerifiedDesign:
+        assert isinstance(end, MixedEnd)
+        problem, sampler, x = self.problem, self.sampler, end.x
+        theta = tuple(float(v) for v in self.theta_of(x))
+        final = _final(problem, theta, end.design.figures)
+        free = replace(problem, suspension=Suspension(0.0, 0.0))
+        unsuspended = measure(
+            scaled_plant(free, theta), final.controller, final.weights, gamma=UNBOUNDED,
+            omega_low=problem.inner.omega_low,
+        )  # fmt: skip
+        loops = loops_of(problem, theta, final.controller)
+        found, robust = None, check_robust(problem, loops)
+        if final.figures.certified:
+            found, robust = survived(problem, loops, final.figures.bandwidth)
+        return VerifiedDesign(
+            problem=problem,
+            x=x,
+            theta=theta,
+            design=final,
+            value=final.figures.bandwidth,
+            objective=objective(problem, theta, final.figures.bandwidth),
+            hardware_cost=hardware_cost(plant_of(problem), theta),
+            binding=self._binding(x, final.figures),
+            kkt=kkt_certificate(problem, x, end.design, sampler.truth.at),
+            inner_gap=end.gap,
+            feasible=final.figures.certified and acceptable(problem, x, end.design),
+            unsuspended=unsuspended,
+            references=check_references(
+                problem, theta, final, workers=sampler.workers, quiet=sampler.quiet
+            ),
+            robust=robust,
+            damping=other_damping(problem, loops),
+            survival=found,
+        )
+
+    def point_of(self, run: FinishedRun) -> Array:
+        return np.append(run.theta, np.log([run.weights.omega_S, run.weights.omega_T]))
+
+    def learner(self, samples: int, seed: int) -> LiftedLearner:
+        return LiftedLearner(self.sampler, samples, seed)
+
+    def responses(self, x: Array) -> PostOptimal:
+        return post_optimal(self.problem, x, self.sampler.quiet)
+
+    def _binding(self, x: Array, figures: DesignFigures) -> tuple[str, ...]:
+        problem = self.problem
+        program = lifted_program(problem, self.sampler.truth, exact_hessian=False)
+        bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
+        extra = touched(problem, tuple(self.theta_of(x)))
+        return (*bounds, *active_constraints(problem.inner, figures), *extra)
+
+
+def _final(
+    problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures
+) -> Design:
+    """The synthesis that is handed out, in SI and certified again there."""
+    plant = scaled_plant(problem, theta)
+    made = synthesise(
+        plant, problem.weights.at(figures.omega_S, figures.omega_T),
+        omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
+        compliance=True,
+    )  # fmt: skip
+    return handed_out(plant, made, problem.inner.omega_low)
+
+
+def _snapped(problem: CoDesignProblem, x: Array) -> Array:
+    """Put variables that IPOPT left within rounding of a bound onto it."""
+    lower, upper = lifted_bounds(problem)
+    width = upper - lower
+    x = np.where(np.abs(x - lower) <= 1e-9 * width, lower, x)
+    return np.where(np.abs(x - upper) <= 1e-9 * width, upper, x)

@@ -1,0 +1,199 @@
+"""The outer problem with controllers of fixed structure, over θ alone.
+
+A formulation works on v(θ) of the problem's anchors and plant set, with envelope gradients. At its
+end a full race and a search for worse plants ask whether these were good enough at that θ; if not,
+what they find joins, and the outer problem is solved again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import NestedLearner
+from ccd_casadi.codesign.full_order import full_order_beside
+from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.robust_check import other_damping, survived
+from ccd_casadi.codesign.sections_direct import pieces_from, polish_sections, solve_direct_sections
+from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
+from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
+from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.worst_plant import Excess
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.progress import Progress
+
+BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
+SETTLED = 1e-7  # of J: what local solves of a look promise less than that is not looked for
+
+
+@dataclass(frozen=True)
+class SectionsEnd(End):
+    """With the sampler of the problem that has it, its design and that one's gradients, a race
+    there, the worst plant, and those to add."""
+
+    asked: Sampler
+    best: BandwidthSample
+    design: SectionsDesign
+    envelope: Envelope | None
+    raced: Raced
+    worst: Excess
+    members: tuple[Member, ...]
+
+
+class SectionsOuter(Outer):
+    """See the module; `words` say why a race at the start found no anchors."""
+
+    kkt_level = VerifiedSections.kkt_level
+    look_is_cheap = False
+
+    def __init__(self, sampler: Sampler, words: str = "") -> None:
+        super().__init__(sampler)
+        self.words = words
+
+    def prepared(self, seed: int) -> "SectionsOuter":
+        """Raced at the start for anchors and the plant set, where there are none."""
+        sampler = self.sampler
+        if sections_of_problem(sampler.problem).anchors:
+            return self
+        problem, words = seeded_and_prepared(
+            sampler.store, sampler.problem, seed, sampler.quiet, sampler.workers
+        )
+        sampler.raced(sampler.hash)
+        lost = words and not sections_of_problem(problem).anchors
+        return SectionsOuter(sampler.of(problem), words if lost else "")
+
+    def formulated(
+        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        """Nested; what is lifted are the exact gradients, as there are no ω_S and ω_T."""
+        if isinstance(formulation, Direct):
+            with self.sampler.spent.on("search"):
+                return solve_direct_sections(self.sampler, formulation.starts, seed=seed)
+        if isinstance(formulation, Nested):
+            return solve_nested(self.sampler, formulation, seed=seed, given=given)
+        options = Nested(
+            "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
+            formulation.tolerance, formulation.max_refinements, formulation.kernel,
+        )  # fmt: skip
+        return solve_nested(self.sampler, options, seed=seed, given=given, gradients=True)
+
+    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+        """None: every θ has had its own race. Why, in words."""
+        nearest = self.sampler.nearest
+        words = self.words if nearest is None else nearest.shortfall
+        return replace(outcome, message=words or outcome.message)
+
+    def ended(self, x: Array) -> SectionsEnd:
+        with self.sampler.spent.on("polish"):
+            asked, best = polish_sections(self.sampler, self.theta_of(x))
+        problem, theta = asked.problem, best.theta
+        found = sections_value(problem, theta)
+        raced = raced_at(asked, theta)
+        tell = teller("at the end", asked.quiet)
+        worst, members = worst_members(problem, theta, found.design, 0, tell)
+        gap = problem.figure.gain(raced.value, best.value) if raced.certified else 0.0
+        return SectionsEnd(
+            np.array(theta), best.value, objective_of(problem, best),
+            sections_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
+            found.envelope, raced, worst, members,
+        )  # fmt: skip
+
+    def joined(self, end: End) -> "SectionsOuter | None":
+        end = cast(SectionsEnd, end)
+        better = end.gap > BETTER
+        if not (better or end.members):
+            return None
+        kappa = np.array(end.raced.kappa) if better else end.design.kappa
+        trace = self.sampler.trace
+        if end.members:  # what was found for fewer plants is worth nothing on these
+            trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
+        return SectionsOuter(self.sampler.of(joined(end.asked.problem, kappa, end.members)))
+
+    def resumed(
+        self,
+        formulation: Formulation,
+        outcome: FormulationResult,
+        x: Array,
+        sampled: Sequence[tuple[float, ...]],
+        seed: int,
+    ) -> FormulationResult:
+        if isinstance(formulation, Direct):
+            return replace(outcome, x=x, agreed=True)
+        thetas = np.unique(np.array([*sampled, tuple(x)]), axis=0)
+        found = self.formulated(formulation, seed, Surrogates((), thetas, ()))
+        if found.x is None:
+            return replace(outcome, x=x)
+        return replace(found, iterates=(*outcome.iterates, *found.iterates))
+
+    def solved_from(
+        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        problem = self.problem
+        truth = TrueBandwidth(self.sampler, "local solve")
+        best, _ = pieces_from(truth, sample, SETTLED if settled is None else settled)
+        J = objective_of(problem, best)
+        if not np.isfinite(J):
+            return None
+        stationary = sections_kkt(problem, best).stationarity <= SMOOTH
+        return Place(np.array(best.theta), J, stationary)
+
+    def verified(self, end: End, rounds: int) -> VerifiedSections:
+        end = cast(SectionsEnd, end)
+        asked, best, made, worst = end.asked, end.best, end.design, end.worst
+        problem = asked.problem
+        assert made.controller is not None
+        loops = loops_of(problem, best.theta, made.controller)
+        kkt = sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
+        wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
+        with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
+            beside = full_order_beside(problem, best.theta, made)
+            bar.advance()
+        return VerifiedSections(
+            problem=problem,
+            theta=best.theta,
+            value=best.value,
+            objective=end.objective,
+            hardware_cost=hardware_cost(plant_of(problem), best.theta),
+            kkt=kkt,
+            inner_gap=float(max(end.gap, 0.0)),
+            feasible=made.certified and not unmet(problem, best.theta),
+            survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
+            damping=other_damping(problem, loops),
+            design=made,
+            raced=end.raced,
+            wide=wide,
+            checked=checked,
+            proof=proof_of(problem, best.theta, made),
+            worst=worst,
+            rounds=rounds,
+            beside=beside,
+        )
+
+    def learner(self, samples: int, seed: int) -> NestedLearner:
+        return NestedLearner(self.sampler, seed=seed)
+
+    def responses(self, x: Array) -> PostOptimal:
+        sample = self.sampler.bandwidths(x, "the run's own design")[0]
+        return sections_responses(self.problem, sample, sections_value(self.problem, sample.theta))

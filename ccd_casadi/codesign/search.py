@@ -1,0 +1,139 @@
+"""The outer problem from a formulation to a verified design, for every kind of controller.
+
+A formulation, a polish of its end on the truth and the whole inner problem there; where that finds
+better the search begins anew with it. Then a look over the box, and on from what is better.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from ccd_casadi.codesign.box_look import look_over_box, perturbed
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.outer import End, Outer
+from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.surrogate_quality import surrogate_quality
+
+AGAIN = 3  # times at most that a search begins with what the inner problem has found better
+MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What a search ends with: `end` None where no design was found; `outer` as it is by then."""
+
+    outer: Outer
+    outcome: FormulationResult
+    end: End | None
+    rounds: int
+    look: BoxLook | None = None
+
+
+def searched(
+    outer: Outer, formulation: Formulation, seed: int, given: Surrogates | None = None
+) -> Searched:
+    """Formulation and polish, again with what the inner problem at the end has found better."""
+    outer = outer.prepared(seed)
+    rounds = 0
+    while True:
+        rounds += 1
+        outcome = outer.formulated(formulation, seed, given)
+        if outcome.x is None:
+            outcome = outer.rescued(outcome, seed)
+        if outcome.x is None:
+            return Searched(outer, outcome, None, rounds)
+        sampled = tuple(outer.sampler.solved)
+        end = outer.ended(outcome.x)
+        more = None if rounds == AGAIN else outer.joined(end)
+        if more is None:
+            return _looked(Searched(outer, outcome, end, rounds), formulation, sampled, seed)
+        outer = more
+
+
+def _looked(
+    found: Searched, formulation: Formulation, sampled: Sequence[tuple[float, ...]], seed: int
+) -> Searched:
+    """After a look over the box, and a last try where the end is not stationary."""
+    outer, outcome, end = found.outer, found.outcome, found.end
+    assert end is not None
+    with outer.sampler.spent.on("box_look"):
+        points = formulation.box_points
+        look = look_over_box(outer, end, points, seed, outcome.surrogates)
+    rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
+    error = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
+    missed = error > formulation.tolerance
+    if look.x is not None or (missed and len(outcome.iterates) <= rounds):
+        x, again = end.x, formulation
+        if look.x is not None:
+            x = look.x
+            if not isinstance(formulation, Direct):
+                again = replace(formulation, max_refinements=min(rounds, MOVED_ROUNDS))
+        outcome = outer.resumed(again, outcome, x, sampled, seed)
+        places = [] if np.array_equal(x, end.x) else [x]
+        if outcome.x is not None and not np.array_equal(x, outcome.x):
+            places.append(outcome.x)
+        end = best_end([end, *map(outer.ended, places)], outer.kkt_level, formulation.tolerance)
+    if np.isfinite(end.kkt.stationarity) and end.kkt.stationarity > outer.kkt_level:
+        with outer.sampler.spent.on("polish"):
+            starts = perturbed(outer, end.x, seed)
+        ends = [end, *map(outer.ended, starts)]
+        end = best_end(ends, outer.kkt_level, formulation.tolerance)
+        if isinstance(formulation, Direct):  # has no surrogate that could have promised another
+            outcome = replace(outcome, x=end.x, design=None)
+    return replace(found, outcome=outcome, end=end, look=look)
+
+
+def best_end(found: Sequence[End], level: float, tolerance: float) -> End:
+    """The least J of those that are feasible; within the tolerance of it one that is stationary.
+
+    A better design that is not stationary is kept: to call a worse one optimal would be untrue.
+    """
+    least = min(item.objective for item in found)
+    if not np.isfinite(least):
+        return found[0]
+    near = [item for item in found if item.objective <= least + tolerance * abs(least)]
+    stationary = [item for item in near if item.kkt.stationarity <= level]
+    return min(stationary or near, key=lambda item: item.objective)
+
+
+def concluded(
+    found: Searched, formulation: str, tolerance: float, seed: int, began: float
+) -> Solution:
+    """The design judged, and result.json."""
+    outer, outcome, sampler = found.outer, found.outcome, found.outer.sampler
+    if found.end is None:
+        result = infeasible_dict(
+            formulation, outcome.message, spent=sampler.spent.by_purpose,
+            seconds=perf_counter() - began, seed=seed,
+        )  # fmt: skip
+        return Solution(result, outcome, None)
+    with sampler.spent.on("checks"):
+        verified = outer.verified(found.end, found.rounds)
+    quality = surrogate_quality(outcome.surrogates, verified, seed, quiet=sampler.quiet)
+    result = result_dict(
+        formulation, outcome, verified, tolerance=tolerance, spent=sampler.spent.by_purpose,
+        seconds=perf_counter() - began, seed=seed, quality=quality, look=found.look,
+    )  # fmt: skip
+    return Solution(result, outcome, verified, quality)
+
+
+def concluded_at(
+    outer: Outer, outcome: FormulationResult, formulation: str, tolerance: float, seed: int,
+    began: float,
+) -> Solution:  # fmt: skip
+    """An outcome polished and judged as it is, without a look over the box."""
+    end = None if outcome.x is None else outer.ended(outcome.x)
+    return concluded(Searched(outer, outcome, end, 1), formulation, tolerance, seed, began)
+
+
+def nothing_found(outer: Outer, words: str) -> Searched:
+    """No design, and why."""
+    return Searched(outer, FormulationResult(None, None, (), (), None, False, words), None, 0)
+
+

@@ -1,0 +1,32 @@
+"""Frequencies that resolve a loop: logarithmic, with points on the flanks of every resonance."""
+
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
+
+FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
+LIGHT = 0.3  # damping ratio below which a pole or zero is a resonance
+
+
+def around(roots: np.ndarray, flanks: Array = FLANKS) -> Array:
+    """|Im p| + flank |Re p| of roots p (k,) of any plane in 1/s, in rad/s and unsorted."""
+    return np.asarray((np.abs(roots.imag)[:, None] + np.abs(roots.real)[:, None] * flanks).ravel())
+
+
+def light(roots: np.ndarray) -> np.ndarray:
+    """Those of the upper half plane with a damping ratio below 0.3, ascending by size."""
+    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
+    upper = upper[np.abs(upper.real) < LIGHT * np.abs(upper)]
+    return np.asarray(upper[np.argsort(np.abs(upper))])
+
+
+def frequency_grid(
+    low: float, high: float, points: int, *special: Array, apart: float = 0.0
+) -> Array:
+    """`points` frequencies evenly spread over ln ω from `low` to `high`, and special ones within.
+
+    Ascending, each at least `apart` (relative) above the one before.
+    """
+    grid = np.unique(np.concatenate([np.geomspace(low, high, points), *special]))
+    grid = grid[(grid >= low) & (grid <= high)]  # NaN compares false
+    return np.asarray(grid[np.append(True, np.diff(grid) > apart * grid[1:])])

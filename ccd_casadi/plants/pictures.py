@@ -1,0 +1,47 @@
+"""What a plant may show of itself: its surface with the shapes of its modes, and a drawing."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ccd_casadi.support.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ModeShape:
+    """Displacements (n, 3) of the surface's points in 1/√kg at a frequency in Hz.
+
+    words: its name, if it has one. numbers: its places among the flexible modes, from 1; two where
+    it stands for a pair of equal frequency. more: further figures of it, by what they are.
+    """
+
+    displacement: Array
+    frequency: float
+    numbers: tuple[int, ...]
+    words: str = ""
+    more: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ModeShapes:
+    """Modes, lowest first, of a surface: points (n, 3) in m, faces (q, 4) of their numbers.
+
+    Faces are counter-clockwise from outside; a triangle names its last corner twice. `view`: from
+    where pictures see it.
+    """
+
+    points: Array
+    faces: np.ndarray
+    modes: tuple[ModeShape, ...]
+    view: str = ""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Several θ of a plant side by side: an <svg> element, its caption, and their lengths."""
+
+    svg: str
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[object, ...], ...]
