@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.deployment.sampled import (
     sampled_figures,
@@ -28,6 +27,7 @@ from ccd_casadi.deployment.sampled import (
     sensitivity_loop,
 )
 from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError

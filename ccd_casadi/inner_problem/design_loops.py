@@ -6,11 +6,11 @@ from functools import partial
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import plants_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.support.arrays import Array
