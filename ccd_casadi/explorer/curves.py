@@ -10,6 +10,7 @@ from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.design_loops import bounds_of_loop
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.lti.grid import frequency_grid
@@ -89,7 +90,7 @@ def curves_of(look: Look) -> Curves | None:
 
 def sampled_of(look: Look) -> AsSampled | None:
     """A certified design at the rate and delay of its sliders; None where it is designed for it."""
-    if look.controller is None or look.problem.sections is not None:
+    if look.controller is None or kind_of(look.problem).as_designed:
         return None
     if look.standing is Standing.REFUSED:
         return None

@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import Bounded, LoopView, loop_view
-from ccd_casadi.fixed_structure import ShapeEnd
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import plants_of
+from ccd_casadi.fixed_structure import Bounds, ShapeEnd
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
@@ -24,9 +24,7 @@ def design_loops(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
 ) -> list[Loop]:
     """The loops that a controller (SI) is designed for at θ: the model's first, as they run."""
-    plants = [scaled_plant(problem, theta)]
-    if problem.sections is not None:
-        plants = plants_of(problem, theta)
+    plants = kind_of(problem).plants(theta)
     return [Loop(plant.plant_si(), controller, problem.sampling) for plant in plants]
 
 
@@ -41,15 +39,15 @@ def bounds_of_loop(
     problem: CoDesignProblem, weights: Weights, gamma: float, bandwidth_hz: float
 ) -> Bounded:
     """What S, KS and T may not exceed: γ/|W|, or what is asked of a fixed structure."""
-    inner = problem.inner
-    if problem.sections is None:
-        over, words = partial(_of_weights, weights, gamma), ("its bound γ/|W|",) * 3
-        most = inner.compliance_max
+    inner, kind = problem.inner, kind_of(problem)
+    asked = kind.bounds()
+    if kind.as_designed:
+        over, words = partial(_asked, asked, bandwidth_hz), OF_SECTIONS
     else:
-        over, words = partial(_of_sections, problem, bandwidth_hz), OF_SECTIONS
-        most = problem.sections.compliance_max
-    return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words, most,
-                   problem.sections is not None)  # fmt: skip
+        over, words = partial(_of_weights, weights, gamma), ("its bound γ/|W|",) * 3
+    most = asked.compliance_max or inner.compliance_max
+    return Bounded(asked.S_max, asked.S_low, asked.omega_low / HZ, over, words, most,
+                   kind.as_designed)  # fmt: skip
 
 
 def design_view(
@@ -72,15 +70,16 @@ def _of_weights(weights: Weights, gamma: float, hz: Array) -> Array:
     return np.asarray(gamma / np.abs(weights.responses(HZ * hz)))
 
 
-def _of_sections(problem: CoDesignProblem, bandwidth_hz: float, hz: Array) -> Array:
+def _asked(asked: Bounds, bandwidth_hz: float, hz: Array) -> Array:
     """The shape, and weighted_level/|W| of KS (N/m) and T."""
-    sections = problem.sections
-    assert sections is not None
-    size = np.abs(problem.weights.responses(HZ * hz))
-    level = np.nan if sections.weighted_level is None else sections.weighted_level
-    shape = np.nan if sections.shape is None else sections.shape
+    none = np.full_like(hz, np.nan)
+    weighted = [none, none]
+    if asked.weights is not None and asked.weighted_level is not None:
+        weighted = list(asked.weighted_level / np.abs(asked.weights.responses(HZ * hz)[1:]))
+    if asked.shape is None:
+        return np.array([none, *weighted])
     below = hz <= bandwidth_hz
-    rising = shape * hz / bandwidth_hz * 2.0**-0.5
+    rising = asked.shape * hz / bandwidth_hz * 2.0**-0.5
     most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
-    bounded = (below | (sections.shape_ends is ShapeEnd.S_MAX)) & (most <= problem.inner.S_max)
-    return np.array([np.where(bounded, most, np.nan), *(level / size[1:])])
+    kept = (below | (asked.shape_ends is ShapeEnd.S_MAX)) & (most <= asked.S_max)
+    return np.array([np.where(kept, most, np.nan), *weighted])
