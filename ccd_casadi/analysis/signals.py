@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop, constant_drive
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 

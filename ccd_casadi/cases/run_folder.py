@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
@@ -24,6 +23,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.signals import Signals, signals_of
 from ccd_casadi.deployment.given_controller import in_discrete_time
@@ -14,6 +13,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -26,9 +26,8 @@ from ccd_casadi.fixed_structure.loop_problem import (
     plant_of_row,
 )
 from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, loop_matrices
+from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
 from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
-from ccd_casadi.fixed_structure.structure import response
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -239,21 +238,3 @@ def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
         out[at] = part.members[plant_of_row(part.problem, own.plant)]
     return out
 
-
-def largest_gains(problem: CompositeProblem, kappa: Array, v: Array) -> tuple[Array, Array, Array]:
-    """σ_max of S, KS and T of every plant at v (k,), each (P, k), in the problem's units."""
-    found = np.zeros((3, problem.count, len(v)))
-    for part in problem.parts:
-        plants, own = part.problem.plants, kappa[part.place]
-        which, at = np.meshgrid(np.arange(len(part.members)), v, indexing="ij")
-        if isinstance(part.problem, MatrixProblem):
-            S, KS, T = loop_matrices(part.problem, own, which, at)
-            gains = [np.linalg.svd(M, compute_uv=False)[..., 0] for M in (S, KS, T)]
-        else:
-            assert isinstance(part.problem, Problem)
-            K, (G, _) = response(part.problem.structure, own, 1j * at), plants.responses(which, at)
-            S = 1.0 / (1.0 + G * K)
-            gains = [np.abs(S), np.abs(K * S), np.abs(G * K * S)]
-        for i, gain in enumerate(gains):
-            found[i, part.members] = np.maximum(found[i, part.members], gain)
-    return found[0], found[1], found[2]

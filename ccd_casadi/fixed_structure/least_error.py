@@ -20,7 +20,6 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
-from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.design import Progress, problem_for
@@ -34,6 +33,7 @@ from ccd_casadi.fixed_structure.sections_design import (
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant

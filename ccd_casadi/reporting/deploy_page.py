@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.signals import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
@@ -19,6 +18,7 @@ from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index

@@ -11,6 +11,7 @@ from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.facts import (
     Fact,
     binding,
+    conclusion,
     cost_words,
     loop_facts,
     theta_words,
@@ -29,8 +30,10 @@ if TYPE_CHECKING:
     pass
 
 
-def sections_conclusion(result: dict[str, Any]) -> str:
-    """One sentence with the key numbers."""
+def conclusion_of(result: Mapping[str, Any]) -> str:
+    """One sentence with the key numbers, for every kind of controller."""
+    if "race" not in result:
+        return conclusion(result)
     verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
     return (
         f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}: a "
@@ -40,7 +43,7 @@ def sections_conclusion(result: dict[str, Any]) -> str:
     )
 
 
-def _plants(result: dict[str, Any]) -> str:
+def _plants(result: Mapping[str, Any]) -> str:
     designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
     if designed == judged == 1:
         return "the model, the only plant of its set"

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
@@ -14,6 +13,7 @@ from ccd_casadi.codesign.later_lines import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
