@@ -8,8 +8,8 @@ from ccd_casadi.codesign.direct import Direct as Direct
 from ccd_casadi.codesign.lifted import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
 from ccd_casadi.codesign.run import solve as solve
+from ccd_casadi.codesign.run import verify as verify
 from ccd_casadi.codesign.solution import Solution as Solution
-from ccd_casadi.codesign.verify import verify as verify
 from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify

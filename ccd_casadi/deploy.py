@@ -37,6 +37,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.structured_text import FILE as ST_FILE
     from ccd_casadi.deployment.structured_text import structured_text
     from ccd_casadi.deployment.words import deployed_line
+    from ccd_casadi.inner_problem.kinds import kind_of
 
     require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
@@ -58,8 +59,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     count = (1 if method else len(Discretisation)) * (2 if timing.lead is None else 1)
     channels = len(finished.plant.C) if finished.plant.channels else 1
     moved = None
-    if finished.problem.sections is not None:  # taken as they are; one way where a rate was given
-        channels, count = 0, 1 if finished.problem.sections.sampling else count
+    if kind_of(finished.problem).as_designed:  # one way where a rate was given
+        channels, count = 0, 1 if finished.problem.sampling else count
     steps = channels + count + 2 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
@@ -108,13 +109,14 @@ def command(options: argparse.Namespace) -> ExitCode:
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.words import against, status_words
+    from ccd_casadi.inner_problem.kinds import kind_of
 
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
     )  # fmt: skip
     orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    if run.problem.sections is not None:
+    if kind_of(run.problem).as_designed:
         orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),

@@ -5,7 +5,7 @@ matrix of one whose damping is a matrix: there a mode's ratio grows as its frequ
 knows which of the two a stage keeps.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from math import inf, log
@@ -16,9 +16,9 @@ import numpy as np
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
 from ccd_casadi.codesign.reach import highest
 from ccd_casadi.codesign.survival import PEAK, Survival, survival_of
-from ccd_casadi.fixed_structure import Bounds, Certificate, certify
+from ccd_casadi.fixed_structure import Certificate, certify
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.scaling import scale_plant
 
@@ -87,16 +87,6 @@ class OtherDamping:
         }
 
 
-def reach_of(problem: CoDesignProblem) -> tuple[float, float]:
-    """The common shifts, down and up, that the set holds at the model's damping and gain."""
-    if problem.sections is None:
-        shift = 0.0 if problem.robust is None else problem.robust.shift
-        return -shift, shift
-    u = problem.sections.uncertainty
-    low, high = ((1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1))
-    return low, high
-
-
 def survived(
     problem: CoDesignProblem, loops: LoopsOffModel, bandwidth: float
 ) -> tuple[Survival, RobustCheck | None]:
@@ -106,7 +96,7 @@ def survived(
     asked for the ranges.
     """
     check = check_robust(problem, loops)
-    marks = [abs(end) for end in reach_of(problem)]
+    marks = [abs(end) for end in kind_of(problem).common_shifts()]
     if check is not None and check.at.damping == 1.0:
         marks.append(abs(check.at.shift))
     found = survival_of(problem, loops, bandwidth, marks)
@@ -152,15 +142,12 @@ def _places(loops: LoopsOffModel, reach: float, shifts: int) -> list[float]:
 
 def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDamping | None:
     """None where the set shifts no resonance."""
-    low, high = reach_of(problem)
+    kind = kind_of(problem)
+    low, high = kind.common_shifts()
     if not high > low:
         return None
-    factors: Sequence[float] = (1.0,) if problem.robust is None else problem.robust.damping
-    gains, inner = [1.0], problem.inner
-    bounds = Bounds(inner.S_max, inner.S_low, inner.omega_low)
-    if problem.sections is not None:
-        u = problem.sections.uncertainty
-        factors, gains, bounds = u.damping, [1.0 - u.gain, 1.0 + u.gain], bounds_of(problem)
+    factors, gains = kind.other_factors()
+    bounds = kind.bounds()
     places = [Perturbation(s, d) for s, d in product((low, high), sorted({1.0, *factors}))]
 
     def judged(of: LoopsOffModel) -> Certificate:

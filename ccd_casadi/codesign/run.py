@@ -21,9 +21,11 @@ from ccd_casadi.codesign.search import concluded, concluded_at, nothing_found, s
 from ccd_casadi.codesign.sections_lists import ListedSections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 
@@ -102,6 +104,17 @@ def co_design(
 def outer_of(sampler: Sampler) -> Outer:
     """The outer problem of the kind of controller that a sampler's problem has."""
     return MixedOuter(sampler) if sampler.problem.sections is None else SectionsOuter(sampler)
+
+
+def verify(sampler: Sampler, x: Array) -> Verified:
+    """The design at x polished on the truth, held against the whole inner problem, and judged.
+
+    x is θ, followed by ln ω_S and ln ω_T for mixed sensitivity.
+    """
+    outer = outer_of(sampler)
+    end = outer.ended(x)
+    with sampler.spent.on("checks"):
+        return outer.verified(end, 1)
 
 
 def require_solvable(problem: CoDesignProblem, given: bool) -> None:

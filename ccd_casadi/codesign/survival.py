@@ -16,8 +16,8 @@ import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.reach import reach
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.sections_robustness import LOOSE
 from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -64,9 +64,8 @@ def loops_of(
 ) -> LoopsOffModel:
     """The loops of a controller in SI (e in, u out) of whatever kind on plants off the model at θ,
     sampled where the problem's loop is."""
-    sampling = None if problem.sections is None else problem.sections.sampling
     system = mechanics(plant_of(problem), theta)
-    return loops_off_model(system, problem.suspension, Controller(controller, sampling))
+    return loops_off_model(system, problem.suspension, Controller(controller, problem.sampling))
 
 
 def survival_of(
@@ -82,7 +81,7 @@ def survival_of(
         bandwidth=bandwidth,
         omega_low=problem.inner.omega_low,
         M_K=problem.weights.M_K,
-        slack=PEAK if problem.sections is None else LOOSE,
+        slack=kind_of(problem).slack,
         marks=marks,
     )
 

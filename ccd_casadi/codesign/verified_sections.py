@@ -9,7 +9,6 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.full_order import Beside
-from ccd_casadi.codesign.robust_check import reach_of
 from ccd_casadi.codesign.sections_entries import (
     active_of,
     beside_dict,
@@ -25,6 +24,7 @@ from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.lti.state_space import StateSpace
@@ -70,7 +70,7 @@ class VerifiedSections(Verified):
     @property
     def kept(self) -> bool:
         """Whether the whole set is: by the judge, the proof, and all along its common shift."""
-        found, ends = self.survival, reach_of(self.problem)
+        found, ends = self.survival, kind_of(self.problem).common_shifts()
         along = found is None or found.within(*ends)
         return self.wide.passed and not self.proof.refuted and along
 

@@ -90,10 +90,9 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
 
     Other runs as they are. `figures` then has ω_b and ‖S‖∞ of the sampled loop.
     """
-    sections = run.problem.sections
-    if sections is None or sections.sampling is None:
+    if run.problem.sampling is None:
         return run
-    sampled = in_discrete_time(run.controller, sections.sampling)
+    sampled = in_discrete_time(run.controller, run.problem.sampling)
     _, bandwidth, peak, _ = sampled.judge(run.plant)
     figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
     return replace(run, controller=sampled.system, figures=figures, sampled=sampled)

@@ -8,8 +8,8 @@ import numpy as np
 from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.derivatives import variance_slopes
 from ccd_casadi.budget.frequency import Loop
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_plant_set import plants_of
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 
@@ -35,9 +35,7 @@ def loop_budget(
     """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
     if problem.budget is None:
         return None
-    plants, hold = [scaled_plant(problem, theta)], None
-    if problem.sections is not None:
-        plants, hold = plants_of(problem, theta), problem.sections.sampling
+    plants, hold = kind_of(problem).plants(theta), problem.sampling
     model = evaluate_budget(plants[0].plant_si(), controller, problem.budget, hold)
     found = [
         variance_slopes(Loop(plant.plant_si(), controller, hold), problem.budget, ())

@@ -11,13 +11,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.inner_problem.envelope import bandwidth_gradient
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.optional_packages import require
 
 om: Any = require("openmdao.api", "openmdao")
@@ -149,14 +146,9 @@ class LargestBandwidth(_Component):
         problem: CoDesignProblem = self.options["problem"]
         super().setup()
         self._found: dict[bytes, tuple[float, Array]] = {}
-        self._value = "bandwidth"
-        if problem.sections is not None:
-            sections = sections_of_problem(problem)
-            self._value = "rms_error" if sections.of_error else "bandwidth"
-            if not sections.anchors:
-                words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
-                raise UserError(f"the problem of a fixed structure {words}")
-        self.add_output(self._value, units="m" if self._value == "rms_error" else "rad/s")
+        self._value = problem.figure.key
+        kind_of(problem).require_function()
+        self.add_output(self._value, units=problem.figure.si_unit)
 
     def compute(self, inputs: Any, outputs: Any) -> None:
         theta = self._x(inputs)
@@ -175,21 +167,8 @@ class LargestBandwidth(_Component):
     def _at(self, theta: Array) -> tuple[float, Array]:
         key = theta.tobytes()
         if key not in self._found:
-            self._found[key] = _inner_value(self.options["problem"], theta)
+            self._found[key] = kind_of(self.options["problem"]).value(theta.tolist())
         return self._found[key]
-
-
-def _inner_value(problem: CoDesignProblem, theta: Array) -> tuple[float, Array]:
-    """What J counts at θ, and its gradient; NaN where nothing is certified."""
-    if problem.sections is not None:
-        made = sections_value(problem, theta.tolist())
-        value = made.error if problem.sections.of_error else made.bandwidth
-        return value, np.array(made.gradient)
-    found = true_inner(problem, theta.tolist())
-    if found.optimum is None:
-        return np.nan, np.full(theta.size, np.nan)
-    slope = bandwidth_gradient(found.optimum, found.active, tuple(problem.inner.bounds))
-    return found.bandwidth, slope
 
 
 def pose(model: Any, problem: CoDesignProblem, *, weights: bool = True) -> None:

@@ -1,0 +1,130 @@
+"""The kinds of inner problem, and what each of them knows of a problem at any θ.
+
+    v(θ) = max ω_b or min e over the controllers of a kind, within their bounds on every plant
+
+A kind knows no hardware cost and no weights of J. `kind_of` is where a problem is told to be of one
+kind or another; what works on problems asks the kind.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.inner_problem.envelope import bandwidth_gradient
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_robustness import LOOSE
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+class InnerKind(ABC):
+    """One kind of controller, for a problem.
+
+    `slack`: relative, by how much its judge lets a bound be exceeded. `as_designed`: its
+    controllers run as they are, without being reduced.
+    """
+
+    slack: float
+    as_designed: bool
+
+    def __init__(self, problem: CoDesignProblem) -> None:
+        self.problem = problem
+
+    @abstractmethod
+    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
+        """v(θ) in SI and its gradient (n,); NaN where no controller is certified."""
+
+    @abstractmethod
+    def require_function(self) -> None:
+        """Raise UserError where v(θ) is not yet one function of θ."""
+
+    @abstractmethod
+    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        """The plants on which the controller's figures count, the model first."""
+
+    @abstractmethod
+    def bounds(self) -> Bounds:
+        """The bounds on every plant, SI."""
+
+    @abstractmethod
+    def common_shifts(self) -> tuple[float, float]:
+        """The common resonance shifts, down and up, that its set holds at the model's damping."""
+
+    @abstractmethod
+    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The extreme factors of damping and of gain in its set."""
+
+
+class MixedSensitivity(InnerKind):
+    """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies."""
+
+    slack = 1e-6
+    as_designed = False
+
+    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
+        found = true_inner(self.problem, theta)
+        if found.optimum is None:
+            return np.nan, np.full(len(theta), np.nan)
+        bounded = tuple(self.problem.inner.bounds)
+        return found.bandwidth, bandwidth_gradient(found.optimum, found.active, bounded)
+
+    def require_function(self) -> None:
+        """It always is."""
+
+    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        return [scaled_plant(self.problem, theta)]
+
+    def bounds(self) -> Bounds:
+        inner = self.problem.inner
+        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
+
+    def common_shifts(self) -> tuple[float, float]:
+        shift = 0.0 if self.problem.robust is None else self.problem.robust.shift
+        return -shift, shift
+
+    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
+        robust = self.problem.robust
+        return (1.0,) if robust is None else robust.damping, (1.0,)
+
+
+class FixedStructure(InnerKind):
+    """Gain, notches, leads and roll-off on a set of plants, sampled or continuous."""
+
+    slack = LOOSE
+    as_designed = True
+
+    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
+        found = sections_value(self.problem, theta)
+        return found.value, np.array(found.gradient)
+
+    def require_function(self) -> None:
+        if not sections_of_problem(self.problem).anchors:
+            words = "has no anchors yet; take that of a finished run, read_run(folder).problem"
+            raise UserError(f"the problem of a fixed structure {words}")
+
+    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        return plants_of(self.problem, theta)
+
+    def bounds(self) -> Bounds:
+        return bounds_of(self.problem)
+
+    def common_shifts(self) -> tuple[float, float]:
+        u = sections_of_problem(self.problem).uncertainty
+        low, high = (
+            (1.0 + s * u.resonance_shift) * (1.0 + s * u.mode_shift) - 1.0 for s in (-1, 1)
+        )
+        return low, high
+
+    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
+        u = sections_of_problem(self.problem).uncertainty
+        return u.damping, (1.0 - u.gain, 1.0, 1.0 + u.gain)
+
+
+def kind_of(problem: CoDesignProblem) -> InnerKind:
+    """The kind of inner problem."""
+    return MixedSensitivity(problem) if problem.sections is None else FixedStructure(problem)
