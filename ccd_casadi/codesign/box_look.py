@@ -34,6 +34,7 @@ from ccd_casadi.support.arrays import Array
 from surrogates import GaussianProcess, design
 
 POINTS_A_START = 8  # points looked at for every local solve: each costs as much as an inner problem
+FEW = 8  # points at most where each takes a search over the controller, seconds or more
 BETTER = 1e-6  # relative: a J that is lower by less is the same optimum
 SAME = 1e-3  # of the box: a point this close to the optimum starts nothing new
 PERTURBED = 0.02  # of the box: starts around an optimum whose residual is too large
@@ -53,9 +54,12 @@ def look_over_box(
 ) -> BoxLook:
     """Look at `points` θ over the box for a J lower than that of an end.
 
-    `processes`: the formulation's surrogates, where there are any.
+    `processes`: the formulation's surrogates, where there are any. What the run has solved itself
+    counts among the points; where these are dear no more than `FEW` are made up.
     """
     problem, J, here = outer.problem, end.objective, outer.theta_of(end.x)
+    if not outer.look_is_cheap:
+        points = min(points, FEW)
     processes = outer.excluding(processes, end.x, seed) if points else ()
     samples, passed_over = _spread(outer.sampler, J, points, seed, processes) if points else ([], 0)
     able = [sample for sample in samples if np.isfinite(objective_of(problem, sample))]

@@ -99,20 +99,14 @@ def gradients_of(problem: CoDesignProblem) -> tuple[Gradient, ...]:
 def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
     """The problem with the design plant of the best formulation, where the case leaves it open.
 
-    With sections: with the anchors and the plant set of the best.
+    And with what its search has added: anchors and plants of a fixed structure.
     """
-    ends = [m for m in methods if m.solution is not None and m.solution.verified is not None]
-    if ends and problem.sections is not None:
-        best = min(ends, key=lambda m: m.figures["objective"])
-        assert best.solution is not None
-        assert best.solution.verified is not None
-        return best.solution.verified.problem
-    solved = [m for m in methods if m.solution is not None and m.solution.problem is not None]
-    if problem.robust is None or problem.robust.design_shift is not None or not solved:
-        return problem
-    best = min(solved, key=lambda m: m.figures.get("objective", np.inf))
-    assert best.solution is not None
-    return best.solution.problem or problem
+    ends = [
+        (method.figures["objective"], method.solution.verified.problem)
+        for method in methods
+        if method.solution is not None and method.solution.verified is not None
+    ]
+    return min(ends, key=lambda end: end[0])[1] if ends else problem
 
 
 def _formulation(
