@@ -2,8 +2,8 @@
 
 Plants that fall apart in the channels' coordinates are one SISO problem for each channel, whose
 bounds are the whole's, or its own where they are tighter: the singular values of S, KS, T and GS
-are the channels' moduli. Plants whose channels are coupled are bounded as a whole
-(`mimo_figures`). All parts share ω_b, a channel's own bandwidth is in proportion.
+are the channels' moduli. Plants whose channels are coupled are bounded as a whole. All parts share
+ω_b, a channel's own bandwidth is in proportion.
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,13 @@ from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
-    Curve,
     LoopProblem,
+    MatrixProblem,
     Problem,
     plant_of_row,
 )
-from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem, loop_matrices
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
-from ccd_casadi.fixed_structure.structure import response
+from ccd_casadi.kernels.limits import Curve
+from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -102,7 +100,7 @@ def composite_problem(
 ) -> CompositeProblem:
     """The problem in the units of the first plant; `frequencies` (rad/s) bound those of K's roots.
 
-    Raises PlantError as `matrix_plant_set` does.
+    Raises PlantError as `plant_set` does.
     """
     first = plants[0]
     alike = [in_units_of(plant, first) for plant in plants]
@@ -130,7 +128,7 @@ def composite_problem(
             problem = Problem(plant_set(singles[i], sampling), own, limits, box[:, place], margin)
             parts.append(Part(problem, place, members, i, lead))
     if len(together):
-        matrices = matrix_plant_set([alike[j] for j in together], structure.decoupling, sampling)
+        matrices = plant_set([alike[j] for j in together], sampling, structure.decoupling)
         place = structure.places
         whole = MatrixProblem(matrices, structure.apart, bounds, box[:, place], margin)
         parts.append(Part(whole, place, together))
@@ -172,9 +170,6 @@ def _(
             rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
         sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
     return Assessment(True, poles, sides[0], sides[1])
-
-
-hessians.register(MatrixProblem, whole_hessians)
 
 
 @to_theta.register
@@ -219,7 +214,7 @@ def kinds_of_rows(problem: LoopProblem, found: Constraints) -> list[str]:
         for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
             channel = part.channel
             if isinstance(part.problem, MatrixProblem):
-                past = row // len(part.problem.plants.plants) - part.problem.own.first
+                past = row // len(part.problem.plants.plants) - part.problem.first
                 channel = past if past >= 0 else None
             if channel is None:
                 continue
@@ -243,17 +238,11 @@ def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
 def largest_gains(problem: CompositeProblem, kappa: Array, v: Array) -> tuple[Array, Array, Array]:
     """σ_max of S, KS and T of every plant at v (k,), each (P, k), in the problem's units."""
     found = np.zeros((3, problem.count, len(v)))
+    curves = np.array([Curve.S_MAX, Curve.KS, Curve.T])
     for part in problem.parts:
-        plants, own = part.problem.plants, kappa[part.place]
-        which, at = np.meshgrid(np.arange(len(part.members)), v, indexing="ij")
-        if isinstance(part.problem, MatrixProblem):
-            S, KS, T = loop_matrices(part.problem, own, which, at)
-            gains = [np.linalg.svd(M, compute_uv=False)[..., 0] for M in (S, KS, T)]
-        else:
-            assert isinstance(part.problem, Problem)
-            K, (G, _) = response(part.problem.structure, own, 1j * at), plants.responses(which, at)
-            S = 1.0 / (1.0 + G * K)
-            gains = [np.abs(S), np.abs(K * S), np.abs(G * K * S)]
-        for i, gain in enumerate(gains):
-            found[i, part.members] = np.maximum(found[i, part.members], gain)
+        count = len(part.members)
+        loop = part.problem.loop(kappa[part.place], None)
+        every = np.tile(curves, (count, 1)), np.arange(count), np.tile(v, (count, 1))
+        gains = np.exp(levels(*every, loop, -np.inf)[..., 0])
+        found[:, part.members] = np.maximum(found[:, part.members], np.moveaxis(gains, -1, 0))
     return found[0], found[1], found[2]

@@ -17,7 +17,6 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.descent import Point, descend
-from ccd_casadi.fixed_structure.figures import HALF_POWER, IS_OF_S
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
     MeasuredFigures,
@@ -34,6 +33,7 @@ from ccd_casadi.fixed_structure.structure import (
     second_slopes,
     state_space,
 )
+from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -217,7 +217,7 @@ class _OnLines:
         K, g, _ = response_and_slopes(self.structure, point.kappa, s)
         S = 1.0 / (1.0 + self.G[rows.plant] * K)
         T = 1.0 - S
-        weight = mu * np.where(IS_OF_S[rows.curve], -T, S)
+        weight = mu * np.where(np.isin(rows.curve, (Curve.KS, Curve.T)), S, -T)
         second = second_slopes(self.structure, point.kappa, s)
         out[:n, :n] = np.einsum("m,mij->ij", weight, second).real
         out[:n, :n] -= np.einsum("m,mi,mj->ij", mu * S * T, g, g).real

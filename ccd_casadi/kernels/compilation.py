@@ -76,15 +76,19 @@ def compile_part(part: str) -> None:
 
 
 def _compile_sections() -> None:
-    from ccd_casadi.kernels import sections
+    from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes
+    from ccd_casadi.kernels.limits import Limit
 
-    pole = np.array([[-1.0 + 1.0j]])
-    modes = (pole, 0.1 * pole, pole, pole, pole)
-    loop = (np.zeros((1, 3), np.int64), np.ones(2), modes, 0.0, 0.0)
-    one, first, limits = np.ones(1), np.zeros(1, np.int64), np.ones(int(sections.Limit.COUNT))
-    sections.rows(first, *loop, first, one, limits)
-    sections.levels(first, *loop, np.ones((1, 1)), limits)
-    sections.close(first, *loop, first, one, one, one, limits, (1e-9, 1e-6, 40.0))
+    one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
+    plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
+    controller = (np.zeros((1, 4), np.int64), one, first, square, square)
+    limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((2, 0, 1)))
+    loop = loop_point.Loop(*controller, *plants, *limits)
+    modes.responses(plants, first, one)
+    loop_rows.levels(first[None], first, square, loop, 0.0)
+    loop_rows.rows(first, first, first, one, loop)
+    loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
+    loop_curvature.second(first, first, first, one, loop)
 
 
 def ensure_compiled() -> None:
@@ -155,7 +159,8 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    import_module(f"{PACKAGE}.gradients")  # with it all the others
+    for name in ("gradients", "loop_curvature"):  # with them all the others
+        import_module(f"{PACKAGE}.{name}")
     found = {}
     for name, module in list(sys.modules.items()):
         if name.startswith(PACKAGE + "."):

@@ -80,11 +80,11 @@ def loops_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDes
     assert isinstance(inside, Problem)
     which, grid = np.meshgrid(np.arange(len(P.plants)), v, indexing="ij")
     K = response(inside.structure, kappa, 1j * v)
-    L = P.values(which, grid) * K
+    L = P.responses(which, grid)[0][..., 0, 0] * K
     S = 1.0 / (1.0 + L)
     GS = nothing
     if inside.bounds.compliance_max is not None:
-        GS = np.abs(P.values(which, grid, free=True) * S) / P.force
+        GS = np.abs(P.responses(which, grid, free=True)[0][..., 0, 0] * S) / P.force
     return Loops(omega / HZ, S, K * P.force * S, 1.0 - S, L, GS, bounds)
 
 
