@@ -25,9 +25,9 @@ from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.fixed_structure import Bounds, Sampling, ShapeEnd, Structure, certify
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
+from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.starts import at_random, kept
-from ccd_casadi.fixed_structure.trust_region import ascend
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant

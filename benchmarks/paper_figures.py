@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
@@ -21,7 +22,6 @@ from ccd_casadi.reporting.loops import synthesised_loop, table_gains
 from ccd_casadi.reporting.page import Section, Table, figure_html, page, paragraph, table_html
 from ccd_casadi.reporting.svg import CYCLE
 from ccd_casadi.studies.published import TWO_MASS
-from ccd_casadi.synthesis.loop_responses import Loop
 
 ROOT = Path(__file__).resolve().parent.parent
 THETA = (60.0, 60.0)
@@ -42,7 +42,7 @@ def sections(problem: CoDesignProblem, published: dict[str, Any]) -> list[Sectio
     ]
 
 
-def _case(problem: CoDesignProblem, name: str, M_K: float) -> Loop | None:
+def _case(problem: CoDesignProblem, name: str, M_K: float) -> LoopView | None:
     """The inner optimum at (60, 60) with the case's M_K; None where it is infeasible."""
     local = replace(problem, weights=replace(problem.weights, M_K=M_K))
     found = true_inner(local, THETA)
@@ -53,7 +53,7 @@ def _case(problem: CoDesignProblem, name: str, M_K: float) -> Loop | None:
     return synthesised_loop(local, THETA, figures.omega_S, figures.omega_T, label)
 
 
-def _plant(loop: Loop, published: dict[str, Any]) -> str:
+def _plant(loop: LoopView, published: dict[str, Any]) -> str:
     paper = published["plant_60_60"]
     caption = (
         f"Plant and the controller of case A. Anti-resonance {loop.antiresonances_hz[0]:.1f} Hz "
@@ -63,7 +63,7 @@ def _plant(loop: Loop, published: dict[str, Any]) -> str:
     return figure_html(figure_bode(loop, key="figure4"), caption, table_bode(loop))
 
 
-def _cases(loops: dict[str, Loop], published: dict[str, Any]) -> str:
+def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> str:
     """S and K of both cases with bandwidths and local peaks, and a table against the paper's."""
     S_curves, K_curves, marks, levels = [], [], [], []
     rows = []

@@ -1,6 +1,7 @@
 """Loops of several channels for the tests: a stage whose load may lie off centre."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
@@ -12,7 +13,8 @@ from helpers import HZ, SUSPENSION, scaled
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import find_decoupling
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
 from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
 from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
@@ -141,6 +143,20 @@ def assert_derivatives(
     found = slopes(lambda theta: values(problem_at(tuple(theta)), kappa, tau), np.ones(2), 1e-4)
     assert (np.abs(found - exact) / scale).max() < 1e-5
     return set(peaks.curve.tolist())
+
+
+def everything() -> tuple[Array, ...]:
+    """Of a coupled, sampled stage with a bound of a channel's own: the peaks, their slopes to κ, τ
+    and θ, and their curvature."""
+    problem, kappa = loop(0, (0.3,), FAST)
+    whole = problem.structure
+    own = channel_bounds(whole.decoupling, {"1": {"S_max": 1.5, "bandwidth_ratio": 1.6}})
+    problem = composite_problem([plant(off=0.3)], whole, replace(BOUNDS, channels=own), FAST)
+    peaks = assess(problem, kappa, -1.5).peaks
+    assert peaks is not None
+    bends = hessians(problem, kappa, -1.5, peaks)
+    return (peaks.v, peaks.value, peaks.to_kappa, peaks.to_tau, to_theta(problem, kappa, peaks),
+            bends)  # fmt: skip
 
 
 def closed(

@@ -104,19 +104,20 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     look, c = searched_look, curves_of(searched_look)
     assert look.how is How.SEARCHED
     assert look.standing is Standing.KEPT
-    assert c.gains[0].max() == pytest.approx(look.figures.sensitivity_peak, rel=1e-6)
-    assert (c.gains <= c.bounds * (1.0 + 1e-9)).all()  # what the certificate says of each of them
-    assert c.gains[0][c.hz == look.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
+    assert c.view.gains[0].max() == pytest.approx(look.figures.sensitivity_peak, rel=1e-6)
+    # what the certificate says of each of them
+    assert (c.view.gains <= c.view.bounds * (1.0 + 1e-9)).all()
+    assert c.view.gains[0][c.view.hz == look.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
     assert c.poles.real.max() < 0.0
     # the distance of L from -1 is 1/|S|
     near = np.abs(1.0 + c.loci[:, 0])
     known = np.isfinite(near)
-    assert near[known] * c.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
-    assert abs(c.step[-1] - 1.0) < 0.05
-    assert c.move.feedforward
+    assert near[known] * c.view.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
+    assert abs(c.signals.step[-1] - 1.0) < 0.05
+    assert c.signals.move.feedforward
     assert (
-        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
-        < 1e-2 * np.abs(c.move.error).max()
+        np.abs(c.signals.move.error[c.signals.move.time > 1.5 * c.signals.move.duration]).max()
+        < 1e-2 * np.abs(c.signals.move.error).max()
     )
 
 
@@ -195,7 +196,8 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
         assert not stable(gain / inwards)
     assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
     assert "feedforward" in move_words(c)
-    assert "without feedforward" in move_words(replace(c, move=replace(c.move, feedforward=False)))
+    alone = replace(c.signals, move=replace(c.signals.move, feedforward=False))
+    assert "without feedforward" in move_words(replace(c, signals=alone))
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

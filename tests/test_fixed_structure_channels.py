@@ -1,5 +1,11 @@
 """Fixed structures on plants of several channels: the whole loop's bounds and their derivatives."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from fixed_structure_channels import (
@@ -8,6 +14,7 @@ from fixed_structure_channels import (
     STRUCTURE,
     assert_derivatives,
     closed,
+    everything,
     gaps,
     loop,
     plant,
@@ -32,6 +39,7 @@ from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
 from ccd_casadi.fixed_structure.peak_search import Brackets, split
 from ccd_casadi.support.errors import PlantError
 
+ROOT = Path(__file__).resolve().parent.parent
 SKEWED = given_decoupling(("a", "b", "c"), [[1, 0.2, 0], [0, 1, 0.1], [0.1, 0, 1]],
                           [[1, 0, 0.1], [0.1, 1, 0], [0, 0.1, 1]])  # fmt: skip
 
@@ -226,3 +234,19 @@ def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
     assert inside.all()
     assert (found.row == 0).all()
     assert top == pytest.approx(1.0, abs=1e-6)
+
+
+INTERPRETED = """
+import interpreted, json, numpy as np
+from fixed_structure_channels import everything
+print(json.dumps([part.tolist() for part in everything()]))
+"""
+
+
+def test_the_kernels_are_what_they_say_as_plain_python() -> None:
+    """Interpreted they have the same constraints, slopes and curvature as compiled."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(ROOT / "benchmarks")])
+    out = subprocess.run([sys.executable, "-W", "ignore", "-c", INTERPRETED], check=True,
+                         capture_output=True, env=os.environ | {"PYTHONPATH": path})  # fmt: skip
+    for one, other in zip(everything(), json.loads(out.stdout), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6 * np.abs(one).max())

@@ -20,13 +20,13 @@ from ccd_casadi.fixed_structure import (
 from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.race import distinct, run_race
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
 from ccd_casadi.fixed_structure.structure import response, state_space
-from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.fixed_structure.worst_plant import excesses, lattice, worst_plants
 from ccd_casadi.lti.state_space import StateSpace

@@ -11,7 +11,6 @@ from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.bundle import Local, descend
 from ccd_casadi.codesign.sections_direct import by_pieces
 from ccd_casadi.codesign.sections_kkt import joint_residual, sections_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
@@ -22,6 +21,7 @@ from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.optim.kkt import KktCertificate
+from ccd_casadi.optim.pieces import Local, descend
 from ccd_casadi.sampling.samples import BandwidthSample
 
 J0 = -700.0

@@ -4,29 +4,30 @@ import numpy as np
 import pytest
 from helpers import HZ, problem, two_mass
 
+from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.reporting.limits import limit_sentences, shares, table_limits
-from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+from ccd_casadi.support.units import shown_unit
 from ccd_casadi.synthesis.synthesis import synthesise
 
 
 @pytest.fixture(scope="module")
-def loop() -> Loop:
+def loop() -> LoopView:
     plant, weights = two_mass(60.0, 60.0), problem().weights.at(HZ * 800.0, HZ * 40.0)
     design = synthesise(plant, weights, omega_low=HZ)
-    return loop_data(
-        plant, design.controller, weights, gamma=design.figures.gamma,
-        bandwidth_hz=design.figures.bandwidth / HZ, omega_low=HZ,
+    return design_view(
+        problem(), (60.0, 60.0), design.controller, weights=weights, gamma=design.figures.gamma,
+        bandwidth_hz=design.figures.bandwidth / HZ,
     )  # fmt: skip
 
 
-def test_no_share_exceeds_the_certified_norm(loop: Loop) -> None:
+def test_no_share_exceeds_the_certified_norm(loop: LoopView) -> None:
     found = np.array([shares(loop, hz) for hz in loop.hz])
     assert found.max() <= 1.0
     assert np.sqrt((found**2).sum(axis=1)).max() == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_words_name_the_zero_that_limits_case_a(loop: Loop) -> None:
+def test_the_words_name_the_zero_that_limits_case_a(loop: LoopView) -> None:
     words = " ".join(limit_sentences(loop))
     assert "At ω_b = 55.66 Hz |S| is at 98 % of its bound" in words
     assert "transmission zero of the plant at 147.9 Hz" in words

@@ -76,16 +76,19 @@ def test_rows_on_lines_have_their_derivatives() -> None:
     kappa = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
     model = _OnLines(measured(None, 60), structure, BOUNDS, None, 0, None)
     tau = float(np.log(2.0 * HZ * 1.013))
-    point = model.at(kappa, tau)
-    assert point.rows is not None
+    x = np.append(kappa, tau)
+    point = model.at(x)
+    assert point is not None
+    rows = model.rows(point, 1.0)
     rng = np.random.default_rng(0)
-    way, h = rng.normal(size=len(kappa) + 1), 1e-6
-    ends = [model.at(kappa + s * h * way[:-1], tau + s * h * way[-1]).rows for s in (1.0, -1.0)]
+    way, h = rng.normal(size=len(x)), 1e-6
+    ends = [model.at(x + s * h * way) for s in (1.0, -1.0)]
     assert ends[0] is not None
     assert ends[1] is not None
-    assert len(ends[0].value) == len(ends[1].value) == len(point.rows.value)
-    difference = (ends[0].value - ends[1].value) / (2.0 * h)
-    slope = point.rows.to_kappa @ way[:-1] + point.rows.to_tau * way[-1]
+    values = [end.data.value for end in ends if end is not None]
+    assert len(values[0]) == len(values[1]) == len(rows.value)
+    difference = (values[0] - values[1]) / (2.0 * h)
+    slope = rows.slopes @ way
     np.testing.assert_allclose(slope, difference, atol=1e-6)
 
 

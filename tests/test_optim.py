@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_kinks import pieces
 
-from ccd_casadi.codesign import bundle
 from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
 from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim import pieces as of_pieces
 from ccd_casadi.optim import quadratic
 from ccd_casadi.optim.quadratic import INSIDE, KEPT, solve_quadratic
 from ccd_casadi.support.arrays import Array
@@ -43,7 +43,7 @@ def elastic(rng: np.random.Generator) -> tuple[Array, ...]:
 def test_an_answer_keeps_its_rows_and_is_optimal(seed: int) -> None:
     """Its value is the dual's: no feasible point has a lower one (weak duality)."""
     H, c, A, upper, low, high = elastic(np.random.default_rng(seed))
-    found = solve_quadratic(H, c, A, upper, low, high, singular=True)
+    found = solve_quadratic(H, c, A, upper, low, high)
     assert found is not None
     x, mu = found.x, found.multipliers
     assert (A @ x - upper).max() <= KEPT
@@ -103,5 +103,5 @@ def test_a_failed_programme_is_no_optimum_in_a_bundle(failing, count: int) -> No
     p = pieces(np.random.default_rng(0), 3, 3, bound=False, bent=0.3)
     z = np.full(3, 0.35)
     failing(count)
-    best = bundle.descend(p.at, p.at(z), [], p.constraints, steps=80, settled=1e-12)
+    best = of_pieces.descend(p.at, p.at(z), [], p.constraints, steps=80, settled=1e-12)
     assert np.abs(best.z - p.minimiser).max() <= 1e-4

@@ -10,8 +10,9 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
+from ccd_casadi.inner_problem.design_loops import bounds_of_loop
 from ccd_casadi.reporting.facts import conclusion
-from ccd_casadi.reporting.loops import above, section_bounds
+from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.robustness_figures import shown_peak, shown_until
 from ccd_casadi.reporting.robustness_page import _cut
 from ccd_casadi.reporting.verdict import LINES, advice
@@ -21,10 +22,10 @@ from ccd_casadi.support.units import HZ
 def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> None:
     problem = problem_of(load_case("runs/two_mass_built.toml"))
     hz = np.geomspace(0.1, 5000.0, 300)
-    S, KS, T = section_bounds(problem, hz, 50.0)
+    S, KS, T = bounds_of_loop(problem, problem.weights, np.nan, 50.0).over(hz)
     assert problem.sections is not None
     ended = replace(problem, sections=replace(problem.sections, shape_ends=ShapeEnd.CROSSING))
-    short = section_bounds(ended, hz, 50.0)[0]
+    short = bounds_of_loop(ended, problem.weights, np.nan, 50.0).over(hz)[0]
     _, W_KS, W_T = np.abs(problem.weights.responses(HZ * hz))
     assert np.allclose(W_KS * KS, 8.426)
     assert np.allclose(W_T * T, 8.426)

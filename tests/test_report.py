@@ -22,6 +22,7 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.deployment.channels import split
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import figure_bode
@@ -34,7 +35,6 @@ from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 from ccd_casadi.support.worker_process import Ahead
-from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
@@ -301,7 +301,7 @@ def test_mimo_shows_its_channels_or_all_singular_values() -> None:
     for theta, apart in (((0.5, 0.5), True), ((0.9, 1.3), False)):  # masses 10, 4, 10 kg or not
         plant = scaled_plant(problem, theta)
         weights = problem.weights.at(HZ * 50.0, HZ * 100.0)
-        loop = loop_data(plant, K, weights, gamma=1.0, bandwidth_hz=50.0, omega_low=HZ)
+        loop = design_view(problem, theta, K, weights=weights, gamma=1.0, bandwidth_hz=50.0)
         text = figure_bode(loop, split(plant, K))
         assert ("channel 1, outputs +" in text) == apart
         assert ("phase of G" in text) == apart

@@ -1,5 +1,6 @@
 """The least RMS error as the inner problem's value: its gradient to θ, and a solve with it."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from ccd_casadi.inner_problem.sections_problem import Uncertainty
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
+from surrogates.retrain import main as retrain
 
 CABLES = ErrorBudget((
     Source("cables", Kind.FORCE, ShapedSpectrum(1e-2, (), ((20.0,),))),
@@ -133,3 +135,18 @@ def test_the_budget_is_part_of_what_a_sample_is() -> None:
     assert case.identity() != quieter.identity()
     plain = least(minimise="bandwidth")
     assert plain.identity() == replace(plain, budget=quieter.budget).identity()
+
+
+@pytest.mark.slow
+def test_retraining_counts_the_error(tmp_path: Path) -> None:
+    """It was refused: J of a sample and of a surrogate is that of what the case minimises."""
+    case = written(tmp_path, "1e6", 'minimise = "rms_error"\nbandwidth_least_hz = 12.0')
+    narrow = case.read_text().replace("lower = 55.0", "lower = 58.0").replace("67.56", "60.0")
+    narrow = narrow.replace("upper = 70.0", "upper = 62.0")
+    case.write_text(narrow.replace('"sections"\n', '"sections"\nstarts = 2\n'))
+    assert retrain([str(tmp_path), "--budget", "14", "--workers", "1", "--quiet"]) == 0
+    found = json.loads((tmp_path / "result.json").read_text())
+    cost, error = found["hardware_cost"], found["error_rms_of_set"]
+    assert found["objective"] == pytest.approx(0.0995 * cost + 1e6 * error, rel=1e-9)
+    assert found["minimise"] == "rms_error"
+    assert found["verification_error"] <= 1e-3

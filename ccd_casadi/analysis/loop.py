@@ -18,6 +18,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 PER_DECADE = 60
+APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class Loop:
         if self.sampling is not None:
             high = np.pi / self.sampling.period
         count = int(PER_DECADE * np.log10(high / low)) + 1
-        return frequency_grid(low, high, count, around(roots))
+        return frequency_grid(low, high, count, around(roots), apart=APART)
 
     @cached_property
     def as_run(self) -> tuple[StateSpace, StateSpace]:

@@ -120,16 +120,14 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
     return tuple(sorted(found))
 
 
-def force_step(
-    plant: StateSpace, controller: StateSpace, sampling: Sampling | None, times: Array
-) -> tuple[Array, Array]:
+def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
     """Times in s near the given ones, and y of the first output in m after 1 N, exact at them.
 
         y_n = C (I - A)⁻¹ (I - Aⁿ) B
 
     of the loop over one step: a period, or where the loop is continuous the first of the times.
     """
-    steps = Loop(plant, controller, sampling).over_a_step(float(times[0]))
+    steps = loop.over_a_step(float(times[0]))
     counts = np.unique(np.maximum(np.round(times / steps.period), 1.0).astype(int))
     A, C = steps.A, steps.C_y[0]
     final = np.linalg.solve(np.eye(len(A)) - A, steps.B_d[:, 0])

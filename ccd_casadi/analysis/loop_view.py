@@ -1,7 +1,7 @@
 """One controller on its plants over frequency: what pages and the explorer draw of a loop."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from ccd_casadi.support.units import HZ
 POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
 # In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.
 FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))
-END = 0.998  # of half the sampling rate
+END = 0.98  # of half the sampling rate
 SAME = 1e-9  # relative distance of two frequencies below which they are one
 NAMES = ("S", "KS", "T")
 
@@ -25,7 +25,8 @@ NAMES = ("S", "KS", "T")
 class Bounded:
     """What a loop has to keep: S_max, S_low up to `low_hz`, and bounds of S, KS, T over Hz.
 
-    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are.
+    `over` gives (3, k) at frequencies (k,), NaN where nothing is asked; `words` say what they are;
+    `compliance_max` (m/N) is for GS. `asked`: the case asks for them; else they are what came out.
     """
 
     S_max: float
@@ -33,6 +34,8 @@ class Bounded:
     low_hz: float
     over: Callable[[Array], Array]
     words: tuple[str, str, str]
+    compliance_max: float | None = None
+    asked: bool = True
 
 
 @dataclass(frozen=True)
@@ -91,11 +94,12 @@ def loop_view(
     label: str = "",
     points: int = POINTS,
     peaks: bool = True,
+    special: Sequence[float] = (),
 ) -> LoopView:
     """The loops of one controller on plants in SI, the model first, on one grid.
 
     It reaches from below ω_low and ω_b to beyond the modes, of a sampled loop to half its rate,
-    and is fine around light poles and zeros of every plant and of K.
+    and is fine around light poles and zeros of every plant and of K, with `special` ones in Hz.
     """
     model = loops[0]
     poles, zeros = (_hz(of) for of in (model.plant.poles, model.plant.zeros(_unit(model))))
@@ -108,8 +112,8 @@ def loop_view(
     roots = [light(loop.plant.poles) for loop in loops]
     roots += [light(model.controller.rates), light(model.plant.zeros(_unit(model)))]
     near = around(np.concatenate(roots), FLANKS) / HZ
-    special = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
-    hz = frequency_grid(low, high, points, near, special, apart=SAME)
+    places = np.array([*poles, *zeros, bandwidth_hz, *special, *(hz for hz, _ in found)])
+    hz = frequency_grid(low, high, points, near, places, apart=SAME)
     sizes, opened, first = [], [], None
     for loop in loops:
         G, K = loop.responses(HZ * hz)
@@ -136,11 +140,6 @@ def peaks_of(loop: Loop) -> tuple[tuple[float, float], ...]:
     found = [climbed(lambda w: float(gain(np.array([w]))[0]), grid[i - 1], grid[i + 1])
              for i in tops]  # fmt: skip
     return tuple((omega / HZ, height) for omega, height in found)
-
-
-def with_label(view: LoopView, label: str) -> LoopView:
-    """The same under another name."""
-    return replace(view, label=label)
 
 
 def _unit(loop: Loop) -> float:

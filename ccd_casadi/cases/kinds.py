@@ -132,13 +132,7 @@ def disturbance_of(controller: ControllerSection, weights: WeightsSection) -> fl
 
 def structure_of(controller: ControllerSection) -> Structure:
     """The sections that [controller] names."""
-    return Structure(
-        integrator=controller.integrator,
-        lead=controller.lead,
-        biquads=controller.biquads,
-        roll_off=controller.roll_off,
-        least_damping=controller.least_damping,
-    )
+    return Structure(**{item.name: getattr(controller, item.name) for item in fields(Structure)})
 
 
 def weights_of(weights: WeightsSection, inner: InnerSection, disturbance: float) -> Weights:
@@ -240,12 +234,12 @@ def sections_problem(
 
 def _channels(controller: ControllerSection) -> tuple[ChannelProblem, ...]:
     """The channels that the case names, each with its structure."""
+    usual, found, given = structure_of(controller), [], dict(controller.channel)
     keys = [item.name for item in fields(Structure)]
-    found, given = [], dict(controller.channel)
     for name, own in controller.channel:
         whose = own if own.like is None else given[own.like]
         values = {key: getattr(whose, key) for key in keys if getattr(whose, key) is not None}
-        structure = Structure(**({key: getattr(controller, key) for key in keys} | values))
+        structure = replace(usual, **values)
         inputs = own.outputs if own.inputs is None else own.inputs
         bounds = {key: getattr(whose, key) for key in _OF_CHANNELS}
         found.append(ChannelProblem(name, structure, own.outputs, inputs, own.like, **bounds))

@@ -4,7 +4,7 @@
 
 in unit-box variables z. An optimum is often where two peaks of S are equal, or where a peak below
 ω_b just stays under -3 dB: ‖S‖∞ has a kink and ω_b a jump there, on which a method that knows
-one gradient alone stalls. A step is taken where the merit J + ρ Σ max(0, g) falls, and where the
+one gradient alone stalls. A step is taken where the merit J + ρ max(0, g) falls, and where the
 design is certified; H is the damped BFGS matrix of the Lagrangian (Nocedal and Wright, 18.3).
 """
 
@@ -19,8 +19,8 @@ from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, SAME_PEAK, other_pe
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.optim.quadratic import solve_quadratic
 from ccd_casadi.optim.quasi_newton import damped_bfgs
+from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -31,38 +31,27 @@ FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
 SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps
 FLATTEST = 1e-3  # the least it comes down to, where a shelf turns out to be straight
-ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
 BASIN = 1e-2  # of the box: this close to an end that is known, and no lower, is its basin
 
 
 @dataclass(frozen=True)
-class _Point:
-    z: Array
-    design: Sensitivities
-    J: float
-    gradient: Array
+class _Design:
+    """A design with its rows g (m,), their slopes (m, n) per share of the box, and whose they are:
+    a name, or "peak" and "shelf" with ln of a frequency and a plant of the set."""
+
+    made: Sensitivities
     g: Array
     jacobian: Array
     tags: tuple[tuple[str, float, int], ...]
 
-    @property
-    def by_shelf(self) -> bool:
-        """Whether ω_b may jump near by."""
-        return any(kind == "shelf" for kind, _, _ in self.tags)
-
-
-@dataclass(frozen=True)
-class _Step:
-    """d, the multipliers of g, and by how much the model of the merit falls."""
-
-    change: Array
-    multipliers: Array
-    model: float
-
-    @property
-    def size(self) -> float:
-        """The largest share of the box."""
-        return float(np.abs(self.change).max())
+    def same(self, tag: tuple[str, float, int]) -> int | None:
+        """The row of the same constraint; of a peak, the nearest of its plant in frequency."""
+        kind, place, member = tag
+        rows = [i for i, (name, _, of) in enumerate(self.tags) if (name, of) == (kind, member)]
+        if not rows:
+            return None
+        nearest = min(rows, key=lambda i: abs(self.tags[i][1] - place))
+        return nearest if abs(self.tags[nearest][1] - place) <= SAME_PEAK else None
 
 
 def descend(
@@ -80,158 +69,103 @@ def descend(
     At most `steps` designs are asked for; none more once it is in the basin of an optimum (x, J)
     where others `ended`. Returns the start where it is not certified.
     """
-    lower, upper = lifted_bounds(problem)
-    width = upper - lower
-    size = x.size
-
-    def at(z: Array) -> _Point | None:
-        where = lower + width * np.clip(z, 0.0, 1.0)
-        design = quantities.at(where)
-        return _point(problem, where, np.clip(z, 0.0, 1.0), design)
-
-    here = at((x - lower) / width)
-    if here is None:
+    model = _Peaks(problem, quantities, ended)
+    here = model.at((x - model.lower) / model.width)
+    if here is None or model.ended(here, here):
         return x
     scale = max(float(np.abs(here.gradient).max()), 1e-300)
-    H = scale * np.eye(size)
-    rho = scale
-    bend = SHELF
-    for _ in range(steps):
-        if any(_in_basin(here, (known - lower) / width, J) for known, J in ended):
-            break
-        least = settled * abs(here.J)
-        step = _step(here, H, radius, rho, bend)
-        while step is not None and step.model <= least and here.by_shelf and radius > LEAST:
-            radius *= 0.35  # a smaller step may go nearer to where ω_b jumps
-            step = _step(here, H, radius, rho, bend)
-        if step is not None and step.model <= least and LEAST < ZOOM * step.size < radius:
-            # The quadratic program is solved to a share of the radius, and the merit counts what
-            # it leaves of a violation: next to an optimum that is more than is left to gain.
-            radius = ZOOM * step.size
-            step = _step(here, H, radius, rho, bend)
-        if radius < LEAST:
-            break
-        if step is None:  # that tells nothing of an optimum: a programme of its own, nearer by
-            H, radius = scale * np.eye(size), 0.35 * radius
-            continue
-        d, mu, model = step.change, step.multipliers, step.model
-        rho = max(rho, 2.0 * float(mu.max(initial=0.0)))
-        if model <= least:
-            break
-        there = at(here.z + d)
-        gained = -np.inf if there is None else _merit(here, rho) - _merit(there, rho)
-        if there is not None:
-            H = _updated(H, here, there, mu)
-            bend = _bend(here, there, bend)
-        if there is None or gained < 0.1 * model:
-            radius = min(radius, step.size) * 0.35
-        elif gained > 0.7 * model and step.size > 0.9 * radius:
-            radius = min(2.0 * radius, LARGEST)
-        if there is not None and gained > 1e-4 * model:
-            here = there
-    return lower + width * here.z
+    end = minimise(
+        model, here, scale * np.eye(x.size), Radius(radius, LEAST, LARGEST), steps=steps,
+        penalty=scale, least_gain=settled * abs(here.value),
+    )  # fmt: skip
+    return model.lower + model.width * end.best.x
 
 
-def _in_basin(here: _Point, z: Array, J: float) -> bool:
-    return bool(here.J >= J and np.abs(here.z - z).max() <= BASIN)
+class _Peaks(Model[_Design]):
+    """The true problem in unit-box variables."""
 
+    growing = True
 
-def _point(problem: CoDesignProblem, x: Array, z: Array, design: Sensitivities) -> _Point | None:
-    if not design.figures.certified or design.made is None:
-        return None
-    gradient, g, jacobian, names = lagrangian_parts(problem, x, design)
-    first, sizes = len(problem.inner.bounds), constraint_sizes(problem)
-    g = np.append(g[:first] + INSIDE, g[first:] / sizes)
-    jacobian = np.vstack([jacobian[:first], jacobian[first:] / sizes[:, None]])
-    peaks = other_peaks(problem, x, design, BAND)
-    tags = [(name, 0.0, 0) for name in names]
-    place = float(np.log(design.figures.sensitivity_peak_frequency))
-    tags[0] = ("peak", place, design.made.worst)
-    if peaks:
+    def __init__(
+        self,
+        problem: CoDesignProblem,
+        quantities: TrueQuantities,
+        known: Sequence[tuple[Array, float]],
+    ) -> None:
+        self.problem, self.quantities = problem, quantities
+        self.lower, upper = lifted_bounds(problem)
+        self.width = upper - self.lower
+        self.low, self.high = np.zeros(len(upper)), np.ones(len(upper))
+        self.known = [((at - self.lower) / self.width, J) for at, J in known]
+        self.bend = SHELF
+
+    def at(self, x: Array) -> Iterate[_Design] | None:
+        """A certified design with ∇J, its constraints and its peaks."""
+        z = np.clip(x, 0.0, 1.0)
+        where = self.lower + self.width * z
+        made = self.quantities.at(where)
+        problem = self.problem
+        if not made.figures.certified or made.made is None:
+            return None
+        gradient, g, jacobian, names = lagrangian_parts(problem, where, made)
+        first, sizes = len(problem.inner.bounds), constraint_sizes(problem)
+        g = np.append(g[:first] + INSIDE, g[first:] / sizes)
+        jacobian = np.vstack([jacobian[:first], jacobian[first:] / sizes[:, None]])
+        tags = [(name, 0.0, 0) for name in names]
+        place = float(np.log(made.figures.sensitivity_peak_frequency))
+        tags[0] = ("peak", place, made.made.worst)
+        peaks = other_peaks(problem, where, made, BAND)
         g = np.append(g, [peak.value + INSIDE for peak in peaks])
         jacobian = np.vstack([jacobian, *(peak.row for peak in peaks)])
-        tags += [
-            (
-                "peak" if peak.name.startswith(OTHER_PEAK) else "shelf",
-                np.log(peak.omega),
-                peak.member,
-            )
-            for peak in peaks
-        ]
-    cost = hardware_cost(plant_of(problem), x[: len(problem.names)])
-    J = problem.w1 * cost + problem.w2 * design.figures.bandwidth
-    return _Point(z, design, J, gradient, g, jacobian, tuple(tags))
+        for peak in peaks:
+            kind = "peak" if peak.name.startswith(OTHER_PEAK) else "shelf"
+            tags.append((kind, float(np.log(peak.omega)), peak.member))
+        cost = hardware_cost(plant_of(problem), where[: len(problem.names)])
+        J = problem.w1 * cost + problem.w2 * made.figures.bandwidth
+        violation = max(0.0, float(g.max()))
+        return Iterate(z, J, gradient, violation, _Design(made, g, jacobian, tuple(tags)))
+
+    def rows(self, here: Iterate[_Design], radius: float) -> Rows:
+        """Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong."""
+        found = here.data
+        shelf = np.array([kind == "shelf" for kind, _, _ in found.tags])
+        margin = self.bend * radius**2 * shelf if shelf.any() else None
+        return Rows(found.g, found.jacobian, margin=margin)
+
+    def learnt(
+        self, H: Array, here: Iterate[_Design], there: Iterate[_Design], step: Step, radius: float
+    ) -> Array:
+        """With the change of the Lagrangian's gradient."""
+        self.bend = _bend(here, there, self.bend)
+        after = there.gradient.copy()
+        for value, tag in zip(step.multipliers, here.data.tags, strict=True):
+            row = there.data.same(tag)
+            if value > 0.0 and row is None:
+                return H  # the peak is gone: there is no difference to learn from
+            if value > 0.0:
+                after += value * there.data.jacobian[row]
+        before = here.gradient + here.data.jacobian.T @ step.multipliers
+        return damped_bfgs(H, there.x - here.x, after - before)
+
+    def ended(self, here: Iterate[_Design], there: Iterate[_Design]) -> bool:
+        """In the basin of an end that is known, and no lower."""
+        return any(there.value >= J and np.abs(there.x - z).max() <= BASIN for z, J in self.known)
 
 
-def _merit(point: _Point, rho: float) -> float:
-    """J + ρ Σ max(0, g); a -3 dB shelf that is passed shows in J itself, as a jump."""
-    return point.J + rho * float(np.maximum(point.g, 0.0).sum())
-
-
-def _bend(here: _Point, there: _Point, bend: float) -> float:
+def _bend(here: Iterate[_Design], there: Iterate[_Design], bend: float) -> float:
     """How far a shelf may depart from its slope, ln per (share of the box)², after a step.
 
     Twice what was seen, but at least a quarter of what was feared before; four times what was
     feared where a shelf was passed.
     """
-    d = there.z - here.z
+    d = there.x - here.x
     size = float(np.abs(d).max())
     seen = []
-    for value, row, tag in zip(here.g, here.jacobian, here.tags, strict=True):
+    for value, row, tag in zip(here.data.g, here.data.jacobian, here.data.tags, strict=True):
         if tag[0] == "shelf" and size > 1e-6:
-            same = _same(tag, there)
+            same = there.data.same(tag)
             if same is None and value + row @ d > -BAND:
                 return min(4.0 * bend, SHELF)
             if same is not None:
-                seen.append(abs(there.g[same] - value - float(row @ d)) / size**2)
+                seen.append(abs(there.data.g[same] - value - float(row @ d)) / size**2)
     return max(0.25 * bend, 2.0 * max(seen), FLATTEST) if seen else bend
-
-
-def _step(here: _Point, H: Array, radius: float, rho: float, bend: float) -> _Step | None:
-    """None where the programme is not solved."""
-    n, m = here.z.size, here.g.size
-    unit = max(float(np.abs(here.gradient).max()), 1e-300)
-    # Past -3 dB ω_b jumps and the merit with it: keep off by more than the slope is wrong.
-    shelf = np.array([kind == "shelf" for kind, _, _ in here.tags])
-    g = here.g + np.where(shelf, bend * radius**2, 0.0)
-    # In steps of one radius, so that the solver's tolerances mean the same at every radius.
-    hessian = np.zeros((n + m, n + m))
-    hessian[:n, :n] = radius * (H / unit + 1e-9 * np.trace(H) / (n * unit) * np.eye(n))
-    hessian[n:, n:] = 1e-6 * np.eye(m)
-    linear = np.append(here.gradient / unit, np.full(m, 10.0 * (1.0 + rho / unit)))
-    A = np.hstack([here.jacobian, -np.eye(m)])
-    low = np.append(np.maximum(-1.0, -here.z / radius), np.zeros(m))
-    high = np.append(np.minimum(1.0, (1.0 - here.z) / radius), np.full(m, np.inf))
-    found = solve_quadratic(hessian, linear, A, -g / radius, low, high, singular=True)
-    if found is None:
-        return None
-    d = radius * np.clip(found.x[:n], low[:n], high[:n])
-    mu = unit * found.multipliers
-    weight = max(rho, 2.0 * float(mu.max(initial=0.0)))
-    before = weight * float(np.maximum(here.g, 0.0).sum())
-    after = weight * float(np.maximum(here.g + here.jacobian @ d, 0.0).sum())
-    model = before - after - float(here.gradient @ d + 0.5 * d @ H @ d)
-    return _Step(d, mu, model)
-
-
-def _updated(H: Array, here: _Point, there: _Point, mu: Array) -> Array:
-    """H with the change of the Lagrangian's gradient."""
-    s = there.z - here.z
-    after = there.gradient.copy()
-    for value, tag in zip(mu, here.tags, strict=True):
-        row = _same(tag, there)
-        if value > 0.0 and row is None:
-            return H  # the peak is gone: there is no difference to learn from
-        if value > 0.0:
-            after += value * there.jacobian[row]
-    return damped_bfgs(H, s, after - here.gradient - here.jacobian.T @ mu)
-
-
-def _same(tag: tuple[str, float, int], there: _Point) -> int | None:
-    """The row of the same constraint there; of a peak, the nearest of its plant in frequency."""
-    kind, place, member = tag
-    rows = [i for i, (name, _, of) in enumerate(there.tags) if (name, of) == (kind, member)]
-    if not rows:
-        return None
-    nearest = min(rows, key=lambda i: abs(there.tags[i][1] - place))
-    return nearest if abs(there.tags[nearest][1] - place) <= SAME_PEAK else None

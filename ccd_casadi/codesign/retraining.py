@@ -1,8 +1,8 @@
 """The truth of a run folder as `surrogates.retrain` asks for it (entry point "ccd_casadi").
 
 Lifted (and direct): x = (θ, ln ω_S, ln ω_T), y = (ω_b, ln‖S‖∞, ln σ_max(S(jω_low))) with gradients.
-Nested: x = θ, y = ω_b*(θ). A controller of fixed structure: the same, with gradients where lifted,
-and by the anchors and the plant set that the run ended with.
+Nested: x = θ, y = v(θ), what J counts. A controller of fixed structure: the same, with gradients
+where lifted, and by the anchors and the plant set that the run ended with.
 """
 
 import json
@@ -25,7 +25,7 @@ from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
-from ccd_casadi.codesign.run import outer_of
+from ccd_casadi.codesign.run import outer_of, require_solvable
 from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import concluded_at
 from ccd_casadi.codesign.sections_races import seeded_and_prepared
@@ -33,7 +33,6 @@ from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
 from ccd_casadi.sampling.cluster import pool
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.sampler import Sampler
@@ -68,7 +67,7 @@ def open_run(
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
-        require_bandwidth(problem, "retrain")
+        require_solvable(problem, False)
         formulation = _formulation(folder)
         with (
             pool(scheduler, workers, PATIENCE) as evaluators,
@@ -97,13 +96,13 @@ class CoDesignTruth:
         self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
         self.write_page = write_page
         self.formulation = formulation
-        self.structured = problem.sections is not None
-        self.nested = self.structured or formulation == "nested"  # x = θ
-        self.names = problem.names if self.nested else (*problem.names, "omega_S", "omega_T")
-        self.outputs = OUTPUTS[: 1 if self.nested else 1 + len(problem.inner.bounds)]
-        self.lower, self.upper = box(problem) if self.nested else lifted_bounds(problem)
+        self.over_theta = problem.sections is not None or formulation == "nested"  # x = θ
+        self.names = problem.names if self.over_theta else (*problem.names, "omega_S", "omega_T")
+        more = () if self.over_theta else OUTPUTS[1 : 1 + len(problem.inner.bounds)]
+        self.outputs = (problem.figure.key, *more)
+        self.lower, self.upper = box(problem) if self.over_theta else lifted_bounds(problem)
         self.tolerance = case.outer.tolerance if tolerance is None else tolerance
-        self.objective, self.constraints = _functions(problem, self.nested)
+        self.objective, self.constraints = _functions(problem, len(self.lower), len(self.outputs))
         form = "nested" if formulation == "nested" else "lifted"  # direct has no surrogates
         self.describe = {"formulation": form, "outputs": list(self.outputs)}
 
@@ -115,17 +114,17 @@ class CoDesignTruth:
     def samples(self) -> Observations:
         """What the store holds inside the box, oldest first."""
         problem = self.sampler.problem
-        if self.nested:
+        if self.over_theta:
             known = stored_thetas(self.sampler.store, problem)
-            return self._bandwidths(self.sampler.bandwidths(known) if len(known) else [])
+            return self._values(self.sampler.bandwidths(known) if len(known) else [])
         designs = stored_designs(self.sampler.store, problem)
         rows = [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
         return self._quantities(rows)
 
     def evaluate(self, X: Array) -> Observations:
         """New syntheses, through the store."""
-        if self.nested:
-            return self._bandwidths(self.sampler.bandwidths(X, "retraining"))
+        if self.over_theta:
+            return self._values(self.sampler.bandwidths(X, "retraining"))
         return self._quantities(self.sampler.quantities(X, "retraining"))
 
     def finish(
@@ -169,9 +168,9 @@ class CoDesignTruth:
     def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
         """Where to verify: x with its break frequencies, or the verified design that is by it."""
         problem = self.sampler.problem
-        if self.structured:
+        if problem.sections is not None:
             return x
-        if self.nested:
+        if self.over_theta:
             inner = self.sampler.bandwidths(x, "verifying")[0]
             if not inner.feasible:
                 lower, upper = lifted_bounds(problem)
@@ -185,14 +184,14 @@ class CoDesignTruth:
         return x
 
     def _quantities(self, samples: list[QuantitySample]) -> Observations:
-        d, k = len(self.lower), 1 + len(self.sampler.problem.inner.bounds)
+        d, k = len(self.lower), len(self.outputs)
         X = np.array([s.x for s in samples]).reshape(-1, d)
         Y = np.array([s.values[:-1] for s in samples]).reshape(-1, k)
         dY = np.array([s.gradients[:-1] for s in samples]).reshape(-1, k, d)
         Y[[not s.certified for s in samples]] = np.nan
         return Observations(X, Y, dY)
 
-    def _bandwidths(self, samples: list[BandwidthSample]) -> Observations:
+    def _values(self, samples: list[BandwidthSample]) -> Observations:
         d = len(self.lower)
         X = np.array([s.theta for s in samples]).reshape(-1, d)
         Y = np.array([[s.value] for s in samples]).reshape(-1, 1)
@@ -214,17 +213,13 @@ def _function_of(
     return seeded_and_prepared(store, problem, seed, quiet)[0]
 
 
-def _functions(problem: CoDesignProblem, nested: bool) -> tuple[ca.Function, ca.Function]:
-    """J(x, y) = w1 f(θ) + w2 ω_b, and g(x, y): ln of the bounds where lifted, and λ(θ)."""
-    plant = plant_of(problem)
-    count = len(problem.names)
-    x = ca.MX.sym("x", count + (0 if nested else 2))
-    levels = problem.inner.levels
-    y = ca.MX.sym("y", 1 if nested else 1 + len(levels))
-    f, lam = plant.hardware(x[:count])
+def _functions(problem: CoDesignProblem, d: int, k: int) -> tuple[ca.Function, ca.Function]:
+    """J(x, y) = w1 f(θ) + w2 v, and g(x, y): ln of the bounds where lifted, and λ(θ)."""
+    x, y = ca.MX.sym("x", d), ca.MX.sym("y", k)
+    f, lam = plant_of(problem).hardware(x[: len(problem.names)])
     g = lam / ca.DM(constraint_sizes(problem)) if lam.numel() else ca.MX(0, 1)
-    if not nested:
-        g = ca.vertcat(y[1:] - levels, g)
+    if k > 1:
+        g = ca.vertcat(y[1:] - problem.inner.levels, g)
     J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])
     return J, ca.Function("constraints", [x, y], [g])
 

@@ -4,7 +4,6 @@ from contextlib import suppress
 
 import numpy as np
 
-from ccd_casadi.codesign.bundle import Local, descend, jumps
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
@@ -16,6 +15,7 @@ from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.optim.pieces import Local, descend, jumps
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -58,7 +58,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more anchors, where the given ones lose it.
 
-    By pieces (`bundle`), which know kinks; by IPOPT where J has one gradient and that is not yet
+    By pieces (`pieces`), which know kinks; by IPOPT where J has one gradient and that is not yet
     zero to what it is known to.
     """
     problem = sampler.problem

@@ -9,7 +9,7 @@ from bokeh.models.widgets.sliders import RangeSlider, Slider
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.units import shown_unit
 
 STEPS = 1000  # of a slider of θ
 WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case

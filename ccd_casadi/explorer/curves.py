@@ -5,48 +5,46 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.analysis.loop import Loop
-from ccd_casadi.analysis.move import Move
-from ccd_casadi.analysis.signals import signals_of
+from ccd_casadi.analysis.loop_view import LoopView, loop_view
+from ccd_casadi.analysis.signals import Signals, signals_of
 from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
+from ccd_casadi.inner_problem.design_loops import bounds_of_loop
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
-from ccd_casadi.lti.closed_loop import largest, responses_of
+from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.reporting.loops import section_bounds
-from ccd_casadi.reporting.nyquist import around_resonances, loci_of
+from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
 
 POINTS = 180  # of the frequency grid, besides those around resonances
-SAME = 1e-9  # relative distance of two frequencies below which they are one
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Of one design. Gains are largest singular values of S, KS (N/m) and T, rows (3, k) over Hz.
+    """Of one design: its loop on the plant looked at, over frequency and over time.
 
-    `bounds` are γ/|W1|, γ/|W2|, γ/|W3| (3, k). `loci` (k, p): eigenvalues of L = GK. `margins`: the
-    least of the loops broken one at a time at the plant's inputs. `poles` of the closed loop, of K
-    and of G in Hz, complex. `step`: y of the first output after a step of its reference, over s.
+    `loci` (k, p): eigenvalues of L = GK. `margins`: the least of the loops broken one at a time at
+    the plant's inputs. Poles of K and of G are in Hz, complex.
     """
 
-    hz: Array
-    gains: Array
-    bounds: Array
+    view: LoopView
     loci: np.ndarray
     margins: ClassicalMargins
-    poles: np.ndarray
     controller_poles: np.ndarray
     plant_poles: np.ndarray
-    step_time: Array
-    step: Array
-    move: Move
+    signals: Signals
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Of the closed loop in Hz, complex."""
+        return self.signals.poles / HZ
 
     @property
     def unstable(self) -> bool:
@@ -72,57 +70,22 @@ def curves_of(look: Look) -> Curves | None:
     """The curves of a design; None where its synthesis ended without a controller."""
     if look.controller is None:
         return None
-    plant, K = look.plant, look.controller
-    hz = grid_of(look)
-    run_at = look.problem.sampling
-
-    loop = Loop(plant.plant_si(), K, run_at)
-    if run_at is not None:  # it was designed for hold and delay
-        hz = hz[hz < 0.499 * run_at.rate_hz]
-    G, k = loop.responses(HZ * hz)
-    found = responses_of(G, k)
-    gains = np.array([largest(found[name]) for name in ("S", "KS", "T")])
+    plant, K, problem = look.plant, look.controller, look.problem
+    loop = Loop(plant.plant_si(), K, problem.sampling)
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
-    signals = signals_of(
-        loop, modal_plant(look.elements.system, Suspension(0.0, 0.0)), bandwidth
-    )
+    gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
+    bounded = bounds_of_loop(problem, look.weights, gamma, look.bandwidth_hz)
+    view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=False,
+                     special=(look.figures.sensitivity_peak_frequency / HZ,))  # fmt: skip
+    free = modal_plant(look.elements.system, Suspension(0.0, 0.0))
     return Curves(
-        hz=hz,
-        gains=gains,
-        bounds=bounds_of(look, hz),
-        loci=loci_of(G @ k, np.inf),
-        margins=least_margins(loop.responses, HZ * hz),
-        poles=signals.poles / HZ,
-        controller_poles=np.linalg.eigvals(K.A) / HZ,
-        plant_poles=np.linalg.eigvals(plant.A) * plant.omega_0 / HZ,
-        step_time=signals.step_time,
-        step=signals.step,
-        move=signals.move,
+        view=view,
+        loci=loci_of(view.open[0], np.inf),
+        margins=least_margins(loop.responses, HZ * view.hz),
+        controller_poles=K.poles / HZ,
+        plant_poles=loop.plant.poles / HZ,
+        signals=signals_of(loop, free, bandwidth),
     )
-
-
-def bounds_of(look: Look, hz: Array) -> Array:
-    """What σ_max of S, KS and T must not exceed (3, k): γ/|W|, or the bounds of the sections."""
-    if look.problem.sections is not None:
-        return section_bounds(look.problem, hz, look.bandwidth_hz)
-    size = np.abs(look.weights.responses(HZ * hz))
-    return float(np.nan_to_num(look.figures.certificate.norm_bound)) / size
-
-
-def grid_of(look: Look) -> Array:
-    """Frequencies in Hz from ω_low/5 to far beyond ω_b and the modes, fine where either needs it.
-
-    It holds the peak of S and ω_b themselves.
-    """
-    plant, figures = look.plant, look.figures
-    low = look.problem.inner.omega_low / HZ / 5.0
-    natural = plant.natural[plant.natural > 0.0] / HZ
-    bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
-    high = max(30.0 * bandwidth, 3.0 * float(natural.max(initial=0.0)))
-    around = around_resonances(plant, look.controller)
-    special = [figures.sensitivity_peak_frequency / HZ, look.bandwidth_hz]
-    # around a double pole they come twice
-    return frequency_grid(low, high, POINTS, around, np.array(special), apart=SAME)
 
 
 def sampled_of(look: Look) -> AsSampled | None:

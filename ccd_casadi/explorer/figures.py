@@ -260,13 +260,14 @@ class Figures:
         if c is None:
             sources = (self.gains, self.loci, self.loop, self.step, self.move, *self.poles.values())
             return found + [_data(source, **{key: [] for key in source.data}) for source in sources]
-        columns = {"hz": c.hz, "top": np.full(len(c.hz), TOP)}
+        columns = {"hz": c.view.hz, "top": np.full(len(c.view.hz), TOP)}
         for i, (name, _) in enumerate(GAINS):
-            nothing = np.full(len(c.hz), np.nan)
-            columns |= {name: c.gains[i], f"b{name}": c.bounds[i] if certified else nothing}
+            nothing = np.full(len(c.view.hz), np.nan)
+            bound = c.view.bounds[i] if certified else nothing
+            columns |= {name: c.view.gains[i], f"b{name}": bound}
         size, phase = _bode_of(c)
         xs, ys = _lines(c.loci)
-        hz = [c.hz] * len(size)
+        hz = [c.view.hz] * len(size)
         found += [
             _data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys),
             _data(self.loop, hz=hz, size=size, phase=phase),
@@ -275,25 +276,25 @@ class Figures:
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
             upper = roots[roots.imag >= 0.0]
             size = np.maximum(np.abs(upper), 1e-300)
-            at = np.maximum(size, SLOWEST * c.hz[0])  # an integrator's has no place on the axis
+            at = np.maximum(size, SLOWEST * c.view.hz[0])  # an integrator's has no place there
             at_poles.append(at)
             found.append(_data(self.poles[name], hz=at, damping=-upper.real / size))
-        ms, y = 1e3 * c.step_time, c.step
-        end, um = 1e3 * c.move.time, 1e6 * c.move.error
+        ms, y = 1e3 * c.signals.step_time, c.signals.step
+        end, um = 1e3 * c.signals.move.time, 1e6 * c.signals.move.error
         found += [
             _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
-            (self.end, {"location": 1e3 * c.move.duration}),
+            (self.end, {"location": 1e3 * c.signals.move.duration}),
         ]  # fmt: skip
         known = [c, *(pin.curves for pin in pinned if pin.curves is not None)]
-        spans = [(made.y_range, [c.gains[i]], True) for i, made in enumerate(self.of_gain)]
+        spans = [(made.y_range, [c.view.gains[i]], True) for i, made in enumerate(self.of_gain)]
         spans += [
             (self.pole_map.x_range, at_poles, True),
             (self.loop_size.y_range, size, True),
             (self.loop_phase.y_range, phase, False),
-            (self.step_figure.x_range, [1e3 * each.step_time for each in known], False),
-            (self.step_figure.y_range, [each.step for each in known], False),
-            (self.move_figure.x_range, [1e3 * each.move.time for each in known], False),
-            (self.move_figure.y_range, [1e6 * each.move.error for each in known], False),
+            (self.step_figure.x_range, [1e3 * each.signals.step_time for each in known], False),
+            (self.step_figure.y_range, [each.signals.step for each in known], False),
+            (self.move_figure.x_range, [1e3 * each.signals.move.time for each in known], False),
+            (self.move_figure.y_range, [1e6 * each.signals.move.error for each in known], False),
         ]
         return found + [_spanned(*span) for span in spans]
 
@@ -301,7 +302,7 @@ class Figures:
         """What lets the frequency axis reach over the present design."""
         if drawn.curves is None:
             return []
-        return [_ends(self.hz, float(drawn.curves.hz[0]), float(drawn.curves.hz[-1]))]
+        return [_ends(self.hz, float(drawn.curves.view.hz[0]), float(drawn.curves.view.hz[-1]))]
 
     def pin(self, pins: list[tuple[str, Drawn]]) -> None:
         """Draw the pinned designs beside the present one."""
@@ -311,13 +312,14 @@ class Figures:
             if c is None:
                 continue
             for k, (gain, _) in enumerate(GAINS):
-                rows[gain].append((c.hz, c.gains[k], colour, name))
+                rows[gain].append((c.view.hz, c.view.gains[k], colour, name))
             for x, y in zip(*_lines(c.loci), strict=True):
                 rows["nyquist"].append((x, y, colour, name))
             for name_, lines in zip(("size", "phase"), _bode_of(c), strict=True):
-                rows[name_] += [(c.hz, line, colour, name) for line in lines]
-            rows["step"].append((1e3 * c.step_time, c.step, colour, name))
-            rows["move"].append((1e3 * c.move.time, 1e6 * c.move.error, colour, name))
+                rows[name_] += [(c.view.hz, line, colour, name) for line in lines]
+            s = c.signals
+            rows["step"].append((1e3 * s.step_time, s.step, colour, name))
+            rows["move"].append((1e3 * s.move.time, 1e6 * s.move.error, colour, name))
         for name, source in self.pinned.items():
             keys = ("xs", "ys", "colour", "name")
             source.data = {key: [row[i] for row in rows[name]] for i, key in enumerate(keys)}

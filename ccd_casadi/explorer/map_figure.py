@@ -16,7 +16,7 @@ from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.page import escape
 from ccd_casadi.reporting.svg import GREY, ORANGE
-from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 280
 MARGIN = 0.03  # of the box

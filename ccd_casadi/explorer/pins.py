@@ -9,7 +9,7 @@ from bokeh.models.widgets.tables import DataTable, NumberFormatter, TableColumn
 from ccd_casadi.cases.sections import Parameter
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.words import pin_columns
-from ccd_casadi.reporting.units import shown_unit
+from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 150
 

@@ -7,10 +7,10 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.fixed_structure.optimality import Envelope, log_bandwidth_envelope, optimality
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign, in_problem_units
-from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -21,6 +21,7 @@ from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike,
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import Progress, synthesise_sections
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import Point, ascend
 from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
@@ -31,7 +32,6 @@ from ccd_casadi.fixed_structure.sections_design import (
     span_of,
 )
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.trust_region import Point, ascend
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -40,13 +40,3 @@ def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) 
         out[end, :n, n] = out[end, n, :n] = chain[:, None] * c_xk[end]
         out[end, n, n] = chain**2 * c_xx[end]
     return out
-
-
-def lagrangian_hessian(
-    problem: LoopProblem, kappa: Array, tau: float, rows: Constraints, mu: Array
-) -> Array:
-    """Σ μ_j ∂²c_j, (n + 1, n + 1), for multipliers μ >= 0 of these constraints."""
-    chosen = mu > 0.0
-    return np.asarray(
-        np.einsum("m,mij->ij", mu[chosen], hessians(problem, kappa, tau, rows.only(chosen)))
-    )

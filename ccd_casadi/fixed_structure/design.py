@@ -14,6 +14,7 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.race import Runner, distinct, finished, local_optima, run_race
@@ -27,7 +28,6 @@ from ccd_casadi.fixed_structure.sections_design import (
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept, redrawn
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.trust_region import ascend
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

@@ -25,11 +25,10 @@ from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
-from ccd_casadi.fixed_structure.curvature import lagrangian_hessian
-from ccd_casadi.fixed_structure.descent import Point, descend
 from ccd_casadi.fixed_structure.design import Progress, problem_for
-from ccd_casadi.fixed_structure.figures import assess, to_theta
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Problem
+from ccd_casadi.fixed_structure.figures import to_theta
+from ccd_casadi.fixed_structure.local_search import LoopModel, all_rows, descend
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Problem
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.sections_design import (
     SectionsDesign,
@@ -39,6 +38,7 @@ from ccd_casadi.fixed_structure.sections_design import (
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -137,9 +137,14 @@ def least_error(
     goal = RmsError(
         tuple(p.plant_si() for p in plants), structure, replace(budget, window=None), sampling
     )
-    model = _OnPlants(problem, goal)
-    w0 = problem.plants.omega_0
+    w0, force = problem.plants.omega_0, problem.plants.force
     floor = float(np.log(max(least_bandwidth, 1e-3 * design.bandwidth) / w0))
+
+    def scaled(kappa: Array) -> tuple[float, Array]:
+        return goal.at(structure.in_units(kappa, w0, force))
+
+    model = LoopModel(problem, scaled, REWARD, floor)
+    first_hessian = np.diag(np.append(np.ones(len(design.kappa)), 0.0))
     tell = progress or (lambda words: None)
     own = (design.bandwidth, tuple(map(float, design.kappa)))
     others = [(o.bandwidth, o.kappa) for o in design.local_optima[1:] if o.kappa]
@@ -153,58 +158,32 @@ def least_error(
             break  # one that was given has led to a design: these are climbed from where none does
         if bandwidth < least_bandwidth:
             continue
-        start = model.at(in_problem_units(problem, np.array(kappa)), float(np.log(bandwidth / w0)))
-        if not np.isfinite(start.value):
+        begin = in_problem_units(problem, np.array(kappa))
+        start = model.at(np.append(begin, np.log(bandwidth / w0)))
+        if start is None:
             continue
-        end, count = descend(model, start, problem.box, floor, REWARD, problem.margin)
+        end, count = descend(model, start, first_hessian, problem.margin)
         steps += count
         made, active, conditions = _judged(problem, plants, sampling, end, design, floor)
-        error = float(np.exp(end.value))
+        error = float(np.exp(end.value + REWARD * end.x[-1]))
         tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
              f"{made.words}")  # fmt: skip
         if made.certified and error < best.error:
             envelope = None
             if made.kkt_residual <= RESIDUAL:
                 direct = goal.to_theta(made.kappa, plants)
-                slopes = to_theta(problem, end.kappa, active)
+                slopes = to_theta(problem, end.x[:-1], active)
                 names = tuple(kinds_of_rows(problem, active))
                 envelope = Envelope(names, direct, slopes, *conditions).times(error)
             best = replace(best, design=made, error=error, envelope=envelope)
     return replace(best, steps=steps)
 
 
-@dataclass(frozen=True)
-class _OnPlants:
-    """The problem as `descent` sees it."""
-
-    problem: Problem
-    goal: RmsError
-
-    def at(self, kappa: Array, tau: float) -> Point:
-        kappa = np.clip(kappa, *self.problem.box)
-        found = assess(self.problem, kappa, tau)
-        if not found.stable:
-            return Point(kappa, tau, np.inf, np.inf, np.zeros(len(kappa)), None)
-        assert found.peaks is not None
-        assert found.near is not None
-        P = self.problem.plants
-        value, slope = self.goal.at(self.problem.structure.in_units(kappa, P.omega_0, P.force))
-        parts = (found.peaks, found.near)
-        rows = Constraints(*(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("curve", "plant", "v", "value", "to_kappa", "to_tau")
-        ))  # fmt: skip
-        return Point(kappa, tau, found.violation, value, slope, rows)
-
-    def hessian(self, point: Point, rows: Constraints, mu: Array) -> Array:
-        return lagrangian_hessian(self.problem, point.kappa, point.tau, rows, mu)
-
-
 def _judged(
     problem: Problem,
     plants: Sequence[ScaledPlant],
     sampling: Sampling | None,
-    end: Point,
+    end: Iterate[Assessment],
     design: SectionsDesign,
     floor: float,
 ) -> tuple[SectionsDesign, Constraints, tuple[Array, Array, Array]]:
@@ -212,22 +191,23 @@ def _judged(
     the conditions of optimality as rows, goal and μ, rowsᵀ μ = goal.
     """
     structure, P = problem.structure, problem.plants
-    kappa = structure.in_units(end.kappa, P.omega_0, P.force)
+    inside, tau = end.x[:-1], float(end.x[-1])
+    kappa = structure.in_units(inside, P.omega_0, P.force)
     controller = state_space(structure, kappa)
     judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
-    assert end.rows is not None
-    active = end.rows.only(np.abs(end.rows.value) <= ACTIVE)
-    n = len(end.kappa)
+    rows = all_rows(end.data)
+    active = rows.only(np.abs(rows.value) <= ACTIVE)
+    n = len(inside)
     columns, names = [np.column_stack([active.to_kappa, active.to_tau])], []
     for i, name in enumerate(structure.names):
         for row, sign, word in ((0, -1.0, "lower"), (1, 1.0, "upper")):
-            if abs(end.kappa[i] - problem.box[row, i]) <= ACTIVE:
+            if abs(inside[i] - problem.box[row, i]) <= ACTIVE:
                 columns.append(sign * np.eye(n + 1)[i : i + 1])
                 names.append((name, word))
-    if abs(end.tau - floor) <= ACTIVE:
+    if abs(tau - floor) <= ACTIVE:
         columns.append(-np.eye(n + 1)[n:])
     matrix = np.concatenate(columns).T
-    goal = np.append(-end.slope, REWARD)
+    goal = -end.gradient
     mu = nnls(matrix, goal, maxiter=100 * matrix.shape[1])[0] if matrix.shape[1] else np.zeros(0)
     residual = float(np.abs(matrix @ mu - goal).max() / np.abs(goal).max())
     multipliers: dict[str, float] = {}

@@ -6,7 +6,7 @@
                     |W_KS KS|, |W_T T| <= weighted_level,  |GS| <= compliance_max
 
 Every line is a row of its own, with exact derivatives to κ; ω_b and ω_low lie between lines, where
-ln|S| is a straight line over ln ω. The search is `descent`'s, from controllers by rules whose
+ln|S| is a straight line over ln ω. The search is `local_search`'s, from controllers by rules whose
 winding is right; the judge is `measured.judge`.
 """
 
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.descent import Point, descend
+from ccd_casadi.fixed_structure.local_search import descend
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
     MeasuredFigures,
@@ -35,6 +35,7 @@ from ccd_casadi.fixed_structure.structure import (
 )
 from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.optim.trust_region import Iterate, Model, Rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -81,23 +82,22 @@ def design_on_data(
     """
     model = _OnLines(measured, structure, bounds, period, unstable_poles, poles_at_zero)
     tell = progress or (lambda words: None)
-    points = sorted(
-        (model.at(kappa, tau) for kappa, tau in _starts(model, starts, seed)),
-        key=lambda point: point.violation,
-    )
-    points = [point for point in points if np.isfinite(point.violation)][:RACED]
+    tried = (model.at(np.append(*start)) for start in _starts(model, starts, seed))
+    points = [point for point in tried if point is not None]
+    points = sorted(points, key=lambda point: point.violation)[:RACED]
     if not points:
         words = "no start is stable by its winding; give poles_at_zero, or more low lines"
         nothing = np.full(len(structure.names), np.nan)
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, words, 0)
     ends, steps = [], 0
     for point in points:
-        end, count = descend(model, point, model.box, -np.inf, 1.0, MARGIN)
+        end, count = descend(model, point, np.zeros((len(point.x), len(point.x))), MARGIN)
         steps += count
         ends.append(end)
-        tell(f"{np.exp(end.tau) / HZ:.2f} Hz, bounds exceeded by {end.violation:.1g}")
-    best = min(ends, key=lambda end: (end.violation > 1e-5, -end.tau))
-    controller = state_space(structure, best.kappa)
+        tell(f"{np.exp(end.x[-1]) / HZ:.2f} Hz, bounds exceeded by {end.violation:.1g}")
+    best = min(ends, key=lambda end: (end.violation > 1e-5, -end.x[-1]))
+    kappa = best.x[:-1]
+    controller = state_space(structure, kappa)
     figures = judge(
         measured, controller, bounds, period=period, unstable_poles=unstable_poles,
         poles_at_zero=poles_at_zero, integrator=structure.integrator,
@@ -109,12 +109,14 @@ def design_on_data(
         words = f"exceeds its bound on {', '.join(broken)} (relative); {words}"
     usable = figures.stable and figures.sure and not broken
     return MeasuredDesign(
-        structure, best.kappa, controller, figures.bandwidth, figures, usable, words, steps
+        structure, kappa, controller, figures.bandwidth, figures, usable, words, steps
     )
 
 
-class _OnLines:
-    """The problem as `descent` sees it; κ in SI."""
+class _OnLines(Model[Constraints]):
+    """The lines as rows over x = (κ, τ), κ in SI."""
+
+    corrected = True
 
     def __init__(
         self,
@@ -143,9 +145,11 @@ class _OnLines:
             (0.1 * self.omega[0], fastest), (1e-3 * inverse.min(), 1e3 * inverse.max())
         )
 
-    def at(self, kappa: Array, tau: float) -> Point:
+        self.low, self.high = np.append(self.box[0], -np.inf), np.append(self.box[1], np.inf)
+
+    def at(self, x: Array) -> Iterate[Constraints] | None:
         """Every line within a factor e of its bound, and the two points between lines."""
-        kappa = np.clip(kappa, *self.box)
+        kappa, tau = np.clip(x[:-1], *self.box), float(x[-1])
         n = len(kappa)
         K, g, _ = response_and_slopes(self.structure, kappa, self.s)
         L = self.G * K
@@ -154,7 +158,7 @@ class _OnLines:
         integrators = int(self.structure.integrator)
         stable = winding(self.whole, joint, self.unstable_poles, integrators)[0] == 0
         if not stable or not np.log(self.omega[0]) < tau < np.log(self.omega[-1]):
-            return Point(kappa, tau, np.inf, 0.0, np.zeros(n), None)
+            return None
         S = 1.0 / (1.0 + L)
         of_s, of_t = -((1.0 - S)[:, None] * g).real, (S[:, None] * g).real
         ln_S, bounds, omega = np.log(np.abs(S)), self.bounds, self.omega
@@ -174,10 +178,10 @@ class _OnLines:
             (Curve.CROSSING, tau, -HALF_POWER),
             (Curve.S_LOW, np.log(bounds.omega_low), np.log(bounds.S_low)),
         )
-        for kind, x, level in ends:
-            i = int(np.clip(np.searchsorted(np.log(omega), x), 1, len(omega) - 1))
+        for kind, place, level in ends:
+            i = int(np.clip(np.searchsorted(np.log(omega), place), 1, len(omega) - 1))
             width = np.log(omega[i] / omega[i - 1])
-            share = np.clip((x - np.log(omega[i - 1])) / width, 0.0, 1.0)
+            share = np.clip((place - np.log(omega[i - 1])) / width, 0.0, 1.0)
             weights = np.array([1.0 - share, share])
             value, slope = weights @ ln_S[i - 1 : i + 1], weights @ of_s[i - 1 : i + 1]
             to_tau = (ln_S[i] - ln_S[i - 1]) / width if kind is Curve.CROSSING else 0.0
@@ -204,23 +208,29 @@ class _OnLines:
             curve[kept], at[kept], omega[at[kept]], value[kept], to_kappa[kept], to_tau[kept]
         )
         violation = max(0.0, float(value.max()))
-        return Point(kappa, tau, violation, 0.0, np.zeros(n), rows)
+        return Iterate(np.append(kappa, tau), -tau, -np.eye(n + 1)[n], violation, rows)
 
-    def hessian(self, point: Point, rows: Constraints, mu: Array) -> Array:
-        """At fixed lines: -Re(S T g gᵀ + T ∂²ln K) of S, -Re(S T g gᵀ - S ∂²ln K) of KS and T."""
-        n = len(point.kappa)
-        out = np.zeros((n + 1, n + 1))
-        rows, mu = rows.only(mu > 0.0), mu[mu > 0.0]
-        if not len(mu):
-            return out
-        s = self.s[rows.plant]
-        K, g, _ = response_and_slopes(self.structure, point.kappa, s)
+    def rows(self, here: Iterate[Constraints], radius: float) -> Rows:
+        """All of them curved."""
+        rows = here.data
+
+        def second(index: np.ndarray) -> Array:
+            return self.hessians(here.x[:-1], rows.only(index))
+
+        slopes = np.column_stack([rows.to_kappa, rows.to_tau])
+        return Rows(rows.value, slopes, hessians=second, curved=len(rows.v))
+
+    def hessians(self, kappa: Array, rows: Constraints) -> Array:
+        """(m, n + 1, n + 1) at fixed lines: -Re(S T g gᵀ + T ∂²ln K) of S, -Re(S T g gᵀ - S ∂²ln K)
+        of KS and T."""
+        n, s = len(kappa), self.s[rows.plant]
+        K, g, _ = response_and_slopes(self.structure, kappa, s)
         S = 1.0 / (1.0 + self.G[rows.plant] * K)
         T = 1.0 - S
-        weight = mu * np.where(np.isin(rows.curve, (Curve.KS, Curve.T)), S, -T)
-        second = second_slopes(self.structure, point.kappa, s)
-        out[:n, :n] = np.einsum("m,mij->ij", weight, second).real
-        out[:n, :n] -= np.einsum("m,mi,mj->ij", mu * S * T, g, g).real
+        sign = np.where(np.isin(rows.curve, (Curve.KS, Curve.T)), S, -T)[:, None, None]
+        weighted = sign * second_slopes(self.structure, kappa, s)
+        out = np.zeros((len(s), n + 1, n + 1))
+        out[:, :n, :n] = (weighted - (S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
         return out
 
 

@@ -14,8 +14,8 @@ from scipy.optimize import nnls
 
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.figures import to_theta
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
-from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.support.arrays import Array
 
 ACTIVE = 1e-5  # ln of the share of its bound within which a constraint binds

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
-from ccd_casadi.fixed_structure.trust_region import FIRST_RADIUS, Ascent, Point, ascend
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 

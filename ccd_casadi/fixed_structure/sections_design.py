@@ -9,11 +9,11 @@ import numpy as np
 from ccd_casadi.fixed_structure.certificate import Certificate, certify
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
+from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.fixed_structure.optimality import optimality
 from ccd_casadi.fixed_structure.race import LocalOptimum
 from ccd_casadi.fixed_structure.structure import Kind, Structure
-from ccd_casadi.fixed_structure.trust_region import Point
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant

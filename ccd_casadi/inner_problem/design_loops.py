@@ -44,9 +44,12 @@ def bounds_of_loop(
     inner = problem.inner
     if problem.sections is None:
         over, words = partial(_of_weights, weights, gamma), ("its bound γ/|W|",) * 3
+        most = inner.compliance_max
     else:
         over, words = partial(_of_sections, problem, bandwidth_hz), OF_SECTIONS
-    return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words)
+        most = problem.sections.compliance_max
+    return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words, most,
+                   problem.sections is not None)  # fmt: skip
 
 
 def design_view(

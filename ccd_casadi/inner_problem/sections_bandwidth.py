@@ -129,7 +129,7 @@ def valued(
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
     """Raise UserError where J counts the RMS error, for a command that knows ω_b alone."""
     if problem.sections is not None and problem.sections.of_error:
-        words = f"{command} counts the bandwidth; solve and inner alone count the error"
+        words = f"{command} counts the bandwidth; solve, inner and retrain count the error"
         raise UserError(f'inner.minimise: is "rms_error", and {words}')
 
 

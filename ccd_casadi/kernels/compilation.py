@@ -1,8 +1,9 @@
 """Compiling every kernel once, on two processes, with words; and doing so when a user comes first.
 
 Numba compiles a function when it is first called and keeps it on disk, beside the sources or,
-where these cannot be written, in the user's own cache. One process does the search for γ_opt,
-the other the certificate; each loads from disk what the other has already left there.
+where these cannot be written, in the user's own cache. One process does the search for γ_opt
+and the rows of structured loops, the other the certificate and their curvature; each loads from
+disk what the other has already left there.
 
 A stamp beside the compiled kernels names the sources, Numba and the processor that they are
 for. The first compilation that finds no such stamp starts the two processes, says so on stderr,
@@ -29,9 +30,9 @@ from ccd_casadi.support.progress import Progress
 from surrogates.options import usable_cores
 
 PACKAGE = __name__.rpartition(".")[0]
-PARTS = ("search", "certificate")
+PARTS = ("search", "certificate", "rows", "curvature")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
-SECONDS = 60.0  # of one core, to compile all; measured, said before anything else is known
+SECONDS = 95.0  # of one core, to compile all; measured, said before anything else is known
 
 
 def compile_part(part: str) -> None:
@@ -39,6 +40,8 @@ def compile_part(part: str) -> None:
 
     One tiny problem serves all: SISO and MIMO have the same types.
     """
+    if part in ("rows", "curvature"):
+        return _compile_rows(part == "curvature")
     from ccd_casadi.kernels import design, frequency, gamma, riccati, sensitivity, synthesis
     from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
     from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
@@ -72,10 +75,9 @@ def compile_part(part: str) -> None:
         gamma.gamma_lower_bound(G, w, grid, np.ones(41))
         squared_weights(w, grid)
         sensitivity.axis_frequencies(A, B, C, none, 1.0)
-        _compile_sections()
 
 
-def _compile_sections() -> None:
+def _compile_rows(curvature: bool) -> None:
     from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes
     from ccd_casadi.kernels.limits import Limit
 
@@ -84,11 +86,13 @@ def _compile_sections() -> None:
     controller = (np.zeros((1, 4), np.int64), one, first, square, square)
     limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((2, 0, 1)))
     loop = loop_point.Loop(*controller, *plants, *limits)
-    modes.responses(plants, first, one)
-    loop_rows.levels(first[None], first, square, loop, 0.0)
-    loop_rows.rows(first, first, first, one, loop)
-    loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
-    loop_curvature.second(first, first, first, one, loop)
+    if curvature:
+        modes.responses(plants, first, one)
+        loop_curvature.second(first, first, first, one, loop)
+    else:
+        loop_rows.levels(first[None], first, square, loop, 0.0)
+        loop_rows.rows(first, first, first, one, loop)
+        loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
 
 def ensure_compiled() -> None:

@@ -15,26 +15,26 @@ from ccd_casadi.support.arrays import Array
 
 KEPT = 1e-7  # by how much an answer may miss its rows
 INSIDE = 1e-6  # and its bounds, to which it can be moved
+CURVED, SLACK = 1e-8, 1e-4  # of a step in its own units: its answer is then one point
 UNBOUNDED = 1e30  # what DAQP takes for infinite
 QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 TOLERANCES = {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}
 
 
 class Answer(NamedTuple):
-    """x (n,), the multipliers (m,) of the rows, and the least value."""
+    """x (n,) and the multipliers (m,) of the rows."""
 
     x: Array
     multipliers: Array
-    value: float
 
 
 def solve_quadratic(
-    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array, *, singular: bool = False
+    H: Array, c: Array, A: Array, upper: Array, low: Array, high: Array
 ) -> Answer | None:
     """min c·x + ½ xᵀ H x over low <= x <= high, A x <= upper; bounds may be infinite.
 
-    None where neither solver keeps the rows of A (m, n), which tells nothing of x. `singular`: H
-    may be nearly so.
+    None where neither solver keeps the rows of A (m, n), which tells nothing of x. H may be
+    nearly singular.
     """
     rows, n = A.shape
 
@@ -45,21 +45,46 @@ def solve_quadratic(
     above = np.minimum(np.concatenate([high, upper]), UNBOUNDED)
     below = np.concatenate([np.maximum(low, -UNBOUNDED), np.full(rows, -UNBOUNDED)])
     matrix = np.ascontiguousarray(A, float)
-    x, value, flag, info = daqp.solve(np.array(H, float), c, matrix, above, below, **TOLERANCES)
+    x, _, flag, info = daqp.solve(np.array(H, float), c, matrix, above, below, **TOLERANCES)
     if flag == 1 and kept(x):
-        return Answer(x, np.maximum(info["lam"][n:], 0.0), float(value))
-    solver = _interior(n, rows, singular)
+        return Answer(x, np.maximum(info["lam"][n:], 0.0))
+    solver = _interior(n, rows)
     found = solver(h=H, g=c, a=A, lba=-np.inf, uba=upper, lbx=low, ubx=high)
     x = np.array(found["x"]).ravel()
     if not solver.stats()["success"] or not kept(x):
         return None
-    return Answer(x, np.maximum(np.array(found["lam_a"]).ravel(), 0.0), float(found["cost"]))
+    return Answer(x, np.maximum(np.array(found["lam_a"]).ravel(), 0.0))
+
+
+def solve_elastic(
+    H: Array, c: Array, slopes: Array, value: Array, elastic: Array, low: Array, high: Array,
+    penalty: float, radius: float, unit: float, *, free: bool = False,
+) -> tuple[Array, Array] | None:  # fmt: skip
+    """p (n,) and the multipliers (m,) of the rows of a trust-region step:
+
+        min c·p + ½ pᵀ H p + ρ σ    over  low <= p <= high, 0 <= σ,    value + slopes·p <= elastic σ
+
+    σ is by how much the rows are left exceeded (l∞ penalty; Fletcher 1987, section 12.4), so that
+    there is a solution where all are elastic; with `free` it may be negative. Solved in steps of
+    one radius and with `unit`, the size of c or ρ, as one: the solvers' tolerances mean the same at
+    every radius. None as in `solve_quadratic`.
+    """
+    n = slopes.shape[1]
+    A = np.column_stack([slopes, -elastic])
+    hessian = np.zeros((n + 1, n + 1))
+    hessian[:n, :n] = radius / unit * H
+    hessian[range(n + 1), range(n + 1)] += np.append(np.full(n, CURVED), CURVED if free else SLACK)
+    ends = np.append(low / radius, -np.inf if free else 0.0), np.append(high / radius, np.inf)
+    cost = np.append(c, penalty) / unit
+    found = solve_quadratic(hessian, cost, A, -value / radius, *ends)
+    if found is None:
+        return None
+    return radius * np.clip(found.x[:n], ends[0][:n], ends[1][:n]), unit * found.multipliers
 
 
 @lru_cache(maxsize=256)
-def _interior(n: int, rows: int, singular: bool) -> ca.Function:
+def _interior(n: int, rows: int) -> ca.Function:
     shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
     options: dict[str, bool | str] = dict.fromkeys(QUIET, False)
-    if singular:  # an LDL factorisation would warn on the terminal
-        options["linear_solver"] = "qr"
+    options["linear_solver"] = "qr"  # an LDL factorisation would warn on the terminal
     return ca.conic("programme", "ipqp", shapes, options)

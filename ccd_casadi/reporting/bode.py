@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLACK, CYCLE
 from ccd_casadi.reporting.tables import spread
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.loop_responses import Loop
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
 
 
-def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bode") -> str:
+def figure_bode(loop: LoopView, channels: Sequence[Channel] = (), *, key: str = "bode") -> str:
     """Plant, controller and L = GK: magnitude and phase, of every one of several scalar channels.
 
     All singular values, and no phase, of a loop that does not fall apart into such channels.
@@ -63,7 +63,7 @@ def figure_bode(loop: Loop, channels: Sequence[Channel] = (), *, key: str = "bod
     return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
 
 
-def scalar_parts(loop: Loop, channels: Sequence[Channel]) -> dict[str, tuple[np.ndarray, ...]]:
+def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> dict[str, tuple[np.ndarray, ...]]:
     """g, k and their product of every scalar channel, by a name that says which outputs it moves.
 
     Empty where the loop is no scalar one and does not fall apart into such channels.
@@ -83,7 +83,7 @@ def scalar_parts(loop: Loop, channels: Sequence[Channel]) -> dict[str, tuple[np.
     return found
 
 
-def _marks(loop: Loop, gains: Array) -> list[Mark]:
+def _marks(loop: LoopView, gains: Array) -> list[Mark]:
     """Resonances above the largest gain, anti-resonances below the least one."""
     found = []
     groups = (
@@ -100,7 +100,7 @@ def _marks(loop: Loop, gains: Array) -> list[Mark]:
     return found
 
 
-def caption_bode(loop: Loop, channels: Sequence[Channel] = ()) -> str:
+def caption_bode(loop: LoopView, channels: Sequence[Channel] = ()) -> str:
     """What to see in the Bode plot of one design."""
     scalar = loop.plant.shape[1:] == (1, 1)
     what = "" if scalar else (
@@ -125,7 +125,7 @@ def caption_bode(loop: Loop, channels: Sequence[Channel] = ()) -> str:
     return words
 
 
-def table_bode(loop: Loop) -> Table:
+def table_bode(loop: LoopView) -> Table:
     """Magnitudes, and phases of a scalar loop, at some frequencies."""
     rows = spread(loop.hz, [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz])
     if loop.plant.shape[1:] == (1, 1):

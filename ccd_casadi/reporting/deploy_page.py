@@ -21,7 +21,8 @@ from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
+from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.page import (
     INDEX,
     Section,
@@ -35,7 +36,7 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
-from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, ORANGE
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
@@ -133,22 +134,13 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         )  # fmt: skip
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
-    top = Panel(
-        "frequency (Hz)", "σ_max(S) (–)", tuple(curves),
-        levels=(
-            Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY),
-            Level(bandwidth, f"ω_b {number(bandwidth, 4)} Hz, continuous", True),
-        ),
-        log_x=True, log_y=True, x_range=(low, nyquist), legend="lower right",
-    )  # fmt: skip
-    bottom = Panel(
-        "frequency (Hz)", "σ_max(K) (N/m)",
-        tuple(
-            Curve(hz, gain, "", colour, line)
-            for gain, colour, line in zip(controllers, colours, lines, strict=True)
-        ),
-        log_x=True, log_y=True, x_range=(low, nyquist),
-    )  # fmt: skip
+    crossing = bandwidth_level(bandwidth, text=", continuous")
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,))
+    drawn = [
+        Curve(hz, gain, "", colour, line)
+        for gain, colour, line in zip(controllers, colours, lines, strict=True)
+    ]
+    bottom = over_hz("σ_max(K) (N/m)", drawn, (low, nyquist))
     svg = figure_lines(
         [[top], [bottom]], key="deployed-loop", heights=(3.4, 2.4),
         title="Sensitivity and controller: full, reduced and sampled, over frequency",

@@ -2,18 +2,17 @@
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front, FrontPoint
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.loops import forbidden, synthesised_loop
+from ccd_casadi.reporting.lines import Panel, figure_lines
+from ccd_casadi.reporting.loops import S_panel, synthesised_loop
 from ccd_casadi.reporting.page import number
 from ccd_casadi.reporting.steps import steps_html
-from ccd_casadi.reporting.svg import GREEN, GREY
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import Loop
 
 MOST = 12  # designs: each is synthesised and drawn
 
@@ -34,7 +33,7 @@ def front_walk(run: FinishedRun, front: Front) -> str:
         row: list[Panel | str | None] = [_machine(problem, point)]
         if loops:
             top = 1.5 * max(problem.inner.S_max, *tops)
-            row.append(_sensitivity(problem, loops[i], (0.5 * min(lows), top)))
+            row.append(S_panel(loops[i], y_range=(0.5 * min(lows), top), marks=()))
         drawn = figure_lines([row], key=f"walk{i}", title="A design of the front")
         steps.append((_words(problem, point), drawn))
     own = float(run.result["hardware_cost"])
@@ -42,27 +41,13 @@ def front_walk(run: FinishedRun, front: Front) -> str:
     return steps_html(steps, first, "lightest to heaviest")
 
 
-def _loop(problem: CoDesignProblem, point: FrontPoint) -> Loop:
+def _loop(problem: CoDesignProblem, point: FrontPoint) -> LoopView:
     return synthesised_loop(problem, point.theta, point.omega_S, point.omega_T, "")
 
 
 def _machine(problem: CoDesignProblem, point: FrontPoint) -> str:
     drawing = plant_of(problem).drawing
     return machine(problem, point.theta) if drawing is None else drawing({"": point.theta}).svg
-
-
-def _sensitivity(problem: CoDesignProblem, loop: Loop, y_range: tuple[float, float]) -> Panel:
-    ends = float(loop.hz[0]), float(loop.hz[-1])
-    inner, hz = problem.inner, loop.bandwidth_hz
-    return Panel(
-        "frequency (Hz)", "σ_max(S) (–)", (Curve(loop.hz, loop.gains[0], width=1.8),),
-        levels=(
-            Level(inner.S_max, f"S_max {inner.S_max:g}", colour=GREY),
-            Level(hz, f"ω_b {number(hz, 4)} Hz", True, GREEN),
-        ),
-        log_x=True, log_y=True, x_range=ends, y_range=y_range,
-        forbidden=forbidden(inner, *ends, y_range[1]),
-    )  # fmt: skip
 
 
 def _words(problem: CoDesignProblem, point: FrontPoint) -> str:

@@ -12,8 +12,7 @@ from ccd_casadi.reporting.facts import cost_axis
 from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import CYCLE, GREY
-from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, shown_unit
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for

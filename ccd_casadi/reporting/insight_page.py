@@ -7,6 +7,7 @@ from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.index import index_of, write_index
@@ -32,7 +33,6 @@ from ccd_casadi.reporting.page import (
 from ccd_casadi.reporting.sections_page import binding_words
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 
 
@@ -91,13 +91,9 @@ def _limits(run: FinishedRun, rule: str) -> str:
         )
         items = "".join(f"<li>{escape(text)}</li>" for text in held)
         return f"<ul>{items}</ul>" + paragraph(without) + paragraph(rule)
-    loop = loop_data(
-        run.plant,
-        run.controller,
-        run.weights,
-        gamma=run.figures.gamma,
+    loop = design_view(
+        run.problem, run.theta, run.controller, weights=run.weights, gamma=run.figures.gamma,
         bandwidth_hz=run.figures.bandwidth / HZ,
-        omega_low=run.problem.inner.omega_low,
-    )
+    )  # fmt: skip
     limits = "\n".join(paragraph(text) for text in (*limit_sentences(loop), rule))
     return limits + table_html(table_limits(loop))

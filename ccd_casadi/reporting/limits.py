@@ -8,19 +8,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.synthesis.loop_responses import Loop
 
 PARTS = ("|S|", "|KS|", "|T|")
 
 
-def shares(loop: Loop, hz: float) -> np.ndarray:
+def shares(loop: LoopView, hz: float) -> np.ndarray:
     """(3,) |W_S S|, |W_KS KS|, |W_T T| over γ at a frequency in Hz."""
     i = int(np.abs(np.log(loop.hz / hz)).argmin())
     return np.asarray(loop.gains[:, i] / loop.bounds[:, i])
 
 
-def table_limits(loop: Loop) -> Table:
+def table_limits(loop: LoopView) -> Table:
     """Shares of γ where it matters: below, at and above the bandwidth, and at the peaks of S."""
     places = [
         ("half the bandwidth", 0.5 * loop.bandwidth_hz),
@@ -37,7 +37,7 @@ def table_limits(loop: Loop) -> Table:
     )
 
 
-def limit_sentences(loop: Loop) -> list[str]:
+def limit_sentences(loop: LoopView) -> list[str]:
     """What holds ω_b, and what stands where S is largest."""
     found = shares(loop, loop.bandwidth_hz)
     order = np.argsort(found)[::-1]

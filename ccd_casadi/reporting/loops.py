@@ -1,22 +1,28 @@
-"""Closed loops over frequency: σ_max of S, KS and T against their bounds."""
+"""Closed loops over frequency: σ_max of S, KS and T against what is forbidden to them."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds, ShapeEnd
+from ccd_casadi.analysis.loop_view import NAMES, LoopView
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sweep import InnerProblem
-from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import CYCLE, GREY, ORANGE
+from ccd_casadi.reporting.bode import phase_deg
+from ccd_casadi.reporting.lines import Band, Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, figure_html, number
+from ccd_casadi.reporting.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import Loop, loop_data
-from ccd_casadi.synthesis.synthesis import synthesise
+from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.synthesis.synthesis import Design, synthesise
+
+if TYPE_CHECKING:
+    from ccd_casadi.codesign.verified import Verified
 
 Areas = tuple[tuple[np.ndarray, str], ...]  # corners x + iy, colours
+UNITS = {"S": "–", "KS": "N/m", "T": "–"}
+PEAK = 1.05  # |S| of a local maximum that is worth a word
 
 
 def synthesised_loop(
@@ -25,72 +31,152 @@ def synthesised_loop(
     omega_S: float,
     omega_T: float,
     label: str,
-) -> Loop:
+) -> LoopView:
     """The loop of the design at (θ, ω_S, ω_T), rad/s, synthesised anew."""
     plant, inner = scaled_plant(problem, theta), problem.inner
     weights = problem.weights.at(omega_S, omega_T)
     made = synthesise(plant, weights, omega_low=inner.omega_low, gamma_backoff=inner.gamma_backoff)
-    return loop_data(
-        plant,
-        made.controller,
-        weights,
-        gamma=float(np.nan_to_num(made.figures.certificate.norm_bound)),
-        bandwidth_hz=made.figures.bandwidth / HZ,
-        omega_low=inner.omega_low,
-        label=label,
-    )
+    return design_view(
+        problem, theta, made.controller, bandwidth_hz=made.figures.bandwidth / HZ, weights=weights,
+        gamma=float(np.nan_to_num(made.figures.certificate.norm_bound)), label=label,
+    )  # fmt: skip
 
 
-def figure_gains(
-    loops: Sequence[Loop], *, S_max: float, key: str = "gains", bounds: bool = True
-) -> str:
-    """|S| over the full width, |KS| and |T| below it, for one design or several."""
-    names = ("S", "KS", "T")
-    units = ("–", "N/m", "–")
-    panels = []
-    for i in range(3):
-        curves, marks, levels = [], [], []
-        for j, loop in enumerate(loops):
-            colour = CYCLE[j]
-            label = loop.label or f"|{names[i]}|"
-            curves.append(Curve(loop.hz, loop.gains[i], label, colour))
-            if bounds:
-                words = "its bound γ/|W|" if len(loops) == 1 else ""
-                curves.append(Curve(loop.hz, loop.bounds[i], words, colour, "--", width=0.9))
-            text = f"ω_b {number(loop.bandwidth_hz, 4)} Hz"
-            levels.append(Level(loop.bandwidth_hz, text if i == 0 else "", True, colour))
-            if i == 0:
-                tops = [p for p in loop.peaks if p[1] > 1.05]
-                marks += _peak_marks(tops, colour)
+def view_of(verified: "Verified") -> LoopView:
+    """The loop over frequency; of a mixed-sensitivity design against its γ."""
+    bounds: dict[str, Any] = {}
+    made = getattr(verified, "design", None)
+    if isinstance(made, Design):
+        bounds = {"weights": made.weights, "gamma": made.figures.gamma}
+    return design_view(
+        verified.problem, verified.theta, verified.controller,
+        bandwidth_hz=verified.bandwidth / HZ, **bounds,
+    )  # fmt: skip
+
+
+def over_hz(
+    label: str, curves: Sequence[Curve], ends: tuple[float, float], **more: Any
+) -> Panel:
+    """Gains over frequency, both axes logarithmic."""
+    kept = {"log_y": True, **more}
+    return Panel("frequency (Hz)", label, tuple(curves), log_x=True, x_range=ends, **kept)
+
+
+def bandwidth_level(hz: float, colour: str = GREY, text: str = "") -> Level:
+    """ω_b on the axis of frequency."""
+    return Level(hz, f"ω_b {number(hz, 4)} Hz{text}", True, colour)
+
+
+def sensitivity_panel(
+    curves: Sequence[Curve], ends: tuple[float, float], S_max: float, at: Sequence[Level] = (),
+    label: str = "σ_max(S) (–)", **more: Any,
+) -> Panel:  # fmt: skip
+    """S of any loops, with S_max and -3 dB."""
+    levels = (Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY))
+    kept = {"legend": "lower right", **more}
+    return over_hz(label, curves, ends, levels=(*levels, *at), **kept)
+
+
+def gain_panels(views: Sequence[LoopView], *, bounds: bool = True) -> list[Panel]:
+    """S, KS and T: of one design the model's in a band of all plants, with what is forbidden.
+
+    Of several designs the largest on the plants of each, with their bounds if these are asked for.
+    """
+    return [_gain_panel(views, i, bounds) for i in range(len(NAMES))]
+
+
+def S_panel(view: LoopView, **more: Any) -> Panel:
+    """S of one design with what is asked of it, its highest peak alone marked."""
+    marks = _peak_marks(_high_peaks(view)[:1], BLACK)
+    return _gain_panel([view], 0, view.bounded.asked, **{"marks": tuple(marks), **more})
+
+
+def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) -> Panel:
+    name, alone = NAMES[i], len(views) == 1
+    curves: list[Curve] = []
+    marks: list[Mark] = []
+    found: dict[str, Any] = {}
+    for view, colour in zip(views, CYCLE * len(views), strict=False):
+        size, bound = view.sizes[i], view.bounds[i]
+        several = len(size) > 1
+        label = view.label or ("the model" if several else view.named(name))
+        curves.append(Curve(view.hz, size[0] if alone else size.max(axis=0), label, colour))
+        if bounds and np.isfinite(bound).any():
+            words = view.bounded.words[i] if alone else ""
+            own = ORANGE if view.bounded.asked and alone else colour
+            curves.append(Curve(view.hz, bound, words, own, "--", width=0.9))
+        if alone and several:
+            low, high = size.min(axis=0), size.max(axis=0)
+            found["bands"] = (Band(view.hz, low, high, "all plants"),)
         if i == 0:
-            levels += [
-                Level(S_max, f"S_max {S_max:g}", colour=GREY),
-                Level(2**-0.5, "-3 dB", colour=GREY),
-            ]
-        panels.append(
-            Panel(
-                "frequency (Hz)",
-                f"σ_max({names[i]}) ({units[i]})",
-                tuple(curves),
-                marks=tuple(marks),
-                levels=tuple(levels),
-                log_x=True,
-                log_y=True,
-                x_range=(float(loops[0].hz[0]), float(loops[0].hz[-1])),
-                y_range=_gain_range(loops, i),
-                legend="best" if i else "lower right",
-            )
-        )
+            marks += _peak_marks(_high_peaks(view), colour)
+    at = [bandwidth_level(view.bandwidth_hz, GREY if alone else colour)
+          for view, colour in zip(views, CYCLE * len(views), strict=False)]  # fmt: skip
+    low, high = (f(np.concatenate([v.sizes[i].ravel() for v in views])) for f in (np.min, np.max))
+    found |= {"marks": tuple(marks), "y_range": (max(low / 1.5, 1e-6 * high), 4.0 * high)}
+    if len(curves) == 1 and not found.get("bands"):
+        found["legend"] = None
+    first, ends = views[0], views[0].ends
+    label = f"{first.named(name)} ({UNITS[name]})"
+    if i == 0:
+        b = first.bounded
+        if alone:
+            top = 3.5 * max(b.S_max, float(high))  # room for the words at its peak
+            found["y_range"] = (0.5 * float(first.sizes[0, 0].min()), top)
+            shape = above(first.hz, first.bounds[0], top) if b.asked else ()
+            found["forbidden"] = (*forbidden(b.S_max, b.S_low, b.low_hz, *ends, top), *shape)
+        return sensitivity_panel(curves, ends, b.S_max, at, label, **{**found, **more})
+    if alone and first.bounded.asked:
+        found["forbidden"] = above(first.hz, first.bounds[i], found["y_range"][1])
+    bare = [Level(level.value, "", True, level.colour) for level in at]
+    return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
+
+
+def figure_gains(views: Sequence[LoopView], *, key: str = "gains", bounds: bool = True) -> str:
+    """S over the full width, KS and T below it; of one design L and GS where these are asked."""
+    S, *others = gain_panels(views, bounds=bounds)
+    more = _open_loop(views[0]) if len(views) == 1 else []
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
-    return figure_lines([panels[:1], panels[1:]], key=key, title=title, heights=(3.3, 2.7))
+    heights = (3.3, *[2.7] * (1 + len(more)))
+    return figure_lines([[S], others, *more], key=key, title=title, heights=heights)
 
 
-def forbidden(inner: InnerProblem | Bounds, low: float, high: float, top: float) -> Areas:
-    """Where |S| may not be, over Hz: above S_max, and above S_low up to ω_low."""
-    ends = (inner.omega_low / HZ, inner.S_low)
+def _open_loop(view: LoopView) -> list[list[Panel]]:
+    """L of one channel on several plants as a Bode plot, and |GS| where it is bounded."""
+    rows: list[list[Panel]] = []
+    at = (Level(view.bandwidth_hz, "", True),)  # as above
+    if view.scalar and len(view.open) > 1:
+        L = view.open[:, :, 0, 0]
+        phase = phase_deg(L.T).T
+        rows.append([
+            _of_plants(view, "|L| (–)", np.abs(L), (Level(1.0, "1", colour=GREY), *at)),
+            _of_plants(view, "phase of L (deg)", phase, (Level(-180.0, "", colour=GREY), *at),
+                       log_y=False, y_step=90.0),
+        ])  # fmt: skip
+    most = view.bounded.compliance_max
+    if most is not None:
+        level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
+        rows.append([_of_plants(view, f"{view.named('GS')} (µm/N)", 1e6 * view.sizes[3], (level,))])
+    return rows
+
+
+def _of_plants(
+    view: LoopView, label: str, values: np.ndarray, levels: tuple[Level, ...], **more: Any
+) -> Panel:
+    """Values of every plant over frequency: the model's in a band of all."""
+    bands = (Band(view.hz, values.min(axis=0), values.max(axis=0), "all plants"),)
+    return over_hz(label, (Curve(view.hz, values[0], "the model"),), view.ends, levels=levels,
+                   bands=bands if len(values) > 1 else (), legend="lower right",
+                   **more)  # fmt: skip
+
+
+def forbidden(
+    S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float
+) -> Areas:
+    """Where |S| may not be, over Hz: above S_max, and above S_low up to `low_hz`."""
     return (
-        (_box(low, high, inner.S_max, top), ORANGE),
-        (_box(low, ends[0], ends[1], min(inner.S_max, top)), ORANGE),
+        (_box(low, high, S_max, top), ORANGE),
+        (_box(low, low_hz, S_low, min(S_max, top)), ORANGE),
     )
 
 
@@ -104,57 +190,36 @@ def above(hz: Array, bound: Array, top: float) -> Areas:
     return ((np.concatenate([x + 1j * y, ends]), ORANGE),)
 
 
-def section_bounds(problem: CoDesignProblem, hz: Array, bandwidth_hz: float) -> Array:
-    """What S, KS (N/m) and T of a fixed structure may not exceed beside S_max and S_low (3, k).
-
-    The shape, and weighted_level/|W|; NaN where nothing is asked.
-    """
-    sections = problem.sections
-    assert sections is not None
-    size = np.abs(problem.weights.responses(HZ * hz))
-    level = np.nan if sections.weighted_level is None else sections.weighted_level
-    shape = np.nan if sections.shape is None else sections.shape
-    below = hz <= bandwidth_hz
-    rising = shape * hz / bandwidth_hz * 2.0**-0.5
-    most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
-    bounded = (below | (sections.shape_ends is ShapeEnd.S_MAX)) & (most <= problem.inner.S_max)
-    return np.array([np.where(bounded, most, np.nan), *(level / size[1:])])
-
-
 def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
     return np.array([complex(x, y) for x, y in (
         (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
 
 
+def _high_peaks(view: LoopView) -> list[tuple[float, float]]:
+    """Those of S worth a word, the highest first."""
+    return sorted((p for p in view.peaks if p[1] > PEAK), key=lambda p: -p[1])
+
+
 def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
     """The highest peak labelled above it, up to three others to their far side of it."""
-    ranked = sorted(tops, key=lambda p: -p[1])[:4]
     marks = []
-    for hz, gain in ranked:
-        text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > ranked[0][0] else -7.0, 2.0)
-        if hz == ranked[0][0]:
+    for hz, gain in tops[:4]:
+        text, offset = f"{number(hz, 4)} Hz", (7.0 if hz > tops[0][0] else -7.0, 2.0)
+        if hz == tops[0][0]:
             text, offset = f"{gain:.3g} at {text}", (0.0, 7.0)
         marks.append(Mark(hz, gain, text, colour=colour, offset=offset))
     return marks
 
 
-def _gain_range(loops: Sequence[Loop], i: int) -> tuple[float, float]:
-    """From the gains, and no more of the bounds above them than a decade."""
-    gains = np.concatenate([loop.gains[i] for loop in loops])
-    low = float(gains.min())
-    return max(low / 1.5, 1e-6 * float(gains.max())), float(gains.max()) * 4.0
+def gains_html(view: LoopView, key: str = "gains") -> str:
+    """The figure of one design with its words and numbers."""
+    return figure_html(figure_gains([view], key=key), caption_gains(view), table_gains(view))
 
 
-def caption_gains(loop: Loop, *, S_max: float) -> str:
+def caption_gains(view: LoopView) -> str:
     """What to see in the gains of one design, in numbers."""
-    share = loop.gains / loop.bounds
-    closest = share.argmax(axis=1)
-    parts = [
-        f"|{name}| comes to {100.0 * share[i, closest[i]]:.1f} % of its bound at "
-        f"{number(float(loop.hz[closest[i]]), 3)} Hz"
-        for i, name in enumerate(("S", "KS", "T"))
-    ]
-    tops = sorted((p for p in loop.peaks if p[1] > 1.05), key=lambda p: -p[1])
+    S_max, plants = view.bounded.S_max, len(view.open)
+    tops = _high_peaks(view)
     words = ""
     if tops:
         hz, gain = tops[0]
@@ -164,20 +229,38 @@ def caption_gains(loop: Loop, *, S_max: float) -> str:
         )
         others = [f"{number(g, 3)} at {number(h, 4)} Hz" for h, g in tops[1:3]]
         words += f"; further local peaks {', '.join(others)}." if others else "."
-    return (
-        f"σ_max(S) first crosses -3 dB at ω_b = {number(loop.bandwidth_hz, 5)} Hz.{words} No gain "
-        f"exceeds its bound γ/|W|, as certified: {', '.join(parts)}."
-    )
+    band = f"The band spans {counted(plants, 'plant')} of the set. " if plants > 1 else ""
+    first = (
+        f"The least ω_b of them is {number(view.bandwidth_hz, 5)} Hz." if plants > 1
+        else f"σ_max(S) first crosses -3 dB at ω_b = {number(view.bandwidth_hz, 5)} Hz."
+    )  # fmt: skip
+    if plants > 1:
+        words = words.replace("peak of S is", "peak of S on the model is")
+    near = [
+        f"|{name}| comes to {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
+        f"{number(float(view.hz[i]), 3)} Hz"
+        for k, (name, share) in enumerate(zip(NAMES, view.shares, strict=True))
+        if np.isfinite(share).any()
+        for i in [int(np.nanargmax(share))]
+    ]
+    closest = f" {'; '.join(near)}." if near else ""
+    return f"{band}{first}{words}{closest} Shaded: beyond a bound."
 
 
-def table_gains(loop: Loop) -> Table:
+def table_gains(view: LoopView) -> Table:
     """Gains and bounds at some frequencies, the marked ones among them."""
-    pairs = zip(loop.gains, loop.bounds, strict=True)
-    head = ("Hz", "|S|", "bound", "|KS| N/m", "bound N/m", "|T|", "bound")
-    columns = [column for pair in pairs for column in pair]
-    return over_frequency(head, loop.hz, *columns, special=marked(loop))
+    if len(view.open) > 1:
+        S, KS, T = view.sizes[:3]
+        head: tuple[str, ...] = ("Hz", f"{view.named('S')} model", f"{view.named('S')} least",
+                                 f"{view.named('S')} largest", f"{view.named('KS')} largest N/m",
+                                 f"{view.named('T')} largest")  # fmt: skip
+        columns = [S[0], S.min(axis=0), *(of.max(axis=0) for of in (S, KS, T))]
+    else:
+        head = ("Hz", "|S|", "bound", "|KS| N/m", "bound N/m", "|T|", "bound")
+        columns = [c for pair in zip(view.gains, view.bounds, strict=True) for c in pair]
+    return over_frequency(head, view.hz, *columns, special=marked(view))
 
 
-def marked(loop: Loop) -> list[float]:
+def marked(view: LoopView) -> list[float]:
     """Frequencies in Hz that a table of the loop does not leave out."""
-    return [loop.bandwidth_hz, *(hz for hz, _ in loop.peaks)]
+    return [view.bandwidth_hz, *(hz for hz, _ in view.peaks)]

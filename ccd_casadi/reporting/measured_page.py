@@ -10,8 +10,8 @@ from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.measured import clearances, controller_response
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.loops import forbidden
+from ccd_casadi.reporting.lines import Curve, Level, figure_lines
+from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.page import (
     Section,
@@ -67,27 +67,19 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
     between = np.full(len(room), np.nan)  # what |S| may reach between two lines, at their middle
     between[room > 0.0] = 1.0 / room[room > 0.0]
     top = 2.5 * max(bounds.S_max, float(size.max()))
-    at = Level(answer["bandwidth_hz"], f"ω_b {number(answer['bandwidth_hz'], 4)} Hz", True)
-    levels = (
-        Level(bounds.S_max, f"S_max {bounds.S_max:g}", colour=GREY),
-        Level(2**-0.5, "-3 dB", colour=GREY),
-        at,
-    )
-
-    def gain(label: str, curves: tuple[Curve, ...], **more: Any) -> Panel:
-        return Panel("frequency (Hz)", label, curves, log_x=True, log_y=True, x_range=ends, **more)
-
+    at = bandwidth_level(answer["bandwidth_hz"])
     locus = np.where(np.abs(L) <= FAR, L, np.nan)
     allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), between, "at most between lines", GREY, width=0.9)
     rows = [
-        [gain("|S| (–)", (allowed, Curve(hz, size, "at the lines")), levels=levels,
-              y_range=(0.5 * float(size.min()), top), legend="lower right",
-              forbidden=forbidden(bounds, *ends, top)),
+        [sensitivity_panel(
+            (allowed, Curve(hz, size, "at the lines")), ends, bounds.S_max, (at,), "|S| (–)",
+            y_range=(0.5 * float(size.min()), top),
+            forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
          nyquist_panel([locus], bounds.S_max, HEIGHT)],
-        [gain("|G| measured (m/N)", (Curve(hz, np.abs(G)),)),
-         gain("|L| (–)", (Curve(hz, np.abs(L)),), levels=(Level(1.0, "1"), at))],
-        [gain("|KS| (N/m)", (Curve(hz, np.abs(K * S)),), levels=(at,)),
-         gain("|T| (–)", (Curve(hz, np.abs(L * S)),), levels=(at,))],
+        [over_hz("|G| measured (m/N)", (Curve(hz, np.abs(G)),), ends),
+         over_hz("|L| (–)", (Curve(hz, np.abs(L)),), ends, levels=(Level(1.0, "1"), at))],
+        [over_hz("|KS| (N/m)", (Curve(hz, np.abs(K * S)),), ends, levels=(at,)),
+         over_hz("|T| (–)", (Curve(hz, np.abs(L * S)),), ends, levels=(at,))],
     ]  # fmt: skip
     svg = figure_lines(rows, key="measured", title="The loop on the measured lines",
                        heights=(HEIGHT, 2.6, 2.6))  # fmt: skip

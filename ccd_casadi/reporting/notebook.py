@@ -5,41 +5,34 @@ from functools import singledispatch
 from itertools import count
 from typing import Any
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.modal_fit import ModalFit
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.facts import conclusion, theta_table
-from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
+from ccd_casadi.reporting.loops import gains_html, view_of
 from ccd_casadi.reporting.page import (
     CSS,
     Table,
     escape,
     facts_html,
-    figure_html,
     header,
     number,
     paragraph,
     table_html,
 )
-from ccd_casadi.reporting.sections_loops import gains_html, loops_of
 from ccd_casadi.reporting.sections_page import controller_html, sections_conclusion
-from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.reporting.verdict import run_header
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, shown_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.loop_responses import loop_data
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
-from ccd_casadi.synthesis.weights import Weights
 
 _OWN = """
 --ink: #1a1a1a; --soft: #5a5a5a; --line: #dcdcdc; background: #fff; color: var(--ink);
@@ -65,24 +58,18 @@ def _cell(*parts: str) -> str:
 def _(item: Solution) -> str:
     result, own = item.result, item.verified
     parts = [_result_head(result)]
-    if isinstance(own, VerifiedSections):
-        loops = loops_of(own.problem, own.theta, own.design)
-        parts += [_theta(own.problem, result), controller_html(result)]
-        parts += [gains_html(own.problem, own, loops, key=f"notebook-{next(_figures)}")]
-    elif isinstance(own, VerifiedDesign):
-        made, plant = own.design, scaled_plant(own.problem, own.theta)
-        loop = _loop(own.problem, plant, made.controller, made.weights, made.figures)
-        parts += [_theta(own.problem, result), loop]
+    if own is not None:
+        parts = _design_parts(own.problem, result, view_of(own))
     return _cell(*parts)
 
 
 @html_of.register
 def _(item: FinishedRun) -> str:
-    parts = [_result_head(item.result), _theta(item.problem, item.result)]
-    if item.problem.sections is not None:
-        parts.append(controller_html(item.result))
-    else:
-        parts.append(_loop(item.problem, item.plant, item.controller, item.weights, item.figures))
+    view = design_view(
+        item.problem, item.theta, item.controller, weights=item.weights, gamma=item.figures.gamma,
+        bandwidth_hz=float(item.result["bandwidth_hz"]),
+    )  # fmt: skip
+    parts = _design_parts(item.problem, item.result, view)
     return _cell(*parts)
 
 
@@ -174,24 +161,13 @@ def _result_head(result: Mapping[str, Any]) -> str:
     return run_header("Co-design", result, "", said(dict(result)))
 
 
-def _theta(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
-    return table_html(theta_table(problem, result))
-
-
-def _loop(
-    problem: CoDesignProblem,
-    plant: ScaledPlant,
-    controller: StateSpace,
-    weights: Weights,
-    figures: DesignFigures,
-) -> str:
-    S_max = problem.inner.S_max
-    loop = loop_data(
-        plant, controller, weights, gamma=figures.gamma, bandwidth_hz=figures.bandwidth / HZ,
-        omega_low=problem.inner.omega_low,
-    )  # fmt: skip
-    drawn = figure_gains([loop], S_max=S_max, key=f"notebook-{next(_figures)}")
-    return figure_html(drawn, caption_gains(loop, S_max=S_max), table_gains(loop))
+def _design_parts(
+    problem: CoDesignProblem, result: Mapping[str, Any], view: LoopView
+) -> list[str]:
+    parts = [_result_head(result), table_html(theta_table(problem, result))]
+    if "sections" in result.get("controller", {}):
+        parts.append(controller_html(result))
+    return [*parts, gains_html(view, f"notebook-{next(_figures)}")]
 
 
 def _design(title: str, figures: DesignFigures, words: str = "") -> str:

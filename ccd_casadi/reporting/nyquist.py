@@ -5,16 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.reporting.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
 from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
-from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
 
 SHOWN = (-3.2, 1.6)  # of the real axis
-LIGHT = 0.3  # damping ratio below which a pole is a resonance
-FLANKS = np.tan(np.radians(np.linspace(-86.0, 86.0, 27)))  # in multiples of its width
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
 
 
@@ -46,14 +40,3 @@ def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
             values[i] = values[i][linear_sum_assignment(away)[1]]
     return np.where(np.abs(values) <= far, values, np.nan)
 
-
-def around_resonances(plant: ScaledPlant, controller: StateSpace | None) -> Array:
-    """Frequencies in Hz around the light poles of plant and controller (SI).
-
-    In even steps of the phase, so that the circle of a resonance in the Nyquist plot is round.
-    """
-    poles = np.linalg.eigvals(plant.A) * plant.omega_0
-    if controller is not None:
-        poles = np.concatenate([poles, np.linalg.eigvals(controller.A)])
-    light = poles[(poles.imag > 0.0) & (np.abs(poles.real) < LIGHT * np.abs(poles))] / HZ
-    return np.asarray((light.imag[:, None] + np.abs(light.real)[:, None] * FLANKS).ravel())

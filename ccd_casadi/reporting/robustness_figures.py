@@ -5,6 +5,7 @@ import numpy as np
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.loops import over_hz
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
@@ -12,7 +13,7 @@ from ccd_casadi.robust.perturbed import Line
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, shown_unit
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
@@ -27,7 +28,7 @@ def gains(found: Study) -> str:
             Curve(found.hz, (1e6 if i == 2 else 1.0) * found.gains[i], name, CYCLE[k])
             for k, (i, name) in enumerate(curves)
         )
-        return Panel("frequency (Hz)", label, drawn, log_x=True, log_y=True, x_range=ends)
+        return over_hz(label, drawn, ends)
 
     rows = [
         [panel("σ_max (–)", (0, "S"), (1, "T"))],
@@ -159,7 +160,7 @@ def move(found: Move, key: str) -> str:
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
     t = 1e3 * found.time[pick]
     end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)
-    unit, scale = _unit(found.peak_error)
+    unit, scale = shown_unit("m", found.peak_error)
     window = (
         Level(scale * found.window, "window", colour=GREY),
         Level(-scale * found.window, "", colour=GREY),
@@ -183,7 +184,7 @@ def move(found: Move, key: str) -> str:
 def move_table(found: Move) -> Table:
     """Some instants."""
     n = int(np.count_nonzero(found.time <= 2.0 * found.duration))
-    unit, scale = _unit(found.peak_error)
+    unit, scale = shown_unit("m", found.peak_error)
     head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *_names(found.force))
     columns = (1e3 * found.time, 1e3 * found.position, found.acceleration, scale * found.error)
     return over_time(head, *(column[:n] for column in (*columns, *found.force.T)))
@@ -191,13 +192,6 @@ def move_table(found: Move) -> Table:
 
 def _names(force: Array) -> list[str]:
     return [f"u{j + 1} N" for j in range(force.shape[1])]
-
-
-def _unit(size: float) -> tuple[str, float]:
-    for unit, scale in (("mm", 1e3), ("µm", 1e6)):
-        if size * scale >= 1.0:
-            return unit, scale
-    return "nm", 1e9
 
 
 def _columns(line: Line) -> tuple[Array, Array, Array]:

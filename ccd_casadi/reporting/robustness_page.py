@@ -24,7 +24,7 @@ from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ, metres
+from ccd_casadi.support.units import HZ, metres, shown
 from surrogates.files import write_whole
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
@@ -132,7 +132,7 @@ def _moved(found: Study, i: int) -> str:
     way = "with mass feedforward" if move.feedforward else "without feedforward"
     way += f", {'its rigid bodies free' if found.moves[0].free else 'on its soft suspension'}"
     settled = (
-        f"settles {_time(move.settling)} after its end"
+        f"settles {shown(move.settling, 's')} after its end"
         if np.isfinite(move.settling)
         else "does not settle while it is watched"
     )
@@ -156,11 +156,7 @@ def _cut(move: Move) -> str:
     if move.duration + move.settling <= until or not later.size:
         return ""
     most = metres(float(later.max()))
-    return f" The figure ends before, at {_time(until)}: after that the error is up to {most}."
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.3g} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
+    return f" The figure ends before, at {shown(until, 's')}: after that the error is up to {most}."
 
 
 def _share(value: float, reach: float) -> str:

@@ -7,33 +7,25 @@ from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
-from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import (
     Fact,
     binding,
     cost_words,
     loop_facts,
-    theta_table,
     theta_words,
 )
-from ccd_casadi.reporting.glance import glance_of_sections
 from ccd_casadi.reporting.page import (
-    Section,
     Table,
-    escape,
-    facts_html,
     number,
     paragraph,
     table_html,
 )
-from ccd_casadi.reporting.sections_loops import force_step_html, gains_html, loops_of
-from ccd_casadi.reporting.sections_move import move_html, move_panels
 from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 if TYPE_CHECKING:
-    from ccd_casadi.codesign.solution import Solution
+    pass
 
 
 def sections_conclusion(result: dict[str, Any]) -> str:
@@ -55,30 +47,7 @@ def _plants(result: dict[str, Any]) -> str:
     return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
-def sections_sections(problem: CoDesignProblem, solution: "Solution") -> list[Section]:
-    """What the page shows between its head and its provenance."""
-    verified = solution.verified
-    assert isinstance(verified, VerifiedSections)
-    assert verified.design.controller is not None
-    loops = loops_of(verified.problem, verified.theta, verified.design)
-    moves = move_panels(verified) if len(loops.L) else None  # of one channel
-    found = [
-        Section("At a glance", glance_of_sections(problem, verified, loops, moves)),
-        _design(problem, solution.result),
-        Section("The controller", controller_html(solution.result)),
-        Section("Full order beside it", _beside(problem, solution.result)),
-        Section(
-            "Closed loop on every plant",
-            _bandwidths(verified) + gains_html(problem, verified, loops),
-        ),
-    ]
-    if moves is not None:
-        found.append(Section("A move", move_html(*moves)))
-        found.append(Section("A step of force", force_step_html(verified)))
-    return [*found, *budget_section(verified.problem, verified.theta, verified.design.controller)]
-
-
-def _bandwidths(verified: "VerifiedSections") -> str:
+def bandwidths_html(verified: "VerifiedSections") -> str:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
@@ -97,17 +66,6 @@ def _bandwidths(verified: "VerifiedSections") -> str:
     head = ("-3 dB of S with this controller, on", "loop", "Hz")
     table = Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
     return table_html(table)
-
-
-def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
-    items = "".join(f"<li>{escape(words)}</li>" for words in binding_words(problem, result))
-    body = (
-        table_html(theta_table(problem, result))
-        + facts_html(_facts(problem, result))
-        + (f"\n<h3>What binds</h3>\n<ul>{items}</ul>" if items else "")
-        + "".join(paragraph(f"Note: {words}.") for words in result.get("notes", ()))
-    )
-    return Section("The design", body)
 
 
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
@@ -133,7 +91,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     return [*over_theta, *over_kappa, *ends]
 
 
-def _beside(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+def beside_html(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     """What the structure, robustness, hold and delay cost, by mixed sensitivity at the same θ."""
     found, sections = result["full_order"], sections_of_problem(problem)
     model, on_set, sampled = found["on_model"], found["on_set"], sections.sampling is not None
@@ -189,7 +147,7 @@ def _judged_words(full: Mapping[str, Any]) -> str:
     return f"{words}; largest figures over the sections' bounds where it is stable: {worst}."
 
 
-def _facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
+def sections_facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     certificate, robust, inner = r["certificate"], r["robust"], problem.inner
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
     sampling = sections_of_problem(problem).sampling

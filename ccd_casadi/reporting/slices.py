@@ -10,9 +10,8 @@ from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
 from ccd_casadi.reporting.true_samples import Truths, feasible
-from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, shown_unit
 from surrogates import GaussianProcess
 
 SLICE = 61

@@ -2,17 +2,20 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.surrogate_quality import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
+from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
 from ccd_casadi.reporting.budget_section import budget_section
@@ -33,9 +36,10 @@ from ccd_casadi.reporting.landscape import (
     tables_landscape,
 )
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
-from ccd_casadi.reporting.loops import caption_gains, figure_gains, table_gains
+from ccd_casadi.reporting.loops import gains_html, view_of
 from ccd_casadi.reporting.maps import ThetaPath, figure_landscape, figure_sweep
 from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
+from ccd_casadi.reporting.moves import MovePanels, force_step_html, move_html, move_panels
 from ccd_casadi.reporting.page import (
     Section,
     Table,
@@ -47,7 +51,14 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
-from ccd_casadi.reporting.sections_page import sections_conclusion, sections_sections
+from ccd_casadi.reporting.sections_page import (
+    bandwidths_html,
+    beside_html,
+    binding_words,
+    controller_html,
+    sections_conclusion,
+    sections_facts,
+)
 from ccd_casadi.reporting.slices import (
     caption_slices,
     figure_slices,
@@ -59,13 +70,17 @@ from ccd_casadi.reporting.true_samples import Truths, read_truths
 from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, table_trust
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.units import HZ
 from ccd_casadi.support.worker_process import Ahead, WorkerLost
-from ccd_casadi.synthesis.loop_responses import loop_data
 from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.solution import Solution
 
+ORDER = (
+    "glance", "design", "controller", "beside", "start", "theta", "stage", "loop", "move", "force",
+    "budget", "history", "trust", "sweep",
+)  # fmt: skip
 ELSEWHERE = ("theta", "trust")  # neither asks the plant: a process of its own solves none anew
 
 
@@ -143,36 +158,58 @@ def _parts(
     folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution"
 ) -> dict[str, Callable[[], list[Section]]]:
     """What draws the sections, in their order."""
-    verified = solution.verified
-    if isinstance(verified, VerifiedSections):
-        return {"sections": lambda: sections_sections(problem, solution)}
-    if not isinstance(verified, VerifiedDesign):
+    verified, result = solution.verified, solution.result
+    if verified is None:
         return {}
-    truths = read_truths(folder / "samples.sqlite", problem)
-    stages = {"start": problem.start, "optimum": verified.theta}
-    return {
-        "glance": lambda: [glance(problem, verified, float(solution.result["bandwidth_hz"]))],
-        "design": lambda: [_design(problem, solution)],
-        "start": lambda: start_section(problem, verified),
-        "theta": lambda: [_theta(problem, solution, verified, truths)],
-        "stage": lambda: stage_sections(problem, stages),
-        "loop": lambda: _loop(problem, solution, verified),
-        "budget": lambda: budget_section(problem, verified.theta, verified.design.controller),
-        "history": lambda: [_history(case, problem, solution, verified)],
-        "trust": lambda: _trust(solution),
-        "sweep": lambda: [_sweep(problem, solution, verified, truths)],
+    theta, K, own = verified.theta, verified.controller, verified.problem
+    hz = verified.bandwidth / HZ
+    view = cache(partial(view_of, verified))
+
+    @cache
+    def move() -> MovePanels:
+        return move_panels(own, theta, K, design_loops(own, theta, K), hz)
+
+    parts = {
+        "glance": lambda: [glance(own, theta, view(), move())],
+        "design": lambda: [_design(problem, result)],
+        "move": lambda: [Section("A move", move_html(move()))],
+        "force": lambda: [
+            Section("A step of force", force_step_html(design_loops(own, theta, K), hz))
+        ],
+        "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
+        "budget": lambda: budget_section(own, theta, K),
     }
+    if isinstance(verified, VerifiedSections):
+        parts |= {
+            "controller": lambda: [Section("The controller", controller_html(result))],
+            "beside": lambda: [Section("Full order beside it", beside_html(problem, result))],
+            "loop": lambda: [Section(
+                "Closed loop on every plant", bandwidths_html(verified) + gains_html(view())
+            )],
+        }
+    elif isinstance(verified, VerifiedDesign):
+        truths = read_truths(folder / "samples.sqlite", problem)
+        parts |= {
+            "start": lambda: start_section(problem, verified),
+            "theta": lambda: [_theta(problem, solution, verified, truths)],
+            "loop": lambda: _loop(verified, view()),
+            "history": lambda: [_history(case, problem, solution, verified)],
+            "trust": lambda: _trust(solution),
+            "sweep": lambda: [_sweep(problem, solution, verified, truths)],
+        }
+    return {name: parts[name] for name in ORDER if name in parts}
 
 
-def _design(problem: CoDesignProblem, solution: "Solution") -> Section:
-    binds = binding(problem, solution.result)
+def _design(problem: CoDesignProblem, result: dict[str, Any]) -> Section:
+    words, facts = (binding_words, sections_facts) if "proof" in result else (binding, design_facts)
+    binds = words(problem, result)
     items = "".join(f"<li>{escape(words)}</li>" for words in binds)
     what = f"<ul>{items}</ul>" if binds else paragraph("Nothing binds: an interior optimum.")
     body = (
-        table_html(theta_table(problem, solution.result))
-        + facts_html(design_facts(problem, solution.result))
+        table_html(theta_table(problem, result))
+        + facts_html(facts(problem, result))
         + f"\n<h3>What binds</h3>\n{what}"
-        + "".join(paragraph(f"Note: {words}.") for words in solution.result.get("notes", ()))
+        + "".join(paragraph(f"Note: {words}.") for words in result.get("notes", ()))
     )
     return Section("The design", body)
 
@@ -219,27 +256,12 @@ def stage_sections(
     return found
 
 
-def _loop(
-    problem: CoDesignProblem, solution: "Solution", verified: "VerifiedDesign"
-) -> list[Section]:
-    figures = verified.design.figures
-    loop = loop_data(
-        scaled_plant(problem, verified.theta),
-        verified.design.controller,
-        verified.design.weights,
-        gamma=figures.gamma,
-        bandwidth_hz=float(solution.result["bandwidth_hz"]),
-        omega_low=problem.inner.omega_low,
-    )
-    S_max = problem.inner.S_max
-    gains = figure_html(
-        figure_gains([loop], S_max=S_max), caption_gains(loop, S_max=S_max), table_gains(loop)
-    )
+def _loop(verified: VerifiedDesign, loop: LoopView) -> list[Section]:
     limits = "\n".join(paragraph(words) for words in limit_sentences(loop))
-    channels = split(scaled_plant(problem, verified.theta), verified.design.controller)
+    channels = split(scaled_plant(verified.problem, verified.theta), verified.controller)
     bode = figure_html(figure_bode(loop, channels), caption_bode(loop, channels), table_bode(loop))
     return [
-        Section("Closed loop: S, KS and T against their bounds", gains),
+        Section("Closed loop: S, KS and T against their bounds", gains_html(loop)),
         Section("What limits the bandwidth", limits + table_html(table_limits(loop))),
         Section("Plant and controller", bode),
     ]

@@ -5,20 +5,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     plant_of,
     scaled_plant,
     true_inner,
 )
-from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.page import Section, Table, figure_html, number, paragraph, table_html
 from ccd_casadi.reporting.svg import BLUE, GREY, ORANGE
-from ccd_casadi.reporting.units import shown_unit
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import Loop, loop_data
+from ccd_casadi.support.units import HZ, shown_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class _Side:
     colour: str
     theta: tuple[float, ...]
     cost: float
-    loop: Loop
+    loop: LoopView
     poles: np.ndarray
 
     def objective(self, problem: CoDesignProblem) -> float:
@@ -83,33 +84,24 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
 def _side(
     problem: CoDesignProblem, name: str, colour: str, theta: tuple[float, ...], design: Design
 ) -> _Side:
-    plant, f = scaled_plant(problem, theta), design.figures
-    loop = loop_data(
-        plant, design.controller, problem.weights.at(f.omega_S, f.omega_T), gamma=f.gamma,
-        bandwidth_hz=f.bandwidth / HZ, omega_low=problem.inner.omega_low, label=name,
+    f = design.figures
+    loop = design_view(
+        problem, theta, design.controller, weights=problem.weights.at(f.omega_S, f.omega_T),
+        gamma=f.gamma, bandwidth_hz=f.bandwidth / HZ, label=name,
     )  # fmt: skip
-    poles = np.linalg.eigvals(closed_loop(plant.plant_si(), design.controller).A)
-    return _Side(name, colour, theta, hardware_cost(plant_of(problem), theta), loop, poles)
+    cost = hardware_cost(plant_of(problem), theta)
+    return _Side(name, colour, theta, cost, loop, loop.loop.poles)
 
 
 def _gains(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Panel:
     curves = tuple(Curve(s.loop.hz, s.loop.gains[0], s.name, s.colour) for s in sides)
-    levels = [Level(s.loop.bandwidth_hz, f"ω_b {number(s.loop.bandwidth_hz, 4)} Hz", True, s.colour)
-              for s in sides]  # fmt: skip
-    S_max = problem.inner.S_max
-    levels += [Level(S_max, f"S_max {S_max:g}", colour=GREY), Level(2**-0.5, "-3 dB", colour=GREY)]
-    return Panel(
-        "frequency (Hz)", "σ_max(S) (–)", curves, levels=tuple(levels), log_x=True, log_y=True,
-        x_range=(float(sides[0].loop.hz[0]), float(sides[0].loop.hz[-1])), legend="lower right",
-    )  # fmt: skip
+    at = [bandwidth_level(s.loop.bandwidth_hz, s.colour) for s in sides]
+    return sensitivity_panel(curves, sides[0].loop.ends, problem.inner.S_max, at)
 
 
 def _plants(sides: tuple[_Side, ...]) -> Panel:
-    curves = tuple(
-        Curve(s.loop.hz, np.linalg.norm(s.loop.plant, 2, axis=(1, 2)), s.name, s.colour)
-        for s in sides
-    )
-    return Panel("frequency (Hz)", "σ_max(G) (m/N)", curves, log_x=True, log_y=True)
+    curves = [Curve(s.loop.hz, largest(s.loop.plant), s.name, s.colour) for s in sides]
+    return over_hz("σ_max(G) (m/N)", curves, sides[0].loop.ends)
 
 
 def _pole_map(sides: tuple[_Side, ...]) -> Panel:

@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.later_lines import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.inner_problem.design_loops import bounds_of_loop
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
@@ -31,9 +33,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import responses
-from ccd_casadi.synthesis.loop_responses import loop_data
 from ccd_casadi.synthesis.statics import Statics, statics
+
+NYQUIST = 0.999  # of half the sampling rate: where a grid ends
 
 
 @dataclass(frozen=True)
@@ -107,53 +109,24 @@ def tried(
     workers: Pool | None = None,
 ) -> Study:
     """Everything but the structured singular value; `workers` share what they can."""
-    demands = demands or Demands()
-    bandwidth_hz = run.figures.bandwidth / HZ
-    if run.sampled is not None:
-        return _sampled(run, demands, seed, quiet, workers)
-    loop = loop_data(
-        run.plant, run.controller, run.weights, gamma=run.figures.gamma,
-        bandwidth_hz=bandwidth_hz, omega_low=run.problem.inner.omega_low,
-    )  # fmt: skip
-    system, d = system_of(run), demands
-    profile = setpoint(d.limits)
-    closed = loop_of(run).closed
-    return Study(
-        demands=d,
-        hz=loop.hz,
-        gains=gains(loop.plant, loop.controller),
-        peaks=norms(closed),
-        margins=margins(lambda omega: responses(run.plant, run.controller, omega)[:2], loop.hz),
-        noise=noise(closed, d.sensor, d.disturbance),
-        statics=_statics(run),
-        shift=shift_line(run, system, d.shift, quiet=quiet),
-        damping=damping_line(run, system, *d.damping, quiet=quiet),
-        modes=single_modes(run, system, d.shift),
-        box=worst_in_box(run, system, d.shift, d.damping, quiet),
-        tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
-        structured=None,
-        setpoint=profile,
-        moves=_moves(run, profile, d),
-    )
+    d = demands or Demands()
+    system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
+    sampled = loop.sampling is not None
+    bounded = bounds_of_loop(run.problem, run.weights, run.figures.gamma, np.nan)
+    hz = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ).hz
+    if loop.sampling is not None:
+        hz = np.append(hz, NYQUIST * 0.5 / loop.sampling.period)
 
+    def sizes(omega: Array) -> Array:
+        return gains(*loop.responses(omega))
 
-def _sampled(run: FinishedRun, d: Demands, seed: int, quiet: bool, workers: Pool | None) -> Study:
-    """The part of the study that a controller in discrete time has, hold and delay exact."""
-    assert run.sampled is not None
-    system = system_of(run)
-    nyquist = 0.5 / run.sampled.period
-    around = run.plant.grid * run.plant.omega_0 / HZ
-    hz = np.unique(np.concatenate([np.geomspace(1e-4 * nyquist, nyquist, 1500), around]))
-    hz = hz[(hz >= min(0.1, 1e-4 * nyquist)) & (hz < nyquist)]
-    respond = loop_of(run).responses
-    profile = setpoint(d.limits)
     return Study(
         demands=d,
         hz=hz,
-        gains=gains(*respond(HZ * hz)),
-        peaks=highest(lambda omega: gains(*respond(omega)), HZ * hz),
-        margins=margins(respond, hz),
-        noise=None,
+        gains=sizes(HZ * hz),
+        peaks=highest(sizes, HZ * hz) if sampled else norms(loop.closed),
+        margins=margins(loop.responses, hz),
+        noise=None if sampled else noise(loop.closed, d.sensor, d.disturbance),
         statics=_statics(run),
         shift=shift_line(run, system, d.shift, quiet=quiet),
         damping=damping_line(run, system, *d.damping, quiet=quiet),

@@ -3,8 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, synthesised_loop, table_gains
@@ -20,11 +22,9 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
-from ccd_casadi.reporting.sections_loops import compared_html
 from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.methods import (
@@ -38,8 +38,7 @@ from ccd_casadi.studies.methods import (
     theta_paths,
 )
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.loop_responses import Loop
+from ccd_casadi.support.units import HZ, shown_unit
 from surrogates.files import write_whole
 
 
@@ -225,32 +224,27 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
 
 def _loops(comparison: Comparison, best: str) -> str:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
-    if comparison.problem.sections is not None:
-        shown = [(name, comparison.method(name)) for name in ("sequential", best)]
-        return compared_html(
-            comparison.problem,
-            {
-                LABELS[name]: (tuple(method.figures["theta"].values()), method.sections)
-                for name, method in shown
-                if method.sections is not None
-            },
-        )
     loops = [
         _loop(comparison.problem, comparison.method(name))
         for name in ("sequential", best)
         if comparison.method(name).figures.get("objective") is not None
     ]
     words = "; ".join(
-        f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.gains[0].max():.3f}"
+        f"{loop.label}: ω_b = {loop.bandwidth_hz:.2f} Hz, ‖S‖∞ = {loop.sizes[0].max():.3f}"
         for loop in loops
     )
     caption = f"Largest singular values of the closed loop. {words}."
-    svg = figure_gains(loops, S_max=comparison.problem.inner.S_max, bounds=False)
+    svg = figure_gains(loops, bounds=False)
     return figure_html(svg, caption, *(table_gains(loop) for loop in loops))
 
 
-def _loop(problem: CoDesignProblem, method: Method) -> Loop:
+def _loop(problem: CoDesignProblem, method: Method) -> LoopView:
     figures = method.figures
     theta = tuple(figures["theta"][name] for name in problem.names)
+    if method.sections is not None:
+        made = method.sections
+        assert made.controller is not None
+        return design_view(problem, theta, made.controller, bandwidth_hz=made.bandwidth / HZ,
+                           label=LABELS[method.name])  # fmt: skip
     omega = HZ * figures["omega_S_hz"], HZ * figures["omega_T_hz"]
     return synthesised_loop(problem, theta, *omega, LABELS[method.name])

@@ -17,6 +17,7 @@ from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -262,7 +263,7 @@ def _figures(
         "status": "verified" if feasible else "not_verified",
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": cost,
-        "objective": problem.w1 * cost + problem.w2 * bandwidth,
+        "objective": objective(problem, theta, bandwidth),
         "active": active,
         "first_resonance_hz": _resonance(problem, theta),
         "surrogate_bandwidth_hz": None,
@@ -280,10 +281,11 @@ def _resonance(problem: CoDesignProblem, theta: tuple[float, ...]) -> float:
 def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
     """compare.json."""
     model = comparison.problem.source.model or ""
+    entries = {method.name: method.figures for method in comparison.methods}
     return clean(
         {
             "case": str(comparison.case.path),
-            "methods": {method.name: method.figures for method in comparison.methods},
+            "methods": entries,
             "traces": {
                 method.name: [asdict(entry) for entry in method.trace]
                 for method in comparison.methods
@@ -302,13 +304,9 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
                 for descent in comparison.descents
             ],
             "published": {} if comparison.problem.sections else PUBLISHED.get(model, {}),
-            "conclusions": conclusions(comparison.problem, _entries(comparison)),
+            "conclusions": conclusions(comparison.problem, entries),
             "seconds": comparison.seconds,
             "seed": seed,
             "versions": versions(),
         }
     )
-
-
-def _entries(comparison: Comparison) -> dict[str, dict[str, Any]]:
-    return {method.name: method.figures for method in comparison.methods}

@@ -6,7 +6,6 @@ import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 
-OURS = ("nested", "lifted", "direct")
 EQUAL = 1e-6  # relative difference of J that counts as none
 
 

@@ -10,10 +10,9 @@ from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import CYCLE, axis_label
-from ccd_casadi.reporting.units import shown_unit
 from ccd_casadi.studies.comparison import Method
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, shown_unit
 
 LABELS = {
     "nested": "nested",

@@ -24,14 +24,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.inner_problem.objective import hardware_at, objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sweep import evaluate
-from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
@@ -119,7 +118,6 @@ def steepest_descent(
     """Descend from `start`; steps are shares of the box of θ. Sections have a total gradient."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     width = upper - lower
-    slope = _cost_gradient(problem)
     spent = 0
 
     ask = _swept(problem, gradient) if problem.sections is None else _structured(problem)
@@ -137,7 +135,7 @@ def steepest_descent(
     step, history = first_step, []
     stop = Stop.ITERATIONS
     for _ in range(max_iterations):
-        g = (problem.w1 * slope(theta) + problem.w2 * answer.slope) * width
+        g = hardware_at(problem, theta).cost_gradient + problem.w2 * answer.slope * width
         history.append(_iterate(problem, theta, answer, g, step, spent))
         if not np.isfinite(g).all():
             stop = Stop.NO_GRADIENT
@@ -152,10 +150,7 @@ def steepest_descent(
         while step >= smallest_step:
             trial = np.clip(theta + step * direction / size * width, lower, upper)
             found = asked(trial, answer.frequencies)
-            if (
-                found is not None
-                and _objective(problem, trial, found.value) < history[-1].objective
-            ):
+            if found is not None and objective(problem, trial, found.value) < history[-1].objective:
                 accepted = trial, found
                 break
             step *= 0.5
@@ -226,18 +221,6 @@ def _sweep(
     return evaluate(plant, problem.weights, inner, (best.omega_S, best.omega_T)), len(rows)
 
 
-def _cost_gradient(problem: CoDesignProblem) -> Callable[[Array], Array]:
-    """∂f/∂θ from the CasADi expression."""
-    symbol = ca.MX.sym("theta", len(problem.names))
-    f, _ = plant_of(problem).hardware(symbol)
-    function = ca.Function("slope", [symbol], [ca.jacobian(f, symbol)])
-    return lambda theta: np.array(function(theta)).ravel()
-
-
-def _objective(problem: CoDesignProblem, theta: Array, value: float) -> float:
-    return problem.w1 * hardware_cost(plant_of(problem), theta) + problem.w2 * value
-
-
 def _iterate(
     problem: CoDesignProblem,
     theta: Array,
@@ -251,7 +234,7 @@ def _iterate(
         omega_S=answer.frequencies[0],
         omega_T=answer.frequencies[1],
         bandwidth=answer.bandwidth,
-        objective=_objective(problem, theta, answer.value),
+        objective=objective(problem, theta, answer.value),
         gradient=tuple(float(v) for v in gradient),
         step=step,
         syntheses=spent,

@@ -5,18 +5,40 @@ import math
 HZ = 2.0 * math.pi  # rad/s in one hertz
 
 
-def metres(value: float, digits: int = 3) -> str:
-    """A length in m in the unit that an engineer would read it in.
+def shown_unit(unit: str, largest: float) -> tuple[str, float]:
+    """The unit to show values up to this size in, and the factor to it: the one rule for the eye.
 
-    >>> metres(4.1e-5), metres(0.01), metres(-2.5e-10), metres(0.0)
-    ('41 um', '10 mm', '-0.25 nm', '0 m')
+    Lengths and times get the SI prefix with which the largest is 1 or more; what has another unit
+    keeps it.
+
+    >>> shown_unit("m", 4e-3), shown_unit("s", 2e-5), shown_unit("kg", 4e-3)
+    (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
     """
-    if value == 0.0:
-        return "0 m"
-    for factor, unit in ((1.0, "m"), (1e3, "mm"), (1e6, "um")):
-        if abs(value) * factor >= 1.0:
-            return f"{factor * value:.{digits}g} {unit}"
-    return f"{1e9 * value:.{digits}g} nm"
+    if unit not in ("m", "s") or largest == 0.0:
+        return unit, 1.0
+    for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):
+        if abs(largest) * factor >= 1.0:
+            return prefix + unit, factor
+    return f"n{unit}", 1e9
+
+
+def shown(value: float, unit: str, digits: int = 3) -> str:
+    """A value in the unit that an engineer would read it in.
+
+    >>> shown(4.1e-5, "m"), shown(0.01, "m"), shown(0.18, "s"), shown(0.0, "m")
+    ('41 µm', '10 mm', '180 ms', '0 m')
+    """
+    read, factor = shown_unit(unit, value)
+    return f"{factor * value:.{digits}g} {read}"
+
+
+def metres(value: float, digits: int = 3) -> str:
+    """A length for the terminal, in ASCII.
+
+    >>> metres(4.1e-5), metres(-2.5e-10)
+    ('41 um', '-0.25 nm')
+    """
+    return shown(value, "m", digits).replace("µ", "u")
 
 
 def counted(number: int, noun: str) -> str:

@@ -66,7 +66,7 @@ class RibStage:
         """Where displacements are read."""
         return shape.corners(self.geometry) if self.sensors is None else self.sensors
 
-    def mechanics(self, theta: Sequence[float], *, derivatives: bool = True) -> Mechanics:
+    def mechanics(self, theta: Sequence[float], derivatives: bool = True) -> Mechanics:
         """M = I, D = 0, K = diag(ω²), B and C of 3 rigid and the flexible modes, and ∂/∂θ.
 
         Rows: z, tip, tilt, then flexible modes; M (n, n), B (n, m) in 1/√kg, C (p, n), SI.

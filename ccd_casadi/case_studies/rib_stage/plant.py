@@ -14,8 +14,9 @@ from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.plants.eigenpairs import StageError
+from ccd_casadi.plants.ordered import Ordered
 from ccd_casadi.plants.pictures import Drawing
-from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.process_pool import Pool
 
@@ -72,14 +73,12 @@ def rib_stage(
 
 def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     """Any RibStage as the plant that the design loop asks for."""
-    place = [list(names).index(name) for name in NAMES]  # of the stage's θ in the case's
-    back = [NAMES.index(name) for name in names]
 
-    def evaluator(variant: RibStage, derivatives: bool = True) -> "StageEvaluator":
-        return StageEvaluator(variant, tuple(place), tuple(back), derivatives)
+    def evaluator(variant: RibStage, derivatives: bool = False) -> Ordered:
+        return Ordered(variant.mechanics, NAMES, names, derivatives)
 
-    theta = ca.SX.sym("theta", len(NAMES))
-    mass, constraints = stage.hardware([theta[i] for i in place])
+    evaluate, theta = evaluator(stage, True), ca.SX.sym("theta", len(NAMES))
+    mass, constraints = stage.hardware([theta[i] for i in evaluate.place])
     count = {"rigid": 3, "modal4": 4}.get(stage.outputs)
     references = {}
     if stage.modes != TWENTY:
@@ -89,56 +88,35 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     return Plant(
         names=tuple(names),
         constraint_names=tuple(constraints),
-        evaluate=evaluator(stage),
+        evaluate=evaluate,
         hardware=ca.Function("hardware", [theta], [mass, ca.vertcat(*constraints.values())]),
         outputs=count or len(stage.sensor_points),
         inputs=count or len(stage.actuator_points),
-        references={name: evaluator(variant, False) for name, variant in references.items()},
-        values=evaluator(stage, False),
-        nearby=partial(_nearby, evaluator(stage, False)) if nearby.applies(stage) else None,
-        shapes=lambda theta, count: mode_shapes(stage, [theta[i] for i in place], count),
-        drawing=partial(_drawing, stage, place),
+        references={name: evaluator(variant) for name, variant in references.items()},
+        values=evaluator(stage),
+        nearby=partial(_nearby, stage, evaluate) if nearby.applies(stage) else None,
+        shapes=lambda theta, count: mode_shapes(stage, evaluate.own(theta), count),
+        drawing=partial(_drawing, stage, evaluate),
     )
 
 
 def _drawing(
-    stage: RibStage, place: Sequence[int], thetas: Mapping[str, Sequence[float]]
+    stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]
 ) -> Drawing:
     from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
 
-    stages = {name: [theta[i] for i in place] for name, theta in thetas.items()}
-    return drawing(stage.geometry, stages)
+    return drawing(stage.geometry, {name: order.own(theta) for name, theta in thetas.items()})
 
 
-class StageEvaluator:
-    """θ in the case's order -> Mechanics, derivatives (if they are wanted) in that order too."""
-
-    def __init__(
-        self,
-        stage: RibStage,
-        place: tuple[int, ...],
-        back: tuple[int, ...],
-        derivatives: bool = True,
-    ) -> None:
-        self.stage, self.place, self.back = stage, place, back
-        self.derivatives = derivatives
-
-    def __call__(self, theta: Sequence[float]) -> Mechanics:
-        here = [float(theta[i]) for i in self.place]
-        found = self.stage.mechanics(here, derivatives=self.derivatives)
-        if not self.derivatives or self.back == tuple(range(len(NAMES))):
-            return found
-        M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
-        return replace(found, derivatives=(M, D, K, B, C))
-
-
-def _nearby(own: StageEvaluator, theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+def _nearby(
+    stage: RibStage, order: Ordered, theta: Sequence[float], reach: float, pool: Pool
+) -> Evaluate:
     """A reduced basis of the stage within ± reach of θ, its snapshots solved by the pool."""
-    stage, here = own.stage, [float(theta[i]) for i in own.place]
+    here = order.own(theta)
     tasks = [(stage, place) for place in nearby.places(here, reach)]
     made = dict(pool.map_unordered(nearby.numbered_snapshot, list(enumerate(tasks))))
     evaluate = nearby.reduced(stage, here, [made[i] for i in range(len(tasks))])
-    return lambda values: evaluate([float(values[i]) for i in own.place])
+    return lambda values: evaluate(order.own(values))
 
 
 def _points(points: Points) -> tuple[Point, ...] | None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import casadi as ca
@@ -12,6 +11,7 @@ from ccd_casadi.plants.cad.elements import Body, Material
 from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
+from ccd_casadi.plants.ordered import Ordered
 from ccd_casadi.plants.pictures import ModeShapes
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
@@ -20,7 +20,6 @@ from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.optional_packages import require
 
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
-REMEMBERED = 64  # θ whose modes are kept
 
 
 def cad_stage(
@@ -155,12 +154,7 @@ class CadStage:
 def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh") -> Plant:
     """The stage as the plant that the design loop asks for, θ in the order of `names`."""
     morph = stage.morph
-    place = [list(names).index(name) for name in morph.names]  # of the morph's θ in the case's
-    back = [morph.names.index(name) for name in names]
     middle, half = 0.5 * (morph.lower + morph.upper), 0.5 * (morph.upper - morph.lower)
-
-    def evaluator(variant: CadStage, derivatives: bool) -> Evaluator:
-        return Evaluator(variant, tuple(place), tuple(back), derivatives)
 
     # in units of the box, so that CasADi's differences of the slope have a fitting step
     mass = VectorCallback(
@@ -169,9 +163,10 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         lambda unit: (half * stage.mass_slope(middle + half * unit))[None],
         hessians=True,
     )  # fmt: skip
-    theta = ca.MX.sym("theta", len(names))
-    own = ca.vertcat(*(theta[i] for i in place))
-    evaluate = evaluator(stage, True)
+    theta, back = ca.MX.sym("theta", len(names)), [morph.names.index(name) for name in names]
+    evaluate = Ordered(stage.mechanics, morph.names, names)
+    own = ca.vertcat(*(theta[i] for i in evaluate.place))
+    finer = replace(stage, modes=2 * stage.modes)
     evaluate.keep = mass  # CasADi holds no reference to it
     notes = (
         f"the stage is the mesh of {file} moved with theta, {len(morph.tets)} tetrahedra, within "
@@ -185,36 +180,13 @@ def plant_of_stage(stage: CadStage, names: Sequence[str], file: str = "the mesh"
         hardware=ca.Function("hardware", [theta], [mass((own - middle) / half), ca.MX(0, 1)]),
         outputs=len(stage.sensors),
         inputs=len(stage.forces),
-        references={"twice as many modes": evaluator(replace(stage, modes=2 * stage.modes), False)},
+        references={"twice as many modes": Ordered(finer.mechanics, morph.names, names, False)},
         exact_hessian=False,
-        values=evaluator(stage, False),
+        values=Ordered(stage.mechanics, morph.names, names, False),
         notes=lambda theta: notes,
         domain=(morph.lower[back], morph.upper[back]),
-        shapes=lambda theta, count: stage.shapes([float(theta[i]) for i in place], count),
+        shapes=lambda theta, count: stage.shapes(evaluate.own(theta), count),
     )
-
-
-class Evaluator:
-    """θ in the case's order -> Mechanics, with or without derivatives, the last ones remembered."""
-
-    keep: object = None
-
-    def __init__(
-        self, stage: CadStage, place: tuple[int, ...], back: tuple[int, ...], derivatives: bool
-    ) -> None:
-        self.stage, self.place, self.back = stage, place, back
-        self.derivatives = derivatives
-        self._read = lru_cache(maxsize=REMEMBERED)(self._evaluate)
-
-    def __call__(self, theta: Sequence[float]) -> Mechanics:
-        return self._read(tuple(float(theta[i]) for i in self.place))
-
-    def _evaluate(self, theta: tuple[float, ...]) -> Mechanics:
-        found = self.stage.mechanics(theta, self.derivatives)
-        if not self.derivatives:
-            return found
-        M, D, K, B, C = (array[list(self.back)] for array in found.derivatives)
-        return replace(found, derivatives=(M, D, K, B, C))
 
 
 def _ports(key: str, texts: Sequence[str], morph: Morph) -> tuple[Port, ...]:

@@ -1,0 +1,155 @@
+"""Descent on a function that is the largest of smooth pieces, of which a point shows one alone.
+
+    min t + ½ dᵀH d   s.t.  J_i + g_iᵀ(z + d - z_i) <= t,   λ + ∇λ d <= 0,
+                            |d| <= Δ,   0 <= z + d <= 1
+
+over the pieces that were met near the best point z: a bundle method with a trust region (Schramm
+and Zowe, 1992), whose slack t carries the goal. Where a step does not hold what the pieces promise
+the point that it led to shows one more. Pieces that would lie above J(z), as they do where J is not
+convex, are lowered to it. H learns from their combination Σ μ_i g_i, which is what is smooth of ∇J
+along a kink.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.optim.quasi_newton import damped_bfgs
+from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, best_step, minimise
+from ccd_casadi.support.arrays import Array
+
+FIRST, LARGEST, LEAST = 1e-2, 0.2, 1e-10  # of the box: radii
+NEAR = 4.0  # radii from the best point within which a piece counts
+PIECES = 8  # per variable, at most
+BENT = 0.5  # of the largest slope, per share of the box: by what a piece is lowered, at least
+RESTORED = 5  # Newton's steps back to λ <= 0
+INSIDE = 1e-10  # of λ
+JUMP = 10.0  # times the slopes on both sides: what is steeper is no kink
+BESIDE = 1e-3  # of the box: so near by no other piece is as steep
+
+Constraints = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Local:
+    """J and its gradient (n,) at z (n,) in the unit box; of one piece, where there is a kink."""
+
+    z: Array
+    value: float
+    gradient: Array
+
+
+def jumps(a: Local, b: Local) -> bool:
+    """Whether J is not continuous between two points near by, as the slopes at both tell."""
+    away = float(np.abs(b.z - a.z).max())
+    steepest = max(float(np.abs(one.gradient).sum()) for one in (a, b))
+    return away < BESIDE and abs(b.value - a.value) > JUMP * steepest * away
+
+
+def descend(
+    at: Callable[[Array], Local | None],
+    start: Local,
+    known: Sequence[Local],
+    constraints: Constraints,
+    *,
+    steps: int,
+    settled: float,
+) -> Local:
+    """The best point after at most `steps` new ones, where the pieces promise no more, or beside a
+    jump of J.
+
+    `at` gives None where J is not known; `constraints` λ (m,) and ∇λ (m, n). `settled` is relative
+    to J. `known` are further points that were met before; `start` keeps λ <= 0.
+    """
+    n = start.z.size
+    model = _Pieces(at, [start, *known], constraints)
+    end = minimise(
+        model, model.iterate(start), np.zeros((n, n)), Radius(FIRST, LEAST, LARGEST), steps=steps,
+        penalty=model.size, least_gain=settled * abs(start.value),
+    )  # fmt: skip
+    return end.best.data
+
+
+class _Pieces(Model[Local]):
+    """The pieces as rows in the unit `size`, the slope of the first."""
+
+    carried = True
+
+    def __init__(
+        self,
+        J: Callable[[Array], Local | None],
+        pieces: list[Local],
+        constraints: Constraints,
+    ) -> None:
+        self.J, self.pieces, self.constraints = J, pieces, constraints
+        self.low, self.high = np.zeros(pieces[0].z.size), np.ones(pieces[0].z.size)
+        self.size = max(float(np.abs(pieces[0].gradient).max()), 1e-300)
+
+    def iterate(self, here: Local) -> Iterate[Local]:
+        """J counts in the merit, and of the model the pieces alone."""
+        return Iterate(here.z, here.value, np.zeros(here.z.size), 0.0, here)
+
+    def at(self, x: Array) -> Iterate[Local] | None:
+        """A point with λ <= 0, and one piece more."""
+        z = _restored(np.clip(x, 0.0, 1.0), self.constraints)
+        there = None if z is None else self.J(z)
+        if there is None:
+            return None
+        self.pieces.append(there)
+        return self.iterate(there)
+
+    def rows(self, here: Iterate[Local], radius: float) -> Rows:
+        """The pieces near by less J, and λ, which no σ pays for."""
+        best, n = here.data, here.x.size
+        away = np.array([best.z - piece.z for piece in self.pieces])
+        far = np.abs(away).max(axis=1)
+        near = np.argsort(far, kind="stable")[: PIECES * n]
+        chosen = near[far[near] <= NEAR * radius]
+        slopes, away = np.array([self.pieces[i].gradient for i in chosen]), away[chosen]
+        value = np.array([self.pieces[i].value for i in chosen]) + (slopes * away).sum(axis=1)
+        steepest = float(np.abs(best.gradient).max())
+        below = np.maximum(best.value - value, BENT * steepest * (away**2).sum(axis=1))
+        g, jacobian = self.constraints(best.z)
+        return Rows(
+            np.append(-below / self.size, np.minimum(g + INSIDE, 0.0)),
+            np.vstack([slopes / self.size, jacobian.reshape(-1, n)]),
+            hard=np.arange(len(chosen) + len(g)) >= len(chosen),
+        )
+
+    def learnt(
+        self, H: Array, here: Iterate[Local], there: Iterate[Local], step: Step, radius: float
+    ) -> Array:
+        """That of the pieces' combination."""
+        if there.value >= here.value:
+            return H
+        after = best_step(self, there, H, radius, self.size)
+        if after is None:
+            return H
+        moved, change = there.x - here.x, self._combined(after) - self._combined(step)
+        if not H.any():
+            seen = abs(float(moved @ change)) / float(moved @ moved)
+            H = max(seen, 1e-3 * float(np.abs(self._combined(after)).max())) * np.eye(len(H))
+        return damped_bfgs(H, moved, change) if H.any() else H
+
+    def ended(self, here: Iterate[Local], there: Iterate[Local]) -> bool:
+        """Beside a jump."""
+        return there.value > here.value and jumps(here.data, there.data)
+
+    def _combined(self, step: Step) -> Array:
+        assert step.rows.hard is not None
+        mu = np.where(step.rows.hard, 0.0, step.multipliers)
+        slopes = self.size * step.rows.slopes
+        return np.asarray(mu @ slopes / max(float(mu.sum()), 1e-300))
+
+
+def _restored(z: Array, constraints: Constraints) -> Array | None:
+    """The point, moved to λ <= 0 by as little as its slopes tell; None where that fails."""
+    for _ in range(RESTORED):
+        g, jacobian = constraints(z)
+        broken = g > 0.0
+        if not broken.any():
+            return z
+        shift = np.linalg.lstsq(jacobian[broken], g[broken] + INSIDE, rcond=None)[0]
+        z = np.clip(z - shift, 0.0, 1.0)
+    return None

@@ -1,0 +1,306 @@
+"""A trust region for a smooth goal within elastic rows.
+
+    min f(x) + ρ max(0, max c(x))   over   low <= x <= high,
+
+or min f(x) + ρ max c(x), where the rows carry the goal (the pieces of a largest function). A step p
+solves
+
+    min ∇f·p + ½ pᵀ H p + ρ σ   s.t.  c + ∇c p (+ ½ pᵀ ∇²c p) <= σ,  |p| <= Δ,  0 <= σ,
+
+with ½ pᵀ ∇²c p by programmes around the step before, whose Hessian is that of the Lagrangian, made
+convex (Fletcher and Sainz de la Maza 1989). A trial counts where the merit falls. What is minimised
+and how its curvature is learnt is the `Model`'s; `Radius` is how far a step is trusted.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from ccd_casadi.optim.quadratic import solve_elastic
+from ccd_casadi.optim.quasi_newton import convex
+from ccd_casadi.support.arrays import Array
+
+ROWS = 400  # of a programme at most
+PROGRAMMES = 6  # around each other, for one step
+SETTLED = 1e-2  # of the radius: a step that moves less from one programme to the next
+HOLDS = 1e-7  # of the penalty: the multiplier of a row that holds the step
+FLAT = 1e-4  # of the slopes: least curvature, which leaves a linear programme one
+CONVEXIFYING = 10.0  # times AᵀA of the rows that hold: changes nothing along them
+ENOUGH, POOR = 0.7, 0.2  # of the predicted gain: with it a model is trusted further, or less far
+SHRINK = 0.5  # of the radius, after a poor step
+GROW = 1.4  # steps: the radius after a good one
+STEADY = 3  # steps at one radius, each of a middling gain, after which a larger one is tried
+WIDER = 10.0
+ZOOM = 4.0  # steps of the radius to which it comes down where they are too small for it
+FADING = 0.1  # of a penalty that a larger sum of multipliers left, at each step
+ELASTIC = 10.0  # times the merit's penalty, where that grows: of the programme
+
+Data = TypeVar("Data")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """c (m,) and its slopes (m, n) at an iterate, in the unit of the violation.
+
+    hard: (m,) rows that a step keeps without σ. margin: (m,) by how much a step keeps further
+    inside, and less as the radius shrinks. hessians: of rows given by index, (k, n, n), for the
+    first `curved` of them.
+    """
+
+    value: Array
+    slopes: Array
+    hard: np.ndarray | None = None
+    margin: Array | None = None
+    hessians: Callable[[np.ndarray], Array] | None = None
+    curved: int = 0
+
+
+@dataclass(frozen=True)
+class Iterate(Generic[Data]):
+    """x (n,), f and its gradient (n,), the largest c above 0, and what its rows are made from."""
+
+    x: Array
+    value: float
+    gradient: Array
+    violation: float
+    data: Data
+
+
+@dataclass(frozen=True)
+class Step:
+    """p (n,), the gain of merit that the model predicts, and that it would have with straight rows.
+
+    hessian: of the last programme. multipliers: (m,) of `rows`. penalty: of the merit.
+    """
+
+    change: Array
+    predicted: float
+    straight: float
+    hessian: Array
+    multipliers: Array
+    rows: Rows
+    penalty: float
+
+    @property
+    def size(self) -> float:
+        """|p|∞."""
+        return float(np.abs(self.change).max())
+
+
+@dataclass(frozen=True)
+class Radius:
+    """How far a step may go in each variable; `steady` counts the steps since it changed."""
+
+    value: float
+    least: float
+    largest: float
+    steady: int = 0
+
+    def times(self, factor: float) -> "Radius":
+        """A smaller or larger one."""
+        return replace(self, value=min(factor * self.value, self.largest), steady=0)
+
+    def after(self, gained: float, step: Step) -> "Radius":
+        """What a step of this predicted gain leaves of it."""
+        if gained > ENOUGH * step.predicted:
+            value = min(max(self.value, GROW * step.size), self.largest)
+            return replace(self, value=value, steady=0)
+        if gained < POOR * step.predicted:
+            return replace(self, value=SHRINK * min(self.value, step.size), steady=0)
+        if self.steady + 1 == STEADY:
+            # What a small step gains less than predicted may be a violation so small that the
+            # linear rows overshoot it, whatever the radius: it is the gain that asks for more.
+            return self.times(WIDER)
+        return replace(self, steady=self.steady + 1)
+
+
+class Model(ABC, Generic[Data]):
+    """What is minimised over the box `low` <= x <= `high` (n,)."""
+
+    low: Array
+    high: Array
+    carried = False  # whether σ >= 0 falls away: f is the largest row
+    corrected = False  # whether a trial that gains too little is corrected to second order
+    growing = False  # whether the penalty grows with the multipliers
+
+    @abstractmethod
+    def at(self, x: Array) -> Iterate[Data] | None:
+        """The iterate at x (n,) or near it; None where it cannot be used."""
+
+    @abstractmethod
+    def rows(self, here: Iterate[Data], radius: float) -> Rows:
+        """What a step of this radius has to keep."""
+
+    def learnt(
+        self, H: Array, here: Iterate[Data], there: Iterate[Data], step: Step, radius: float
+    ) -> Array:
+        """The Hessian (n, n) of f, or of the Lagrangian where rows have none, after a trial."""
+        return H
+
+    def ended(self, here: Iterate[Data], there: Iterate[Data]) -> bool:
+        """Whether a trial tells that to go on is of no use."""
+        return False
+
+
+class End(NamedTuple, Generic[Data]):
+    """The best iterate, the radius left, the trials, and whether further steps do not help."""
+
+    best: Iterate[Data]
+    radius: Radius
+    evaluations: int
+    done: bool
+
+
+def minimise(
+    model: Model[Data],
+    start: Iterate[Data],
+    H: Array,
+    radius: Radius,
+    *,
+    steps: int,
+    penalty: float,
+    least_gain: float,
+) -> End[Data]:
+    """From `start` to where the model promises less than `least_gain` of the merit.
+
+    H (n, n) is the first Hessian, also after a programme without an answer. `steps` bounds the
+    iterations.
+    """
+    here, first, evaluations = start, H, 0
+    for _ in range(steps):
+        if radius.value < radius.least:
+            return End(here, radius, evaluations, True)
+        step = best_step(model, here, H, radius.value, penalty)
+        if step is None:  # that tells nothing of an optimum
+            H, radius = first, radius.times(0.3)
+            continue
+        if step.predicted <= least_gain or step.straight <= least_gain:
+            zoomed = ZOOM * step.size
+            if step.straight > least_gain or step.rows.margin is not None:
+                radius = radius.times(0.3)  # so bent that nothing is found as far as this
+            elif model.growing and radius.least < zoomed < radius.value:
+                # The programme is solved to a share of the radius, and the merit counts what it
+                # leaves of a violation: next to an optimum that is more than is left to gain.
+                radius = radius.times(zoomed / radius.value)
+            else:
+                return End(here, radius, evaluations, True)
+            continue
+        penalty = step.penalty
+        there = model.at(here.x + step.change)
+        evaluations += 1
+        gained = _gain(here, there, penalty)
+        if gained < ENOUGH * step.predicted and there is not None and model.corrected:
+            change = _corrected(model, here, there, step, H, radius.value)
+            other = None if change is None else model.at(here.x + change)
+            evaluations += change is not None
+            if _gain(here, other, penalty) > gained:
+                there, gained = other, _gain(here, other, penalty)
+        radius = radius.after(gained, step)
+        if there is not None:
+            if model.ended(here, there):
+                return End(there if gained > 0.0 else here, radius, evaluations, True)
+            H = model.learnt(H, here, there, step, radius.value)
+            here = there if gained > 0.0 else here
+    return End(here, radius, evaluations, False)
+
+
+def best_step(
+    model: Model[Data], here: Iterate[Data], H: Array, radius: float, penalty: float
+) -> Step | None:
+    """The best step that the model knows; None where its programme has no answer."""
+    rows = model.rows(here, radius)
+    margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
+    chosen = np.arange(len(rows.value))
+    if not model.carried:  # a row that the step cannot lift over its bound is none of it
+        slack = rows.value + margin + radius * np.abs(rows.slopes).sum(1)
+        chosen = np.flatnonzero(slack > 0.0)
+        chosen = chosen[np.argsort(-slack[chosen], kind="stable")[:ROWS]]
+    m, n = len(chosen), len(here.x)
+    value, slopes = rows.value[chosen], rows.slopes[chosen]
+    elastic = np.ones(m) if rows.hard is None else 1.0 - rows.hard[chosen]
+    unit = _unit(here, penalty if model.carried else 0.0)
+    weight = ELASTIC * (unit + penalty) if model.growing else penalty
+    multipliers = np.zeros(len(rows.value))
+
+    def gain(p: Array, level: Array) -> float:
+        """Of merit at p, where the rows have these levels."""
+        most = float(level[elastic > 0.0].max(initial=-np.inf if model.carried else 0.0))
+        return penalty * (here.violation - most) - float(here.gradient @ p + 0.5 * p @ H @ p)
+
+    curved, known = np.zeros((m, n, n)), chosen >= rows.curved
+    at, offset, M, p = slopes, value + margin[chosen], convex(H, FLAT * unit), np.zeros(n)
+    best: Step | None = None
+    straight = 0.0
+    for turn in range(PROGRAMMES):
+        cost = here.gradient + (H - M) @ p  # M acts on what is left of p
+        ends = _ends(model, here, radius)
+        found = solve_elastic(
+            M, cost, at, offset, elastic, *ends, weight, radius, unit, free=model.carried
+        )
+        if found is None:
+            break
+        moved, (p, mu) = float(np.abs(found[0] - p).max()), found
+        if model.growing:
+            penalty = max(FADING * penalty, 2.0 * float(mu.sum()))
+        if turn == 0:
+            straight = gain(p, value + slopes @ p)
+        holds = mu > HOLDS * weight
+        fresh = holds & ~known
+        if fresh.any() and rows.hessians is not None:
+            curved[fresh] = rows.hessians(chosen[fresh])
+            known |= fresh
+        bend = curved @ p
+        at, offset = slopes + bend, value - 0.5 * bend @ p
+        predicted = gain(p, offset + at @ p)
+        if rows.curved:
+            lagrangian = H + np.einsum("m,mij->ij", np.where(holds, mu, 0.0), curved)
+            active = at[holds]
+            M = convex(lagrangian + CONVEXIFYING * active.T @ active, FLAT * unit)
+        if best is None or predicted > best.predicted:
+            multipliers = np.zeros(len(rows.value))
+            multipliers[chosen] = mu
+            best = Step(p, predicted, straight, M, multipliers, rows, penalty)
+        if not rows.curved or (not fresh.any() and moved < SETTLED * radius):
+            break
+    return best
+
+
+def _corrected(
+    model: Model[Data],
+    here: Iterate[Data],
+    there: Iterate[Data],
+    step: Step,
+    H: Array,
+    radius: float,
+) -> Array | None:
+    """The second-order correction: the same model with the rows as they are at the trial."""
+    rows = model.rows(there, radius)
+    offset = rows.value - rows.slopes @ step.change
+    slack = rows.value + radius * np.abs(rows.slopes).sum(1)
+    chosen = np.argsort(-slack, kind="stable")[: min(ROWS, int((slack > 0.0).sum()))]
+    cost = here.gradient + (H - step.hessian) @ step.change
+    found = solve_elastic(
+        step.hessian, cost, rows.slopes[chosen], offset[chosen], np.ones(len(chosen)),
+        *_ends(model, here, radius), step.penalty, radius, _unit(here, 0.0),
+    )  # fmt: skip
+    return None if found is None else found[0]
+
+
+def _gain(here: Iterate[Data], there: Iterate[Data] | None, penalty: float) -> float:
+    """By how much the merit falls; -∞ where there is nothing."""
+    if there is None:
+        return -np.inf
+    return here.value - there.value + penalty * (here.violation - there.violation)
+
+
+def _unit(here: Iterate[Data], carried: float) -> float:
+    """The size of what is minimised, per unit of a variable."""
+    return max(float(np.abs(here.gradient).max()), carried, 1e-300)
+
+
+def _ends(model: Model[Data], here: Iterate[Data], radius: float) -> tuple[Array, Array]:
+    low = np.minimum(np.maximum(model.low - here.x, -radius), 0.0)
+    return low, np.maximum(np.minimum(model.high - here.x, radius), 0.0)

@@ -1,0 +1,128 @@
+"""A move and a step of force of a design on every plant of its set."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ccd_casadi.analysis.loop import Loop
+from ccd_casadi.analysis.loop_figures import force_step
+from ccd_casadi.analysis.move import Move, mass_feedforward, moves
+from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.analysis.signals import LIMITS, WINDOW
+from ccd_casadi.inner_problem.design_loops import free_loops
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.modal import Suspension, modal_plant
+from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.reporting.page import Table, figure_html, number
+from ccd_casadi.reporting.svg import GREY
+from ccd_casadi.reporting.tables import over_time
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import counted
+
+AFTER = 1.0  # of the move's duration, that is shown after its end
+POINTS = 600
+SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
+STEPS = 200  # points of it
+
+
+@dataclass(frozen=True)
+class MovePanels:
+    """Error of a move, without and with mass feedforward (the last one), its words and numbers."""
+
+    panels: tuple[Panel, ...]
+    caption: str
+    table: Table
+
+
+def move_panels(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    controller: StateSpace,
+    loops: Sequence[Loop],
+    bandwidth_hz: float,
+) -> MovePanels:
+    """The default move of `robustness` on the plants of `loops`, their rigid bodies free."""
+    profile = setpoint(LIMITS)
+    modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
+    ahead = mass_feedforward(modal, 0)
+    ways = {"without feedforward": None} | ({} if ahead is None else {"mass feedforward": ahead})
+    free = free_loops(problem, theta, controller)
+    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=WINDOW,
+                  bandwidth_hz=bandwidth_hz)  # fmt: skip
+    end = profile.duration
+    time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)
+    panels, words, columns, heads = [], [], [1e3 * time], ["ms"]
+    for name, made in zip(ways, found, strict=True):
+        error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
+        panels.append(_over_plants(
+            1e3 * time, error, f"error, {name} (µm)", legend="upper right",
+            levels=(Level(1e3 * end, "end of the move", True, GREY),),
+        ))  # fmt: skip
+        columns += _columns(error)
+        heads += [f"µm, {name}", "least", "largest"] if len(error) > 1 else [f"µm, {name}"]
+        words.append(_words(name, made))
+    sampled = loops[0].sampling is not None
+    how = "hold and delay exact, at the instants" if sampled else "continuous loop"
+    where = "without the suspension" if found[0][0].free else "on the soft suspension"
+    caption = (
+        f"{number(1e3 * LIMITS.stroke)} mm in {number(1e3 * end, 4)} ms "
+        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; for other moves "
+        f"the options of robustness). {' '.join(words)}"
+    )
+    return MovePanels(tuple(panels), caption, over_time(heads, *columns))
+
+
+def move_html(found: MovePanels) -> str:
+    """What `move_panels` found, as a figure."""
+    svg = figure_lines([list(found.panels)], key="move", heights=(3.2,), title="Error of a move")
+    return figure_html(svg, found.caption, found.table)
+
+
+def force_step_html(loops: Sequence[Loop], bandwidth_hz: float) -> str:
+    """The position of every plant after a step of force at the actuator."""
+    slow = min(float(-loop.poles.real.max()) for loop in loops)
+    times = np.geomspace(0.02 / (2.0 * np.pi * bandwidth_hz), SETTLED / slow, STEPS)
+    steps = [force_step(loop, times) for loop in loops]
+    t = steps[0][0]
+    y = 1e6 * np.array([step[1] for step in steps])
+    panel = _over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
+    svg = figure_lines([[panel]], key="force", heights=(3.2,), title="A step of force")
+    head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
+    on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
+        "the stage, until it rests"
+    )  # fmt: skip
+    words = f"A force of 1 N at the actuator moves {on}."
+    return figure_html(svg, words, over_time(head, 1e3 * t, *_columns(y)))
+
+
+def _over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
+    """The model's in a band of all."""
+    several = len(values) > 1
+    curve = Curve(ms, values[0], "the model" if several else "")
+    band = Band(ms, values.min(axis=0), values.max(axis=0), "all plants")
+    return Panel("time (ms)", label, (curve,), (band,) if several else (), **more)  # type: ignore[arg-type]
+
+
+def _columns(values: Array) -> list[Array]:
+    found = [values[0]]
+    return [*found, values.min(axis=0), values.max(axis=0)] if len(values) > 1 else found
+
+
+def _words(name: str, made: Sequence[Move]) -> str:
+    latest = max(move.settling for move in made)
+    several = len(made) > 1
+    settled = (
+        f"settles within ±{number(1e6 * made[0].window)} µm {number(1e3 * latest, 3)} ms after "
+        f"the end{' at the latest' if several else ''}"
+        if np.isfinite(latest)
+        else f"does not settle {'on all plants ' if several else ''}while it is watched"
+    )
+    peak = 1e6 * max(move.peak_error for move in made)
+    force = max(float(move.peak_force.max()) for move in made)
+    return (
+        f"{name[0].upper()}{name[1:]}: error of at most {number(peak, 3)} µm, {settled}, "
+        f"{number(force, 4)} N at most."
+    )
