@@ -56,6 +56,12 @@ GROUPS = (
         interpreted=True,
     ),
     Group(
+        _kernels("limits", "sections", "modes", "loop_point", "loop_rows", "loop_curvature"),
+        ("tests/test_fixed_structure_loops.py", "tests/test_fixed_structure_channels.py"),
+        "derivatives or closed_in_on or crossing or moves_with or hessian_of_the_whole",
+        interpreted=True,
+    ),
+    Group(
         tuple(
             f"ccd_casadi/{name}.py"
             for name in (

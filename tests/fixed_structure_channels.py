@@ -1,21 +1,30 @@
 """Loops of several channels for the tests: a stage whose load may lie off centre."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
+import pytest
 from differences import slopes
 from helpers import HZ, SUSPENSION, scaled
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.decoupling import find_decoupling
-from ccd_casadi.fixed_structure.figures import assess, to_theta
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
-from ccd_casadi.fixed_structure.mimo_figures import evaluate_rows, whole_constraints
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
+from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
+from ccd_casadi.fixed_structure.loop_problem import (
+    Constraints,
+    Curve,
+    LoopProblem,
+    MatrixProblem,
+    plant_of_row,
+)
+from ccd_casadi.fixed_structure.peak_search import CLOSINGS, FLAT, NARROW, Brackets
+from ccd_casadi.kernels import loop_rows
 from ccd_casadi.plants.plant import Plant, build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -93,6 +102,19 @@ def loop(
     raise AssertionError("no random controller is stable")
 
 
+def gaps(model: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
+    """How far each singular value is from the next one of its matrix, relative."""
+    which = plant_of_row(model, rows.plant)
+    loop = model.loop(kappa, tau)
+    level = loop_rows.levels(rows.curve[:, None], which, rows.v[:, None], loop, -np.inf)[:, 0, 0]
+    every, number = np.arange(len(which)), rows.plant // len(model.plants.plants)
+    whole = number < model.first
+    size = np.exp(level[:, : model.first])
+    gap = np.abs(size / size[every, np.where(whole, number, 0)][:, None] - 1.0)
+    gap[every, np.where(whole, number, 0)] = np.inf
+    return np.where(whole, gap.min(axis=1), np.inf)
+
+
 def assert_derivatives(
     problem_at: Callable[[tuple[float, float]], MatrixProblem],
     kappa: Array,
@@ -105,13 +127,10 @@ def assert_derivatives(
     tau, model = -1.5, problem_at((1.0, 1.0))
     peaks = assess(model, kappa, tau, depth=-2.0).peaks
     assert peaks is not None
-    rows = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
-    gap = np.abs(rows.s / rows.s[range(len(peaks.v)), rows.at][:, None] - 1.0)
-    gap[range(len(peaks.v)), rows.at] = np.inf
-    peaks = peaks.only(chosen(peaks.plant) & (gap.min(axis=1) > 0.03))
+    peaks = peaks.only(chosen(peaks.plant) & (gaps(model, kappa, tau, peaks) > 0.03))
 
     def values(of, kappa, tau):
-        return whole_constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
+        return constraints(of, kappa, tau, peaks.curve, peaks.plant, peaks.v).value
 
     size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-2
     to_kappa = slopes(lambda x: values(model, x, tau), kappa, 1e-4)
@@ -124,3 +143,28 @@ def assert_derivatives(
     found = slopes(lambda theta: values(problem_at(tuple(theta)), kappa, tau), np.ones(2), 1e-4)
     assert (np.abs(found - exact) / scale).max() < 1e-5
     return set(peaks.curve.tolist())
+
+
+def everything() -> tuple[Array, ...]:
+    """Of a coupled, sampled stage with a bound of a channel's own: the peaks, their slopes to κ, τ
+    and θ, and their curvature."""
+    problem, kappa = loop(0, (0.3,), FAST)
+    whole = problem.structure
+    own = channel_bounds(whole.decoupling, {"1": {"S_max": 1.5, "bandwidth_ratio": 1.6}})
+    problem = composite_problem([plant(off=0.3)], whole, replace(BOUNDS, channels=own), FAST)
+    peaks = assess(problem, kappa, -1.5).peaks
+    assert peaks is not None
+    bends = hessians(problem, kappa, -1.5, peaks)
+    return (peaks.v, peaks.value, peaks.to_kappa, peaks.to_tau, to_theta(problem, kappa, peaks),
+            bends)  # fmt: skip
+
+
+def closed(
+    patch: pytest.MonkeyPatch, slope: Callable[[float], float], brackets: Brackets
+) -> tuple[Array, np.ndarray]:
+    """The kernel's false position, interpreted, on curves of this slope to ln v."""
+    patch.setattr(loop_rows, "room", lambda loop: None)
+    patch.setattr(loop_rows, "slope_at", lambda row, v, *loop: slope(v))
+    run = getattr(loop_rows.close, "py_func", loop_rows.close)
+    ends = (brackets.start, brackets.low, brackets.high)
+    return run(brackets.curve, brackets.row, brackets.row, *ends, None, (FLAT, NARROW, CLOSINGS))

@@ -1,12 +1,15 @@
 """Loops for the tests of fixed structures: plants, bounds, random stable controllers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from helpers import HZ, PAPER, SUSPENSION, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.loop_problem import Problem
+from ccd_casadi.fixed_structure.loop_problem import Curve, Problem
 from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
@@ -46,3 +49,12 @@ def loop(
         if len(found):
             return problem, found[0]
     raise AssertionError("no random controller is stable")
+
+
+def by_curve(
+    problem: Problem, kappa: Array, tau: float, curves: Sequence[Curve], v: Array
+) -> dict[Curve, Array]:
+    """The levels of all plants at v (P, k) by curve, without the margin."""
+    codes, loop = np.tile(np.array(curves, np.int64), (len(v), 1)), problem.loop(kappa, tau)
+    found = levels(codes, np.arange(len(v)), v, loop, -np.inf)
+    return {curve: found[:, :, i, 0] for i, curve in enumerate(curves)}

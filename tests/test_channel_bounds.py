@@ -26,11 +26,9 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
-from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop_problem import Curve
-from ccd_casadi.fixed_structure.mimo_figures import whole_constraints
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.fixed_structure.figures import assess, constraints
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
 from ccd_casadi.plants.plant import build_plant, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -47,7 +45,7 @@ def with_own(whole: ChannelStructure, bounds: Bounds = BOUNDS) -> Bounds:
 
 def as_one(whole: ChannelStructure, sampling: Sampling | None, off: float, theta=(1.0, 1.0)):
     """The stage with a load off centre beside the empty one, never taken apart."""
-    members = matrix_plant_set([plant(), plant(theta, off)], whole.decoupling, sampling)
+    members = plant_set([plant(), plant(theta, off)], sampling, whole.decoupling)
     box = whole.bounds((1e-3, 1e4), (1e-6, 1e6))
     return MatrixProblem(members, whole, with_own(whole), box)
 
@@ -63,12 +61,12 @@ def test_derivatives_of_the_rows(seed: int, sampling: Sampling | None, skewed: b
     model = as_one(whole, sampling, 0.3)
     peaks = assess(model, kappa, TAU, depth=-2.0).peaks
     assert peaks is not None
-    alone = peaks.plant // 2 >= model.own.first
+    alone = peaks.plant // 2 >= model.first
     kinds = {Curve.S_MAX, Curve.LEVEL, Curve.SHAPE, Curve.CROSSING, Curve.KS}
     assert set(peaks.curve[alone]) == kinds
     seen = assert_derivatives(
         lambda theta: as_one(whole, sampling, 0.3, theta), kappa,
-        lambda row: (row % 2 == 1) & (row // 2 >= model.own.first),
+        lambda row: (row % 2 == 1) & (row // 2 >= model.first),
     )  # fmt: skip
     assert seen == kinds
 
@@ -79,7 +77,7 @@ def test_the_hessian_of_the_rows_is_the_difference_of_gradients() -> None:
     problem = composite_problem([plant(off=0.3)], problem.structure, with_own(problem.structure))
     peaks = assess(problem, kappa, TAU).peaks
     assert peaks is not None
-    rows = np.flatnonzero(peaks.plant >= problem.parts[0].problem.own.first)
+    rows = np.flatnonzero(peaks.plant >= problem.parts[0].problem.first)
     assert len(rows) >= 4
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -108,10 +106,10 @@ def test_where_plants_fall_apart_the_parts_have_the_rows(sampling: Sampling | No
     for (part, _, rows), i in zip(apart.split(peaks), range(3), strict=True):
         assert part.channel == i
         for one in (rows.only(np.array([j])) for j in range(len(rows.v))):
-            own = one.curve[0] in [c for c in Curve if i in joint.own.bounded(c)]
-            numbers = [joint.own.first + i] if own else range(joint.own.first)
+            own = np.isfinite(joint.limits[one.curve[0], joint.first + i])
+            numbers = [joint.first + i] if own else range(joint.first)
             found = [
-                whole_constraints(joint, kappa, TAU, one.curve, np.array([2 * number]), one.v)
+                constraints(joint, kappa, TAU, one.curve, np.array([2 * number]), one.v)
                 for number in numbers
             ]
             row = min(found, key=lambda row: abs(row.value[0] - one.value[0]))

@@ -1,7 +1,10 @@
 """Fixed structures on plants of several channels: the whole loop's bounds and their derivatives."""
 
-from types import SimpleNamespace
-from typing import cast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +13,16 @@ from fixed_structure_channels import (
     FAST,
     STRUCTURE,
     assert_derivatives,
+    closed,
+    everything,
+    gaps,
     loop,
     plant,
     structure,
 )
 from helpers import sensitivity_gain
 
-from ccd_casadi.fixed_structure import Sampling, mimo_figures
+from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem, plants_of_rows
 from ccd_casadi.fixed_structure.curvature import hessians
@@ -27,23 +33,27 @@ from ccd_casadi.fixed_structure.decoupling import (
     in_channels,
     is_decoupled,
 )
-from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop_problem import Curve
-from ccd_casadi.fixed_structure.mimo_figures import evaluate_rows, whole_constraints
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
-from ccd_casadi.fixed_structure.peak_search import closed_on_zero
+from ccd_casadi.fixed_structure.figures import assess, constraints
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.peak_search import Brackets, split
 from ccd_casadi.support.errors import PlantError
 
+ROOT = Path(__file__).resolve().parent.parent
 SKEWED = given_decoupling(("a", "b", "c"), [[1, 0.2, 0], [0, 1, 0.1], [0.1, 0, 1]],
                           [[1, 0, 0.1], [0.1, 1, 0], [0, 0.1, 1]])  # fmt: skip
-ONE = SimpleNamespace(plants=(None,))
+
+
+def finer(brackets: Brackets) -> np.ndarray:
+    """Places inside of brackets, those where they start among them."""
+    inside = np.geomspace(brackets.low, brackets.high, 12, axis=1)
+    return np.sort(np.concatenate([inside, brackets.start[:, None]], axis=1), axis=1)
 
 
 def whole(problem, sampling: Sampling | None, off: float = 0.3, theta=(1.0, 1.0)) -> MatrixProblem:
     """The same problem with one plant as a whole, in the units of the stage at θ = (1, 1)."""
     plants = [plant(), plant(theta, off)]
-    members = matrix_plant_set(plants, problem.structure.decoupling, sampling)
+    members = plant_set(plants, sampling, problem.structure.decoupling)
     return MatrixProblem(members, problem.structure, BOUNDS, problem.box)
 
 
@@ -71,7 +81,7 @@ def test_where_plants_fall_apart_the_parts_are_the_whole(sampling: Sampling | No
     for i in range(len(parts.v)):
         one = parts.only(np.array([i]))
         rows = [
-            whole_constraints(together, kappa, -1.5, one.curve, np.array([2 * k]), one.v)
+            constraints(together, kappa, -1.5, one.curve, np.array([2 * k]), one.v)
             for k in range(3)
         ]
         row = min(rows, key=lambda row: abs(row.value[0] - one.value[0]))
@@ -141,16 +151,14 @@ def test_the_hessian_of_the_whole_is_the_difference_of_gradients(sampling: Sampl
     peaks = assess(problem, kappa, tau).peaks
     assert peaks is not None
     model = problem.parts[0].problem
-    found = evaluate_rows(model, kappa, tau, peaks.curve, peaks.plant, peaks.v)
-    gap = np.abs(found.s / found.s[range(len(peaks.v)), found.at][:, None] - 1.0)
-    gap[range(len(peaks.v)), found.at] = np.inf
+    gap = gaps(model, kappa, tau, peaks)
     rng = np.random.default_rng(0)
     for _ in range(3):
         direction = rng.normal(0.0, 1.0, len(kappa))
         direction /= np.linalg.norm(direction)
         ends = [assess(problem, kappa + x * direction, tau).peaks for x in (1e-5, -1e-5)]
         seen = set()
-        for j in np.flatnonzero(gap.min(axis=1) > 0.1):
+        for j in np.flatnonzero(gap > 0.1):
             one = peaks.only(np.array([j]))
             exact = hessians(problem, kappa, tau, one)[0, :-1, :-1] @ direction
             slopes = []
@@ -182,27 +190,22 @@ def test_peaks_of_the_whole_are_those_of_dense_grids(off: tuple[float, ...]) -> 
     assert structure().order == 3 * STRUCTURE.order
 
 
-def test_a_maximum_beside_a_crossing_of_singular_values_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_maximum_beside_a_crossing_of_singular_values_is_found() -> None:
     """The higher of two that lie so close that no point of the grid is above its neighbours."""
 
-    def levels(problem, kappa, tau, which, v, least):  # type: ignore[no-untyped-def]
+    def level(v: np.ndarray) -> np.ndarray:
         one, other = (top - 2e3 * (v - at) ** 2 for at, top in ((1.0, 0.0), (1.01, 0.05)))
-        return {Curve.T: np.sort(np.stack([one, other], axis=-1))[..., ::-1]}
+        return np.sort(np.stack([one, other], axis=-1))[..., ::-1]
 
-    monkeypatch.setattr(mimo_figures, "levels", levels)
-    problem = cast(MatrixProblem, SimpleNamespace(plants=ONE, own=SimpleNamespace(first=2)))
     # the grid's own largest sigma_1 is elsewhere; sigma_2 is largest where the two cross
-    brackets = (np.full(2, Curve.T), np.array([0, 1]), np.array([1.0, 1.004]),
-                np.array([0.99, 1.0]), np.array([1.004, 1.03]))  # fmt: skip
-    kind, rows, start, low, high = mimo_figures._split(
-        problem, np.zeros(0), 0.0, brackets, np.array([0.0, -0.04])
-    )
-    assert ((rows == 0) & (low < 1.01) & (high > 1.01)).sum() == 1
-    assert (rows == 0).sum() == 2  # and the one that was known stays
-    assert ((low <= start) & (start <= high)).all()
-    assert (kind == Curve.T).all()
+    brackets = Brackets(np.full(2, Curve.T), np.array([0, 1]), np.array([1.0, 1.004]),
+                        np.array([0.99, 1.0]), np.array([1.004, 1.03]))  # fmt: skip
+    inside = finer(brackets)
+    found = split(brackets, np.arange(2), inside, level(inside), 1, 2)
+    assert ((found.row == 0) & (found.low < 1.01) & (found.high > 1.01)).sum() == 1
+    assert (found.row == 0).sum() == 2  # and the one that was known stays
+    assert ((found.low <= found.start) & (found.start <= found.high)).all()
+    assert (found.curve == Curve.T).all()
 
 
 def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
@@ -218,20 +221,32 @@ def test_a_maximum_before_a_crossing_of_singular_values_is_closed_in_on(
     def largest(v: np.ndarray) -> np.ndarray:
         return np.max([top - 2e2 * (v - at) ** 2 for at, top in peaks], axis=0)
 
-    def levels(problem, kappa, tau, which, v, least):  # type: ignore[no-untyped-def]
-        return {Curve.S_MAX: largest(v)[..., None]}
+    def slope(v: float) -> float:
+        return float((largest(v * np.exp(1e-7)) - largest(v * np.exp(-1e-7))) / 2e-7)
 
-    def slope(x: np.ndarray, of: np.ndarray) -> np.ndarray:
-        return (largest(np.exp(x + 1e-7)) - largest(np.exp(x - 1e-7))) / 2e-7
-
-    monkeypatch.setattr(mimo_figures, "levels", levels)
-    problem = cast(MatrixProblem, SimpleNamespace(plants=ONE, own=SimpleNamespace(first=1)))
     low, start, high = (np.array([v]) for v in (0.99, 0.9985, 1.0145))
     assert largest(start) > max(largest(low), largest(high))
-    assert not closed_on_zero(slope, start, low, high)[1].any()
-    brackets = (np.full(1, Curve.S_MAX), np.zeros(1, int), start, low, high)
-    _, rows, *bracket = mimo_figures._split(problem, np.zeros(0), 0.0, brackets, largest(start))
-    top, closed = closed_on_zero(slope, *bracket)
-    assert closed.all()
-    assert (rows == 0).all()
+    brackets = Brackets(np.full(1, Curve.S_MAX), np.zeros(1, int), start, low, high)
+    assert not closed(monkeypatch, slope, brackets)[1].any()
+    inside = finer(brackets)
+    found = split(brackets, np.arange(1), inside, largest(inside)[..., None], 1, 1)
+    top, inside = closed(monkeypatch, slope, found)
+    assert inside.all()
+    assert (found.row == 0).all()
     assert top == pytest.approx(1.0, abs=1e-6)
+
+
+INTERPRETED = """
+import interpreted, json, numpy as np
+from fixed_structure_channels import everything
+print(json.dumps([part.tolist() for part in everything()]))
+"""
+
+
+def test_the_kernels_are_what_they_say_as_plain_python() -> None:
+    """Interpreted they have the same constraints, slopes and curvature as compiled."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(ROOT / "benchmarks")])
+    out = subprocess.run([sys.executable, "-W", "ignore", "-c", INTERPRETED], check=True,
+                         capture_output=True, env=os.environ | {"PYTHONPATH": path})  # fmt: skip
+    for one, other in zip(everything(), json.loads(out.stdout), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6 * np.abs(one).max())

@@ -121,7 +121,7 @@ def test_a_narrow_peak_at_3_db_is_seen_by_the_judge_and_by_the_search(gain: floa
     scaled, own = in_problem_units(problem, kappa), problem.plants
     omega = np.geomspace(20.0, 1100.0, 200_000)
     v = own.variable(omega / own.omega_0)
-    G, _ = own.responses(np.zeros(len(v), int), v)
+    G = own.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
     S = np.abs(1.0 / (1.0 + G * response(structure, scaled, 1j * v)))
     judged = certify([rigid(12.743)], state_space(structure, kappa), bounds, sampling)
     first = omega[np.argmax(np.sqrt(2.0) * S > 1.0)]
@@ -175,7 +175,7 @@ def test_a_flat_shelf_is_no_bandwidth() -> None:
     # Zeros at 3 Hz make K G, a double integrator, flat up to the poles: |S| is near 1/2.1 there.
     kappa = np.log(np.array([1.0, 0.05 * hz, 3.0 * hz, 1.0, 90.0 * hz, 0.7]))
     at = np.array([20.0 * hz])
-    G = problem.plants.responses(np.zeros(1, int), at)[0]
+    G = problem.plants.responses(np.zeros(1, int), at)[0][:, 0, 0]
     kappa[0] += np.log(1.1 / np.abs(G * response(structure, kappa, 1j * at)))[0]
     si = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
     K = state_space(structure, si)
@@ -271,7 +271,7 @@ def test_the_box_holds_the_plants_that_it_names() -> None:
     flexible = members.poles[:, np.abs(members.poles[0]).argmax()]
     assert abs(flexible[1]) == pytest.approx(1.02 * abs(flexible[0]), rel=1e-9)
     low = np.array([1e-4])
-    G = [members.responses(np.array([i]), low)[0][0] for i in range(2)]
+    G = [members.responses(np.array([i]), low)[0][0, 0, 0] for i in range(2)]
     assert abs(G[1] / G[0]) == pytest.approx(1.05, rel=1e-4)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS
+from fixed_structure_loops import BOUNDS, FAST, LATE, WEIGHTS, by_curve
 from helpers import HZ, SUSPENSION, two_mass_model
 
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify
@@ -12,7 +12,6 @@ from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi,
 from ccd_casadi.fixed_structure.box_proof import ProofOutcome, prove
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
-from ccd_casadi.fixed_structure.figures import curve_levels
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.modal_sum import modal_sum
@@ -109,7 +108,7 @@ def test_enclosures_hold_at_the_corners_of_small_boxes(sampling, structure) -> N
     curves = (Curve.S_MAX, Curve.SHAPE, Curve.KS, Curve.T, Curve.GS)
     v = own.variable(corner[0] / own.omega_0)[:, None]
     tau = float(np.log(bandwidth / own.omega_0))
-    levels = curve_levels(problem, in_problem_units(problem, kappa), tau, curves, v)
+    levels = by_curve(problem, in_problem_units(problem, kappa), tau, curves, v)
     rising = (middle - half)[0] < family.corner
     assert rising.sum() > 10
     for curve in curves:

@@ -31,7 +31,7 @@ def measured(sampling: Sampling | None, lines: int = 2000) -> MeasuredResponse:
     """Case study 1 as a spectrum analyser would give it, hold and delay in it."""
     P = plant_set([plant()], sampling)
     hz = np.geomspace(0.3, 4900.0, lines)
-    G = P.responses(np.zeros(lines, int), P.variable(HZ * hz / P.omega_0))[0] / P.force
+    G = P.responses(np.zeros(lines, int), P.variable(HZ * hz / P.omega_0))[0][:, 0, 0] / P.force
     return MeasuredResponse(hz, G)
 
 

@@ -17,9 +17,8 @@ from ccd_casadi.fixed_structure.composite import composite_problem
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.loop_problem import Curve
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import PlantError
@@ -42,7 +41,7 @@ def problem(theta: tuple[float, float], sampling: Sampling | None) -> MatrixProb
     """Of the plants at (1, 1) and at θ."""
     first = [one_sensor(), one_sensor(theta, 0.2)]
     box = composite_problem(first[:1], STRUCTURE, BOUNDS, sampling).box
-    return MatrixProblem(matrix_plant_set(first, BOTH, sampling), STRUCTURE, BOUNDS, box)
+    return MatrixProblem(plant_set(first, sampling, BOTH), STRUCTURE, BOUNDS, box)
 
 
 def start(sampling: Sampling | None) -> np.ndarray:
@@ -153,12 +152,12 @@ def test_channels_that_do_not_fit_the_plant_are_refused() -> None:
     with pytest.raises(PlantError, match="give as many"):
         given_decoupling(("a", "b"), [[1, 0, 0], [0, 1, 0]], [[1, 0], [0, 1]])
     with pytest.raises(PlantError, match="1 outputs and 2 inputs"):
-        matrix_plant_set([one_sensor()], find_decoupling(plant()))
+        plant_set([one_sensor()], None, find_decoupling(plant()))
     whole = plant()
     fewer = replace(whole, B=whole.B[:, :2], dB=whole.dB[:, :, :2], channels=())
     directions = given_decoupling(("a", "b"), [[1, 0], [0, 1]], [[1, 0], [0, 1]])
     with pytest.raises(PlantError, match="3 outputs and 2 inputs"):
-        matrix_plant_set([fewer], directions)
+        plant_set([fewer], None, directions)
 
 
 @pytest.fixture

@@ -12,9 +12,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import channel_plant
-from ccd_casadi.fixed_structure.loop import plant_set, stable
+from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set, whole_closed_loops
 from ccd_casadi.fixed_structure.starts import at_random, with_crossover
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -43,17 +42,17 @@ def actuator_starts(
         kappa = at_random(single, crossovers, rng)
         v = family.variable(crossovers)
         G, slope = family.responses(np.zeros(draws, int), v)
-        lag = (slope / G).real > STIFFNESS_LINE
+        lag = (slope / G)[:, 0, 0].real > STIFFNESS_LINE
         for j in range(1, own.lead + 1):
             pair = [own.names.index(f"lead {j} {root}") for root in ("zero", "pole")]
             kappa[np.ix_(lag, pair)] = kappa[np.ix_(lag, pair[::-1])]
         parts.append(with_crossover(single, kappa, crossovers))
-    first = matrix_plant_set(plants[:1], structure.decoupling, sampling)
-    every = matrix_plant_set(plants, structure.decoupling, sampling)
+    first = plant_set(plants[:1], sampling, structure.decoupling)
+    every = plant_set(plants, sampling, structure.decoupling)
     found: list[Array] = []
     for kappa in np.hstack(parts):
         for family in (first, every):
-            if not stable(whole_closed_loops(family, structure, kappa)).all():
+            if not stable(closed_loops(family, structure, kappa)).all():
                 break
         else:
             found.append(kappa)

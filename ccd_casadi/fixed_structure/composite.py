@@ -2,8 +2,8 @@
 
 Plants that fall apart in the channels' coordinates are one SISO problem for each channel, whose
 bounds are the whole's, or its own where they are tighter: the singular values of S, KS, T and GS
-are the channels' moduli. Plants whose channels are coupled are bounded as a whole
-(`mimo_figures`). All parts share ω_b, a channel's own bandwidth is in proportion.
+are the channels' moduli. Plants whose channels are coupled are bounded as a whole. All parts share
+ω_b, a channel's own bandwidth is in proportion.
 """
 
 from collections.abc import Sequence
@@ -20,14 +20,12 @@ from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,
     Constraints,
-    Curve,
     LoopProblem,
+    MatrixProblem,
     Problem,
     plant_of_row,
 )
-from ccd_casadi.fixed_structure.mimo_curvature import whole_hessians
-from ccd_casadi.fixed_structure.mimo_levels import MatrixProblem
-from ccd_casadi.fixed_structure.mimo_loop import matrix_plant_set
+from ccd_casadi.kernels.limits import Curve
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -101,7 +99,7 @@ def composite_problem(
 ) -> CompositeProblem:
     """The problem in the units of the first plant; `frequencies` (rad/s) bound those of K's roots.
 
-    Raises PlantError as `matrix_plant_set` does.
+    Raises PlantError as `plant_set` does.
     """
     first = plants[0]
     alike = [in_units_of(plant, first) for plant in plants]
@@ -129,7 +127,7 @@ def composite_problem(
             problem = Problem(plant_set(singles[i], sampling), own, limits, box[:, place], margin)
             parts.append(Part(problem, place, members, i, lead))
     if len(together):
-        matrices = matrix_plant_set([alike[j] for j in together], structure.decoupling, sampling)
+        matrices = plant_set([alike[j] for j in together], sampling, structure.decoupling)
         place = structure.places
         whole = MatrixProblem(matrices, structure.apart, bounds, box[:, place], margin)
         parts.append(Part(whole, place, together))
@@ -171,9 +169,6 @@ def _(
             rows.append((own.curve, own.plant + start, own.v, own.value, wide, own.to_tau))
         sides.append(Constraints(*(np.concatenate(column) for column in zip(*rows, strict=True))))
     return Assessment(True, poles, sides[0], sides[1])
-
-
-hessians.register(MatrixProblem, whole_hessians)
 
 
 @to_theta.register
@@ -218,7 +213,7 @@ def kinds_of_rows(problem: LoopProblem, found: Constraints) -> list[str]:
         for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
             channel = part.channel
             if isinstance(part.problem, MatrixProblem):
-                past = row // len(part.problem.plants.plants) - part.problem.own.first
+                past = row // len(part.problem.plants.plants) - part.problem.first
                 channel = past if past >= 0 else None
             if channel is None:
                 continue

@@ -1,19 +1,16 @@
 """The Hessians of the constraints c_j to (κ, τ), exact but for one difference in frequency.
 
-At a fixed frequency, with g = ∂ln K,
-
-    ∂²ln|S| = -Re(S T g gᵀ + T ∂²ln K),   ∂²ln|KS| = ∂²ln|T| = -Re(S T g gᵀ - S ∂²ln K),
-
-and a peak moves as κ does: -c_xκ c_xκᵀ/c_xx is added, x = ln v. (T here is without weight.)
+At a fixed frequency they are those of `kernels.loop_curvature`, and a peak moves as κ does:
+-c_xκ c_xκᵀ/c_xx is added, x = ln v.
 """
 
 from functools import singledispatch
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.figures import IS_OF_S, loop_rows, to_parameters
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem, Problem
-from ccd_casadi.fixed_structure.structure import second_slopes
+from ccd_casadi.fixed_structure.figures import evaluate_rows
+from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, LoopProblem
+from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.support.arrays import Array
 
 STEP = 1e-5  # of ln v
@@ -22,25 +19,17 @@ STEP = 1e-5  # of ln v
 @singledispatch
 def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
     """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
-    assert isinstance(problem, Problem)
-    n, m = len(kappa), len(rows.v)
+    n, m, P = len(kappa), len(rows.v), len(problem.plants.plants)
     out = np.zeros((m, n + 1, n + 1))
     if not m:
         return out
-    _, slope, S, g = loop_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v)
-    T = 1.0 - S
-    of_s = IS_OF_S[rows.curve]
-    second = second_slopes(problem.structure, kappa, 1j * rows.v)
-    weighted = np.where(of_s, -T, S)[:, None, None] * second
-    out[:, :n, :n] = (weighted - (S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
-    slopes, gradients = [], []
-    for sign in (1.0, -1.0):
-        moved = rows.v * np.exp(sign * STEP)
-        _, near, *parts = loop_rows(problem, kappa, tau, rows.curve, rows.plant, moved)
-        slopes.append(near)
-        gradients.append(to_parameters(rows.curve, *parts))
-    c_xx = (slopes[0] - slopes[1]) / (2.0 * STEP)
-    c_xk = (gradients[0] - gradients[1]) / (2.0 * STEP)
+    loop = problem.loop(kappa, tau)
+    out[:, :n, :n] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
+    (_, slope, *_), up, down = (
+        evaluate_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v * np.exp(step))
+        for step in (0.0, STEP, -STEP)
+    )
+    c_xx, c_xk = ((up[i] - down[i]) / (2.0 * STEP) for i in (1, 2))
     end = rows.curve == Curve.CROSSING
     fixed = end | (rows.curve == Curve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))

@@ -7,6 +7,10 @@ Tustin's rule, without prewarping and without lead, as `deploy` discretises it. 
 loop are one: poles in the left half plane, responses on jv. Without sampling v = ω. A delay comes
 with sampling only: then the loop has finitely many poles, and its stability is decided by them.
 
+u = -K y with K = V diag(K_i) Uᵀ; where U and V are orthogonal the plants are turned into the
+coordinates of the channels first. There may be more inputs than outputs: two actuators on one
+sensor are U = (1 1), V = I, G K = G_1 K_1 + G_2 K_2. One channel has U = V = 1.
+
 Time is counted in 1/ω₀ of the first plant, force in its unit (`scaling`).
 """
 
@@ -16,6 +20,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
 from ccd_casadi.fixed_structure.loop_plant import (
     LoopPlant,
     finite_zeros,
@@ -24,20 +30,23 @@ from ccd_casadi.fixed_structure.loop_plant import (
     padded_states,
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
+from ccd_casadi.kernels import modes
 from ccd_casadi.lti.hold import Sampling, moments, transfer
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
-CANCELLING = 1e-4  # |z - e^{pT}| below which the difference loses digits, and expm1 does not
 
 
 @dataclass(frozen=True)
 class PlantSet:
-    """All plants in the units of the first: ω₀ in rad/s, force in N/m; T and τ in 1/ω₀.
+    """All plants, p x m with p <= m, in the units of the first: ω₀ in rad/s, force in N/m; T and τ
+    in 1/ω₀.
 
-    `poles` and `residues` (P, n) are those of the continuous plants, the shorter ones with zeros.
+    `poles` (P, n) and `residues` (P, n, p, m) are those of the continuous plants, the shorter ones
+    with zeros. `out` = Uᵀ (c, p) and `into` = V (m, c) in the coordinates of the plants: identities
+    where they are turned.
     """
 
     plants: tuple[LoopPlant, ...]
@@ -52,19 +61,36 @@ class PlantSet:
     B: Array
     C: Array
     D: Array
+    out: Array
+    into: Array
 
     @cached_property
-    def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of hold and delay: d (P,), and a mode's two moments and e^{pT}, (P, n)."""
-        assert self.period is not None
-        d, late, early = moments(self.poles, self.period, self.delay)
-        return np.full(len(self.poles), d), late, early, np.exp(self.poles * self.period)
+    def modes(self) -> modes.Plants:
+        """Conjugate poles in pairs, as the kernels have them."""
+        upper = self.poles.imag >= 0.0
+        order = np.argsort(~upper, axis=1, kind="stable")[:, : int(upper.sum(axis=1).max())]
+        kept = np.take_along_axis(upper, order, axis=1)
+        p = np.take_along_axis(self.poles, order, axis=1)
+        p.imag = np.abs(p.imag)  # those past the last of a plant have no residue
+        r = np.take_along_axis(self.residues, order[..., None, None], axis=1)
+        share = np.where(kept, np.where(p.imag == 0.0, 0.5, 1.0), 0.0)[..., None, None]
+        residues = np.stack([share * r.real, np.where(share == 1.0, r.imag, 0.0)], axis=2)
+        if self.period is None:
+            return modes.Plants(np.stack([p] * 4, axis=-1), residues, 0.0, 0.0)
+        d, late, early = moments(p, self.period, self.delay)
+        terms = np.stack([p, late, early, np.exp(p * self.period)], axis=-1)
+        return modes.Plants(terms, residues, self.period, d)
 
     def frequency(self, v: Array) -> Array:
         """ω of v, both over ω₀."""
         if self.period is None:
             return v
         return np.asarray(2.0 / self.period * np.arctan(0.5 * self.period * v))
+
+    def chain(self, v: Array) -> Array:
+        """∂ln ω/∂ln v."""
+        T = self.period or 0.0
+        return np.asarray(v / self.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
 
     def variable(self, omega: Array) -> Array:
         """v of ω, both over ω₀; infinite from half the sampling rate on."""
@@ -73,69 +99,21 @@ class PlantSet:
         half = np.minimum(0.5 * self.period * omega, 0.5 * np.pi)
         return np.asarray(2.0 / self.period * np.tan(half))
 
-    def responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G of the plants `which` at jv and ∂G/∂ln v; both indices of one shape."""
-        value, slope = self.modal_terms(which, v)
-        r = self.residues[which]
-        return (r * value).sum(-1), (r * slope).sum(-1)
-
-    def values(self, which: np.ndarray, v: Array, *, free: bool = False) -> np.ndarray:
-        """G of the plants `which` at jv alone; `free` of hold and delay."""
-        value = self.modal_values(which, v, free=free)
-        return np.asarray((self.residues[rows_alike(which)] * value).sum(-1))
-
-    def modal_values(self, which: np.ndarray, v: Array, *, free: bool = False) -> np.ndarray:
-        """f(p; jv) (..., n), with which modes of unit residue answer; `free` of hold and delay."""
-        s, which = 1j * self.frequency(v)[..., None], rows_alike(which)
-        if self.period is None or free:
-            return np.asarray(1.0 / (s - self.poles[which]))
-        d, late, early, _ = (part[which] for part in self.held)
-        z, gap = self._gaps(which, s)
-        return np.asarray((late + early / z) / gap * np.exp(-s * self.period * d[..., None]))
-
-    def _gaps(self, which: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """z = e^{sT} and z - e^{pT}, without loss of digits where they are close."""
-        assert self.period is not None
-        p, grown = self.poles[which], self.held[3][which]
-        z = np.exp(s * self.period)
-        gap = z - grown
-        near = np.abs(gap) < CANCELLING
-        at_s, at_p, own = (np.broadcast_to(part, gap.shape)[near] for part in (s, p, grown))
-        gap[near] = own * np.expm1((at_s - at_p) * self.period)
-        return z, gap
-
-    def modal_terms(
+    def responses(
         self, which: np.ndarray, v: Array, *, free: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same with ∂f/∂ln v."""
-        s = 1j * self.frequency(v)[..., None]
-        T = self.period
-        if T is None or free:
-            warp = v if T is None else v / (1.0 + (0.5 * T * v) ** 2)
-            f = 1.0 / (s - self.poles[which])
-            return f, -f * f * (1j * warp)[..., None]
-        d, late, early, _ = (part[which] for part in self.held)
-        d = d[..., None]
-        z, gap = self._gaps(which, s)
-        value = (late + early / z) / gap
-        slope = early / (z * gap) + value * z / gap + d * value
-        shift = np.exp(-s * T * d)
-        chain = -1j * T * v / (1.0 + (0.5 * T * v) ** 2)
-        return value * shift, slope * shift * chain[..., None]
+        """G (..., p, m) of the plants `which` at jv and ∂G/∂ln v; both indices of one shape.
 
-    def free_responses(self, which: np.ndarray, v: Array) -> tuple[np.ndarray, np.ndarray]:
-        """G(jω) of the continuous plant without hold and delay, and ∂G/∂ln v.
-
-        A disturbing force d e^{jωt} shows in the samples as G(jω) d, whatever the sampling.
+        `free` of hold and delay: a disturbing force d e^{jωt} shows in the samples as G(jω) d,
+        whatever the sampling.
         """
-        value, slope = self.modal_terms(which, v, free=True)
-        r = self.residues[which]
-        return (r * value).sum(-1), (r * slope).sum(-1)
-
-    def to_theta(self, which: int, v: Array, *, free: bool = False) -> np.ndarray:
-        """∂G/∂θ (len(v), n_θ) of one plant at jv; `free` of hold and delay."""
-        one = np.ones((len(v), 1))
-        return self.form_to_theta(which, v, one, one, free=free)
+        v = np.asarray(v, float)
+        at, plants, chain = v, self.modes, np.ones_like(v)
+        if free:
+            at, plants, chain = self.frequency(v), plants._replace(period=0.0), self.chain(v)
+        found = modes.responses(plants, np.ravel(which), at.ravel())
+        G, slope = (found[:, i].reshape(*v.shape, *found.shape[2:]) for i in (0, 1))
+        return G, slope * chain[..., None, None]
 
     def form_to_theta(
         self, which: int, v: Array, left: np.ndarray, right: np.ndarray, *, free: bool = False
@@ -166,49 +144,67 @@ class PlantSet:
         return np.asarray(out)
 
 
-def rows_alike(which: np.ndarray) -> np.ndarray:
-    """Numbers of plants (P, k) as (P, 1) where every row is one plant: nothing is copied k times.
+def plant_set(
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None = None,
+    decoupling: Decoupling | None = None,
+) -> PlantSet:
+    """The plants in the units of the first, with hold and delay where the loop is sampled.
 
-    That is how they come for a grid: broadcast, with a stride of 0.
+    Without a decoupling for one channel. Raises PlantError for a plant whose inputs or outputs are
+    not those of the channels, that has more outputs than inputs, is not stable, or not
+    diagonalisable.
     """
-    return which[..., :1] if which.ndim > 1 and which.strides[-1] == 0 else which
-
-
-def plant_set(plants: Sequence[ScaledPlant], sampling: Sampling | None = None) -> PlantSet:
-    """The plants in common units, with hold and delay where the loop is sampled.
-
-    Raises PlantError for a plant that is not SISO, not stable, or not diagonalisable.
-    """
+    out = into = np.eye(1)
+    if decoupling is not None:
+        out, into = decoupling.outputs.T, decoupling.inputs
     for number, plant in enumerate(plants, 1):
-        if plant.B.shape[1] != 1 or plant.C.shape[0] != 1:
+        shape = (plant.C.shape[0], plant.B.shape[1])
+        if decoupling is None and shape != (1, 1):
             raise PlantError(f"plant {number} is not SISO; give one of its channels")
+        words = f"plant {number} has {shape[0]} outputs and {shape[1]} inputs"
+        if shape != (out.shape[1], len(into)):
+            given = f"the channels' directions have {out.shape[1]} and {len(into)} entries"
+            raise PlantError(f"{words}, but {given}; give as many of each")
+        if shape[0] > min(shape[1], len(out)):
+            given = f"for {len(out)} channels"
+            raise PlantError(f"{words} {given}; leave some outputs out, or give more channels")
+    if decoupling is not None and decoupling.orthogonal:
+        plants = [in_channels(plant, decoupling) for plant in plants]
+        out = into = np.eye(len(out))
     found, units = loop_plants(plants, sampling)
-    poles, residues = padded_modes(found)
     zeros = tuple(finite_zeros(loop) for loop in found)
-    return PlantSet(tuple(found), *units, poles, residues[:, :, 0, 0], zeros,
-                    *padded_states(found))  # fmt: skip
+    directions = (np.ascontiguousarray(M, float) for M in (out, into))
+    return PlantSet(tuple(found), *units, *padded_modes(found), zeros, *padded_states(found),
+                    *directions)  # fmt: skip
 
 
-def closed_loops(plants: PlantSet, structure: Structure, kappa: Array) -> np.ndarray:
+def closed_loops(
+    plants: PlantSet, structure: Structure | ChannelStructure, kappa: Array
+) -> np.ndarray:
     """Poles (N, P, n) in w of every plant's loop with N controllers κ (N, n_κ); NaN if ill-posed.
 
-    An algebraic loop with 1 + D_G D_K = 0 has a pole at z = -1: it counts as not stable.
+    An algebraic loop with det(I + D_K D_G) = 0 has a pole at z = -1: it counts as not stable.
     """
-    a, b, c, d = state_spaces(structure, np.atleast_2d(kappa))
-    N, P, n, k = len(a), len(plants.A), plants.A.shape[1], a.shape[1]
-    Dg, Dk = plants.D[None, :, 0, 0], d[:, None, 0, 0]
-    well = 1.0 + Dg * Dk
-    m = (1.0 / np.where(well == 0.0, 1.0, well))[..., None, None]
-    A, B, C = plants.A[None], plants.B[None], plants.C[None]
-    a, b, c = a[:, None], b[:, None], c[:, None]
-    Dg, Dk = Dg[..., None, None], Dk[..., None, None]
-    joint = np.empty((N, P, n + k, n + k))
-    joint[:, :, :n, :n] = A - m * Dk * (B @ C)
-    joint[:, :, :n, n:] = m * (B @ c)
-    joint[:, :, n:, :n] = -m * (b @ C)
-    joint[:, :, n:, n:] = a - m * Dg * (b @ c)
-    values = np.linalg.eigvals(joint)
-    return np.where((well != 0.0)[..., None], values, np.nan)
+    kappa = np.atleast_2d(kappa)
+    if isinstance(structure, Structure):
+        a, b, c, d = state_spaces(structure, kappa)
+    else:
+        systems = [structure.diagonal(one) for one in kappa]
+        a, b, c, d = (np.array([getattr(one, name) for one in systems]) for name in "ABCD")
+    A, B, C, D = plants.A, plants.B, plants.C, plants.D
+    a, d = a[:, None], (plants.into @ d @ plants.out)[:, None]
+    b, c = (b @ plants.out)[:, None], (plants.into @ c)[:, None]
+    well = np.eye(d.shape[-2]) + d @ D
+    posed = np.linalg.det(well) != 0.0
+    m = np.linalg.inv(np.where(posed[..., None, None], well, np.eye(d.shape[-2])))
+    n, k = A.shape[-1], a.shape[-1]
+    joint = np.empty((len(a), len(A), n + k, n + k))
+    joint[..., :n, :n] = A - B @ (m @ d) @ C
+    joint[..., :n, n:] = B @ (m @ c)
+    joint[..., n:, :n] = -b @ (C - D @ (m @ d) @ C)
+    joint[..., n:, n:] = a - b @ D @ (m @ c)
+    return np.where(posed[..., None], np.linalg.eigvals(joint), np.nan)
 
 
 def stable(poles: np.ndarray) -> np.ndarray:

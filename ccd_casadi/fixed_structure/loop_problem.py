@@ -6,7 +6,9 @@
     S_low   ln|S(jω_low)| - ln S_low
     KS, T   ln|W_KS KS|, ln|W_T T| - ln weighted_level,   GS   ln|GS| - ln compliance_max
 
-A constraint is c(κ, τ) <= 0 with τ = ln ω_b.
+A constraint is c(κ, τ) <= 0 with τ = ln ω_b. Of several channels |M| stands for every singular
+value: row number i + kP is the k-th of plant i of P. After those of the whole, p of them, come the
+rows that single channels keep within bounds of their own: uᵀS and wᵀKS, u and w of `ChannelBounds`.
 """
 
 from dataclasses import dataclass
@@ -17,10 +19,9 @@ import numpy as np
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.loop import PlantSet
-from ccd_casadi.fixed_structure.structure import (
-    Structure,
-)
-from ccd_casadi.kernels.sections import Curve, Limit
+from ccd_casadi.fixed_structure.structure import Structure, roots
+from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
+from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
@@ -49,7 +50,7 @@ class LoopProblem:
     @cached_property
     def base(self) -> Array:
         """v from far below ω_low and every root to far above, logarithmic."""
-        sizes = np.abs(self.plants.poles[self.plants.residues != 0.0])
+        sizes = np.abs(self.plants.poles[(self.plants.residues != 0.0).any(axis=(2, 3))])
         bottom = 0.03 * min(self.low, float(sizes.min()))
         top = 100.0 * max(1.0, float(sizes.max()))  # of a rigid body ω₀, not its suspension
         if self.bounds.weighted_level is not None and self.bounds.weights is not None:
@@ -87,43 +88,96 @@ class LoopProblem:
         short = self.bounds.shape_ends is ShapeEnd.CROSSING
         return curve is Curve.LEVEL or (curve is Curve.SHAPE and short)
 
+    @property
+    def first(self) -> int:
+        """How many gains of each matrix are of the whole; the others are rows of channels."""
+        return len(self.plants.C[0])
+
+    @cached_property
+    def _factors(self) -> tuple[np.ndarray, np.ndarray]:
+        """The factors of K and the channel of every parameter, see `kernels.loop_point.Loop`."""
+        structure = self.structure
+        parts = [(structure, 0)] if isinstance(structure, Structure) else [
+            (own, place.start)
+            for own, place in zip(structure.structures, structure.slices, strict=True)
+        ]  # fmt: skip
+        factors, channel = [], np.zeros(len(structure.names), np.int64)
+        for i, (own, start) in enumerate(parts):
+            channel[start : start + len(own.names)] = i
+            factors.append(np.insert(own.factors + np.array([0, 0, start]), 0, i, axis=1))
+        return np.concatenate(factors), channel
+
+    def roots(self, kappa: Array) -> np.ndarray:
+        """Zeros and poles of K."""
+        own = self.structure
+        found = roots(own, kappa) if isinstance(own, Structure) else own.roots(kappa)
+        return np.concatenate(found)
+
+    @cached_property
+    def leads(self) -> Array:
+        """ln ω_i/ω_b by number."""
+        return np.append(np.zeros(self.first), [one.lead for one in self.bounds.channels])
+
+    @cached_property
+    def limits(self) -> Array:
+        """What gains are held against at ω_b = ω₀, (Limit.COUNT, numbers), see `kernels.limits`."""
+        b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
+        found = np.zeros((Limit.COUNT, self.first + len(b.channels)))
+        found[: len(Curve)] = np.inf
+        whole, alone = found[:, : self.first], found[:, self.first :]
+        whole[[Curve.S_MAX, Curve.S_LOW]] = np.log([[b.S_max], [b.S_low]])
+        whole[[Curve.CROSSING, Curve.LEVEL]] = -HALF_POWER
+        found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
+        if b.shape is not None:
+            whole[Curve.SHAPE] = np.log(b.shape) - HALF_POWER
+        if b.compliance_max is not None:
+            whole[Curve.GS] = np.log(b.compliance_max * force)
+        if b.weights is not None and b.weighted_level is not None:
+            w, level = b.weights, np.log(b.weighted_level)
+            whole[Curve.KS] = level - np.log(w.c_K / w.M_K * force)
+            whole[Curve.T] = level + np.log(w.A_u)
+            ends = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
+            found[Limit.KS_ZERO : Limit.COUNT] = np.array(ends)[:, None] / w0
+        for i, one in enumerate(b.channels):
+            if one.S_max is not None:
+                alone[Curve.S_MAX, i] = np.log(one.S_max)
+            if one.M_K is not None and b.weights is not None:
+                alone[Curve.KS, i] = whole[Curve.KS, 0] + np.log(one.M_K / b.weights.M_K)
+            if one.lead > 0.0:
+                alone[[Curve.CROSSING, Curve.LEVEL], i] = -HALF_POWER
+                alone[Curve.SHAPE, i] = whole[Curve.SHAPE, 0] - one.lead
+        return found
+
+    @cached_property
+    def _rows(self) -> Array:
+        """uᵀ and wᵀ of the channels in the plants' coordinates, (2, channels, m)."""
+        count, into = len(self.bounds.channels), self.plants.into
+        found = np.zeros((2, count, len(into)))
+        found[0, :, : self.first] = self.plants.out[:count]
+        found[1] = np.linalg.inv(into)[:count]
+        return found
+
+    def loop(self, kappa: Array, tau: float | None) -> Loop:
+        """What the kernels take at κ and τ; without bounds where τ is None."""
+        limits = np.zeros_like(self.limits) if tau is None else self.limits.copy()
+        limits[Curve.SHAPE] -= tau or 0.0
+        plants = self.plants
+        return Loop(self._factors[0], np.exp(kappa), self._factors[1], plants.into, plants.out,
+                    *plants.modes, limits, self._rows)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Problem(LoopProblem):
-    """That of SISO plants, with what its kernels take (`kernels.sections`)."""
+    """That of one channel."""
 
     structure: Structure
 
-    @cached_property
-    def factors(self) -> np.ndarray:
-        """Those of the structure."""
-        return self.structure.factors
 
-    @cached_property
-    def modes(self) -> tuple[tuple[np.ndarray, ...], float, float]:
-        """The plants' modes, T (0: continuous) and whole periods of delay."""
-        P = self.plants
-        if P.period is None:
-            return (P.poles, P.residues, P.poles, P.poles, P.poles), 0.0, 0.0
-        d, late, early, grown = P.held
-        return (P.poles, P.residues, late, early, grown), P.period, float(d[0])
+@dataclass(frozen=True)
+class MatrixProblem(LoopProblem):
+    """That of several channels as a whole, each with parameters of its own."""
 
-    def limits(self, tau: float) -> Array:
-        """What the curves are held against at ω_b = e^τ; infinite where nothing bounds one."""
-        b, w0, force = self.bounds, self.plants.omega_0, self.plants.force
-        found = np.zeros(Limit.COUNT)
-        found[Limit.S_MAX], found[Limit.S_LOW] = np.log(b.S_max), np.log(b.S_low)
-        found[Limit.SHAPE] = np.inf if b.shape is None else np.log(b.shape) - tau
-        found[Limit.LEAST] = 0.0 if self.structure.integrator else self.low
-        if b.weights is not None and b.weighted_level is not None:
-            w, level = b.weights, np.log(b.weighted_level)
-            found[Limit.KS] = level - np.log(w.c_K / w.M_K * force)
-            found[Limit.T] = level + np.log(w.A_u)
-            roots = (w.omega_K, w.c_K * w.omega_K, w.omega_T / w.A_l, w.omega_T / w.A_u)
-            found[Limit.KS_ZERO : Limit.COUNT] = np.array(roots) / w0
-        if b.compliance_max is not None:
-            found[Limit.GS] = np.log(b.compliance_max * force)
-        return found
+    structure: ChannelStructure
 
 
 @dataclass(frozen=True)
@@ -180,19 +234,6 @@ def log_weights(weights: Weights, omega: Array) -> tuple[Array, Array]:
     ]
     slopes = [square / (square + z**2) - square / (square + p**2) for z, p in pairs]
     return np.array(values), np.array(slopes)
-
-
-def shaped_at(problem: LoopProblem, omega: Array) -> Array:
-    """The ω that the shape counts: its own, without an integrator at least ω_low."""
-    return omega if problem.structure.integrator else np.maximum(omega, problem.low)
-
-
-def chain_of(problem: LoopProblem, v: Array) -> Array:
-    """∂ln ω/∂ln v."""
-    T = problem.plants.period
-    if T is None:
-        return np.ones_like(v)
-    return np.asarray(v / problem.plants.frequency(v) / (1.0 + (0.5 * T * v) ** 2))
 
 
 def flanked(values: np.ndarray) -> Array:

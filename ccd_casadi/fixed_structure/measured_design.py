@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.figures import HALF_POWER, IS_OF_S
 from ccd_casadi.fixed_structure.local_search import descend
 from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
 from ccd_casadi.fixed_structure.measured import (
@@ -34,6 +33,7 @@ from ccd_casadi.fixed_structure.structure import (
     second_slopes,
     state_space,
 )
+from ccd_casadi.kernels.limits import HALF_POWER
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate, Model, Rows
 from ccd_casadi.support.arrays import Array
@@ -227,8 +227,8 @@ class _OnLines(Model[Constraints]):
         K, g, _ = response_and_slopes(self.structure, kappa, s)
         S = 1.0 / (1.0 + self.G[rows.plant] * K)
         T = 1.0 - S
-        weighted = np.where(IS_OF_S[rows.curve], -T, S)[:, None, None]
-        weighted = weighted * second_slopes(self.structure, kappa, s)
+        sign = np.where(np.isin(rows.curve, (Curve.KS, Curve.T)), S, -T)[:, None, None]
+        weighted = sign * second_slopes(self.structure, kappa, s)
         out = np.zeros((len(s), n + 1, n + 1))
         out[:, :n, :n] = (weighted - (S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
         return out

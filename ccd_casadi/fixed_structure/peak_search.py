@@ -5,33 +5,55 @@ a rational function has no narrower peak than these. A local maximum on it is cl
 its exact slope.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.loop_problem import (
-    LoopProblem,
-    flanked,
-)
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem, flanked
+from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.kernels.loop_rows import close, levels
 from ccd_casadi.support.arrays import Array
 
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
 FLAT = 1e-9  # slope at a maximum
 NARROW = 1e-6  # of its first width: a bracket that is left alone, as at a kink
+# Sorted singular values may have two maxima between neighbours of the grid, where the smooth ones
+# cross, or one and a crossing, past which the slope has no change of sign: brackets of a maximum
+# above -CLOSE are looked at again at so many places and at the maximum (an even number: the middle
+# of a regular grid's bracket is the maximum itself).
+CLOSE = 0.1
+FINER = 12
+
+
+@dataclass(frozen=True)
+class Brackets:
+    """Local maxima: curve, row, where on a grid, and the neighbours there."""
+
+    curve: np.ndarray
+    row: np.ndarray
+    start: Array
+    low: Array
+    high: Array
+
+    def only(self, chosen: np.ndarray) -> "Brackets":
+        """Some of them, by mask or index."""
+        return Brackets(*(part[chosen] for part in vars(self).values()))
+
+    def and_those(self, *others: "Brackets") -> "Brackets":
+        """These and others."""
+        parts = zip(*(vars(one).values() for one in (self, *others)), strict=True)
+        return Brackets(*(np.concatenate(part) for part in parts))
 
 
 def frequency_grid(
-    problem: LoopProblem,
-    controller: tuple[np.ndarray, np.ndarray],
-    poles: np.ndarray,
+    problem: LoopProblem, roots: np.ndarray, poles: np.ndarray
 ) -> tuple[Array, np.ndarray]:
     """The frequencies v (P, k), ascending, on which peaks are looked for; which are of the base.
 
-    `controller`: the zeros and the poles of K.
+    `roots`: the zeros and the poles of K.
     """
-    own = np.concatenate(controller)
-    own = np.tile(own[np.abs(own) > 0.0], (len(poles), 1))
+    own = np.tile(roots[np.abs(roots) > 0.0], (len(poles), 1))
     joint = np.concatenate([problem.fixed, flanked(own), flanked(poles)], axis=1)
     bottom, top = problem.base[0], problem.base[-1]
     # Points that fall together would hide a peak between them: spares go below the base instead.
@@ -50,39 +72,64 @@ def frequency_grid(
     return np.delete(v, useless, axis=1), np.delete(regular, useless, axis=1)
 
 
-def closed_on_zero(
-    slope: Callable[[Array, np.ndarray], Array], start: Array, low: Array, high: Array
-) -> tuple[Array, np.ndarray]:
-    """Local maxima by Illinois false position on the slope, in brackets [low, high] around start.
+def local_peaks(
+    loop: Loop, curves: np.ndarray, v: Array, value: Array, depth: float, end: Array
+) -> Brackets:
+    """The local maxima above `depth` of the levels `value` at v (P, k).
 
-    A bracket that two steps do not halve is cut in the middle: where the slope is tiny at one end
-    and large at the other, as with two maxima about to part, false position alone creeps.
-    `slope` takes logarithms and the indices of the brackets that they are in. Where a bracket's
-    slopes do not change sign (an end) the start stays; second: where they do.
+    Brackets stop at `end` (C, numbers) in v; those near their bounds are narrowed where singular
+    values may cross.
     """
-    if not len(start):
-        return start, np.zeros(0, bool)
-    every = np.arange(len(start))
-    middle = np.log(start)
-    f = slope(middle, every)
-    other = np.where(f > 0.0, np.log(high), np.log(low))
-    g = slope(other, every)
-    a, fa, b, fb = middle.copy(), f.copy(), other, g
-    inside = (fa * fb < 0.0) & np.isfinite(fa) & np.isfinite(fb)
-    left = np.flatnonzero(inside)
-    before, wider = np.full((2, len(start)), np.inf)  # widths one and two steps ago
-    narrow = NARROW * np.abs(b - a)
-    for _ in range(CLOSINGS):
-        if not len(left):
-            break
-        A, FA, B, FB = a[left], fa[left], b[left], fb[left]
-        width = np.abs(B - A)
-        creeping = width > 0.5 * wider[left]
-        wider[left], before[left] = before[left], width
-        x = np.where(creeping, 0.5 * (A + B), B - FB * (B - A) / (FB - FA))
-        fx = slope(x, left)
-        opposite = fx * FB < 0.0
-        a[left], fa[left] = np.where(opposite, B, A), np.where(opposite, FB, 0.5 * FA)
-        b[left], fb[left] = x, fx
-        left = left[(np.abs(fx) >= FLAT) & (np.abs(b - a) > narrow)[left]]
-    return np.exp(np.where(inside, b, middle)), inside
+    (P, count), first = v.shape, loop.out.shape[1]
+    beside = np.pad(value, ((0, 0), (1, 1), (0, 0), (0, 0)), constant_values=-np.inf)
+    tops = (value > depth) & (value >= beside[:, :-2]) & (value > beside[:, 2:])
+    i, at, c, k = np.nonzero(tops)
+    low, high = v[i, np.maximum(at - 1, 0)], v[i, np.minimum(at + 1, count - 1)]
+    found = Brackets(curves[c], i + k * P, v[i, at], low, np.minimum(high, end[c, k]))
+    if first == 1:
+        return found
+    near = np.flatnonzero((value[i, at, c, k] > -CLOSE) & (found.low < found.high))
+    inside = np.geomspace(found.low[near], found.high[near], FINER, axis=1)
+    inside = np.sort(np.concatenate([inside, found.start[near, None]], axis=1), axis=1)
+    level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * CLOSE)
+    return split(found, near, inside, level[:, :, 0], P, first)
+
+
+def split(
+    found: Brackets, near: np.ndarray, inside: Array, level: Array, P: int, first: int
+) -> Brackets:
+    """Brackets with those `near` narrowed by the levels (N, k, numbers) inside, (N, k) in v;
+    several maxima in one come apart.
+
+    A maximum of σ_k+1 where smooth ones cross has one of σ_k beside it, which the grid may miss.
+    """
+    known = found.only(near)
+
+    def tops(row: np.ndarray) -> np.ndarray:
+        own = level[np.arange(len(near)), :, row // P]
+        return np.asarray((own[:, 1:-1] >= own[:, :-2]) & (own[:, 1:-1] > own[:, 2:]))
+
+    def bracketed(row: np.ndarray, top: np.ndarray) -> Brackets:
+        i, m = np.nonzero(top)
+        return Brackets(known.curve[i], row[i], inside[i, m + 1], inside[i, m], inside[i, m + 2])
+
+    own = tops(known.row)
+    kept = np.setdiff1d(np.arange(len(found.row)), near[own.any(axis=1)])
+    crossed = (known.row >= P) & (known.row < first * P)
+    above = np.where(crossed, known.row - P, known.row)
+    beside = tops(above) & crossed[:, None]
+    # no maximum twice
+    same = (above[:, None] == found.row) & (known.curve[:, None] == found.curve)
+    x = inside[:, 1:-1, None]
+    beside &= ~(same[:, None] & (found.low <= x) & (x <= found.high)).any(axis=2)
+    return found.only(kept).and_those(bracketed(known.row, own), bracketed(above, beside))
+
+
+def closed_on_peaks(loop: Loop, peaks: Brackets) -> tuple[Array, np.ndarray]:
+    """The maxima in brackets, and which of them lie inside."""
+    P = len(loop.terms)
+    ends = (peaks.start, peaks.low, peaks.high)
+    found: tuple[Array, np.ndarray] = close(
+        peaks.curve, peaks.row // P, peaks.row % P, *ends, loop, (FLAT, NARROW, float(CLOSINGS))
+    )
+    return found

@@ -29,7 +29,7 @@ SKEWED = (
 def resonances(problem: Problem) -> Array:
     """|p| of the flexible modes of the first plant that the loop sees, the strongest first."""
     plants = problem.plants
-    p, r = plants.poles[0], plants.residues[0]
+    p, r = plants.poles[0], plants.residues[0, :, 0, 0]
     light = (p.imag > 0.0) & (-p.real < 0.2 * np.abs(p))
     strength = np.abs(r) / np.maximum(-p.real, 1e-300)
     order = np.argsort(-strength[light])
@@ -144,7 +144,7 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     v = problem.plants.variable(np.asarray(crossovers, float))
     kappa[:, kinds] = 0.0
     K = response(problem.structure, kappa.T, 1j * v)
-    G, _ = problem.plants.responses(np.zeros(len(v), int), v)
+    G = problem.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
     kappa[:, kinds] = -np.log(np.abs(G * K))[:, None]
     return np.clip(kappa, *problem.box)
 

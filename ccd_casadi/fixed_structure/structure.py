@@ -13,7 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.kernels.sections import INTEGRATOR, PAIR, REAL
+from ccd_casadi.kernels.sections import GAIN, INTEGRATOR, PAIR, REAL
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -78,16 +78,15 @@ class Structure:
     @property
     def factors(self) -> np.ndarray:
         """(f, 3) as `kernels.sections` has them: kind, +1 above or -1 below, first parameter."""
-        found, at = [], 1
-        if self.integrator:
-            found, at = [(INTEGRATOR, 1, 1)], 2
-        kinds = [(REAL, sign) for _ in range(self.lead) for sign in (1, -1)]
+        found, at = [], 0
+        kinds = [(GAIN, 1)] + [(INTEGRATOR, 1)] * self.integrator
+        kinds += [(REAL, sign) for _ in range(self.lead) for sign in (1, -1)]
         kinds += [(PAIR, sign) for _ in range(self.biquads) for sign in (1, -1)]
         kinds += [(PAIR, -1)] * (self.roll_off // 2) + [(REAL, -1)] * (self.roll_off % 2)
         for kind, sign in kinds:
             found.append((kind, sign, at))
             at += 2 if kind == PAIR else 1
-        return np.array(found, np.int64).reshape(-1, 3)
+        return np.array(found, np.int64)
 
     def bounds(self, frequencies: tuple[float, float], gains: tuple[float, float]) -> Array:
         """Lower and upper bounds (2, n) of κ for frequencies and gains within these."""

@@ -1,8 +1,9 @@
 """Compiling every kernel once, on two processes, with words; and doing so when a user comes first.
 
 Numba compiles a function when it is first called and keeps it on disk, beside the sources or,
-where these cannot be written, in the user's own cache. One process does the search for γ_opt,
-the other the certificate; each loads from disk what the other has already left there.
+where these cannot be written, in the user's own cache. One process does the search for γ_opt
+and the rows of structured loops, the other the certificate and their curvature; each loads from
+disk what the other has already left there.
 
 A stamp beside the compiled kernels names the sources, Numba and the processor that they are
 for. The first compilation that finds no such stamp starts the two processes, says so on stderr,
@@ -29,9 +30,9 @@ from ccd_casadi.support.progress import Progress
 from surrogates.options import usable_cores
 
 PACKAGE = __name__.rpartition(".")[0]
-PARTS = ("search", "certificate")
+PARTS = ("search", "certificate", "rows", "curvature")
 WORKER = "CCD_CASADI_COMPILES"  # set in the processes that compile
-SECONDS = 60.0  # of one core, to compile all; measured, said before anything else is known
+SECONDS = 95.0  # of one core, to compile all; measured, said before anything else is known
 
 
 def compile_part(part: str) -> None:
@@ -39,6 +40,8 @@ def compile_part(part: str) -> None:
 
     One tiny problem serves all: SISO and MIMO have the same types.
     """
+    if part in ("rows", "curvature"):
+        return _compile_rows(part == "curvature")
     from ccd_casadi.kernels import design, frequency, gamma, riccati, sensitivity, synthesis
     from ccd_casadi.kernels.generalized_plant import generalized_plant, squared_weights
     from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
@@ -72,19 +75,24 @@ def compile_part(part: str) -> None:
         gamma.gamma_lower_bound(G, w, grid, np.ones(41))
         squared_weights(w, grid)
         sensitivity.axis_frequencies(A, B, C, none, 1.0)
-        _compile_sections()
 
 
-def _compile_sections() -> None:
-    from ccd_casadi.kernels import sections
+def _compile_rows(curvature: bool) -> None:
+    from ccd_casadi.kernels import loop_curvature, loop_point, loop_rows, modes
+    from ccd_casadi.kernels.limits import Limit
 
-    pole = np.array([[-1.0 + 1.0j]])
-    modes = (pole, 0.1 * pole, pole, pole, pole)
-    loop = (np.zeros((1, 3), np.int64), np.ones(2), modes, 0.0, 0.0)
-    one, first, limits = np.ones(1), np.zeros(1, np.int64), np.ones(int(sections.Limit.COUNT))
-    sections.rows(first, *loop, first, one, limits)
-    sections.levels(first, *loop, np.ones((1, 1)), limits)
-    sections.close(first, *loop, first, one, one, one, limits, (1e-9, 1e-6, 40.0))
+    one, first, square = np.ones(1), np.zeros(1, np.int64), np.eye(1)
+    plants = modes.Plants(np.full((1, 1, 4), -1.0 + 1.0j), np.ones((1, 1, 2, 1, 1)), 0.0, 0.0)
+    controller = (np.zeros((1, 4), np.int64), one, first, square, square)
+    limits = (np.ones((int(Limit.COUNT), 1)), np.zeros((2, 0, 1)))
+    loop = loop_point.Loop(*controller, *plants, *limits)
+    if curvature:
+        modes.responses(plants, first, one)
+        loop_curvature.second(first, first, first, one, loop)
+    else:
+        loop_rows.levels(first[None], first, square, loop, 0.0)
+        loop_rows.rows(first, first, first, one, loop)
+        loop_rows.close(first, first, first, one, one, one, loop, (1e-9, 1e-6, 40.0))
 
 
 def ensure_compiled() -> None:
@@ -155,7 +163,8 @@ def _compile(kernels: dict[str, Any], count: int) -> bool:
 
 def _kernels() -> dict[str, Any]:
     """Every kernel, by module and name."""
-    import_module(f"{PACKAGE}.gradients")  # with it all the others
+    for name in ("gradients", "loop_curvature"):  # with them all the others
+        import_module(f"{PACKAGE}.{name}")
     found = {}
     for name, module in list(sys.modules.items()):
         if name.startswith(PACKAGE + "."):

@@ -1,0 +1,69 @@
+"""What the loop's matrices are held against, as what is added to the logarithm of a gain.
+
+    c = ln σ + offset(ω),   a constraint c <= 0
+
+    S_max   -ln S_max,   S_low   -ln S_low,   GS   -ln compliance_max
+    level   ½ ln 2,      shape   ½ ln 2 - ln(shape ω/ω_i),   ω_i = lead ω_b
+    KS, T   ln|W| - ln weighted_level
+
+The gains of a matrix are numbered: its p singular values first, then the rows that single channels
+keep within bounds of their own, uᵀS or wᵀKS, of which the only singular value is the length. A
+table (Limit.COUNT, numbers) has ln of every curve's bound in its first rows, infinite where nothing
+bounds it.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+from ccd_casadi.kernels.compiled import compiled
+
+HALF_POWER = 0.5 * np.log(2.0)
+
+
+class Curve(IntEnum):
+    """What is bounded; the row of its limit."""
+
+    S_MAX = 0
+    SHAPE = 1  # of shape/√2/e^τ/lead
+    S_LOW = 2
+    KS = 3  # of the level over scale and unit of force
+    T = 4  # of the level over scale
+    GS = 5
+    CROSSING = 6  # |S(jω_b)| <= 1/√2, the end of the level
+    LEVEL = 7  # |S| <= 1/√2 below ω_b
+
+
+class Limit(IntEnum):
+    """The other rows: roots of the weights over ω₀."""
+
+    LEAST = 8  # ω that the shape counts at least
+    KS_ZERO = 9
+    KS_POLE = 10
+    T_ZERO = 11
+    T_POLE = 12
+    COUNT = 13
+
+
+@compiled
+def warped(T, v):
+    """ω of v and ∂ln ω/∂ln v, of a loop with period T (0: continuous)."""
+    if T == 0.0:
+        return v, 1.0
+    ω = 2.0 / T * np.arctan(0.5 * T * v)
+    return ω, v / ω / (1.0 + (0.5 * T * v) ** 2)
+
+
+@compiled
+def offset(curve, number, ω, chain, limits):
+    """What is added to the logarithm of a gain, and its slope to ln v."""
+    level = -limits[curve, number]
+    if curve == Curve.SHAPE:
+        least = limits[Limit.LEAST, number]
+        return level - np.log(max(ω, least)), -chain if ω >= least else 0.0
+    if curve == Curve.KS or curve == Curve.T:
+        at = Limit.KS_ZERO if curve == Curve.KS else Limit.T_ZERO
+        a = ω * ω + limits[at, number] ** 2
+        b = ω * ω + limits[at + 1, number] ** 2
+        return level + 0.5 * np.log(a / b), (ω * ω / a - ω * ω / b) * chain
+    return level, 0.0

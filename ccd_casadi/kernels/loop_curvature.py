@@ -1,0 +1,130 @@
+"""Second derivatives of the gains of a loop's matrices to κ, at fixed frequencies.
+
+With ∂_a M = P_i ∂_a K_i Q_i (see `loop_point`) and R = Uᵀ S G V, a of channel i, b of channel j,
+
+    ∂²_ab M = -P_i ∂_a K_i R_ij ∂_b K_j Q_j - P_j ∂_b K_j R_ji ∂_a K_i Q_i + δ_ij P_i ∂²_ab K_i Q_i,
+
+and of λ = σ² as an eigenvalue of MᴴM, with z_m = v_mᴴ ∂(MᴴM) v = σ conj(uᴴ∂M v_m) + (M v_m)ᴴ∂M v,
+
+    ½ ∂²λ/λ = Re(ũᵀ ∂²M v) + Re((∂M v)ᴴ ∂M v)/λ + Re Σ_{m≠} z̄_m z_m/(λ (λ - λ_m)),
+    ∂² ln σ = ½ ∂²λ/λ - 2 ∂ln σ ∂ln σ.
+
+Where σ_m comes close to σ the gap is kept from zero: both are constraints, and the trust region
+holds where the model does.
+"""
+
+import numpy as np
+
+from ccd_casadi.kernels.compiled import compiled
+from ccd_casadi.kernels.limits import Curve
+from ccd_casadi.kernels.loop_point import (
+    FREE,
+    GV,
+    LEFT,
+    RIGHT,
+    SHARE,
+    US,
+    K,
+    M,
+    S,
+    V,
+    gain_of,
+    opened,
+    room,
+    row_of,
+)
+from ccd_casadi.kernels.sections import second_slopes
+
+LEAST_GAP = 1e-2  # of two singular values, relative, that the model counts with
+
+
+@compiled
+def second(curve, number, which, v, loop):
+    """∂²ln σ/∂κ² (M, n, n) of M rows at their v."""
+    at, of, g, sigma = room(loop)
+    (m, c), p, n, channel = loop.into.shape, loop.out.shape[1], g.size, loop.channel
+    z = np.complex128
+    out, bend = np.empty((v.size, n, n)), np.empty((n, n), z)
+    crossed, moved = np.empty((c, c), z), np.empty((c, c), z)
+    back, ahead = np.empty((m, c), z), np.empty((m, c), z)
+    for j in range(v.size):
+        opened(curve[j], which[j], v[j], loop, at, of, g)
+        σ, place = gain_of(curve[j], number[j], loop.into, loop.out, loop.rows, at, of, sigma)
+        columns = m if curve[j] == Curve.GS else p
+        _by_channel(curve[j], number[j], place, loop, at, of, crossed, moved, back, ahead)
+        second_slopes(loop.factors, g, bend)
+        for a in range(n):
+            i = channel[a]
+            for b in range(a + 1):
+                h = channel[b]
+                both = g[a] * g[b]
+                total = g[a].conjugate() * g[b] * moved[i, h] / (σ * σ)
+                total -= both * (crossed[i, h] + crossed[h, i])
+                if i == h:
+                    total += of[SHARE, i] * (bend[a, b] + both)
+                for q in range(columns):
+                    if q != place:
+                        za = ahead[q, i] * g[a] + (back[q, i] * g[a]).conjugate()
+                        zb = ahead[q, h] * g[b] + (back[q, h] * g[b]).conjugate()
+                        total += za.conjugate() * zb * _over_gap(σ, sigma[q])
+                first = (of[SHARE, i] * g[a]).real * (of[SHARE, h] * g[b]).real
+                out[j, a, b] = out[j, b, a] = total.real - 2.0 * first
+    return out
+
+
+@compiled
+def _over_gap(σ, other):
+    """1/(λ (λ - λ_m)), σ's gap to σ_m kept from zero."""
+    gap, least = σ - other, LEAST_GAP * σ
+    if abs(gap) < least:
+        gap = -least if gap < 0.0 else least
+    return 1.0 / (σ * σ * gap * (σ + other))
+
+
+@compiled
+def _by_channel(curve, number, place, loop, at, of, crossed, moved, back, ahead):
+    """For ∂ln K_i = 1 fills left_i K_i R_ij K_j right_j (c, c), (∂M v)ᴴ∂M v (c, c), and both parts
+    of z_m (m, c).
+    """
+    into, (m, c), p = loop.into, loop.into.shape, loop.out.shape[1]
+    rows, columns = m if curve == Curve.KS else p, m if curve == Curve.GS else p
+    z = np.complex128
+    R, P, Q = np.zeros((c, c), z), np.zeros((m, c), z), np.zeros((m, c), z)
+    for i in range(c):
+        for h in range(c):
+            for a in range(p):
+                R[i, h] += at[US, i, a] * at[GV, a, h]
+            crossed[i, h] = of[LEFT, i] * of[K, i] * R[i, h] * of[K, h] * of[RIGHT, h]
+    sign = 1.0 if curve == Curve.T else -1.0
+    for i in range(c):
+        for a in range(rows):
+            if curve == Curve.KS:
+                P[a, i] = into[a, i]
+                for h in range(c):
+                    P[a, i] -= into[a, h] * of[K, h] * R[h, i]
+            else:
+                for b in range(p):
+                    P[a, i] += sign * at[S, a, b] * at[GV, b, i]
+        for q in range(columns):
+            for b in range(p):
+                entry = at[V, b, q]
+                if curve == Curve.GS:
+                    entry = 0.0j
+                    for d in range(m):
+                        entry += at[FREE, b, d] * at[V, d, q]
+                Q[q, i] += at[US, i, b] * entry
+    if number >= p:
+        row_of(loop.rows[int(curve == Curve.KS), number - p], P, rows, c)
+        rows = 1
+    for i in range(c):
+        for h in range(c):
+            moved[i, h] = 0.0
+            for a in range(rows):
+                one, other = P[a, i] * of[K, i] * of[RIGHT, i], P[a, h] * of[K, h] * of[RIGHT, h]
+                moved[i, h] += one.conjugate() * other
+        for q in range(columns):
+            back[q, i], ahead[q, i] = 0.0, 0.0
+            for a in range(rows):
+                change = P[a, i] * of[K, i]
+                back[q, i] += at[M, a, place].conjugate() * change * Q[q, i]
+                ahead[q, i] += at[M, a, q].conjugate() * change * of[RIGHT, i]
