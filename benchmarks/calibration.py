@@ -15,6 +15,7 @@ from numba import njit
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import linprog, minimize
 
+from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.problem import scaled_plant, true_inner
@@ -24,7 +25,7 @@ from ccd_casadi.kernels.design import design
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.sensitivity import sensitivity_gain
-from ccd_casadi.synthesis.closed_loop import local_peaks
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.synthesis.synthesis import synthesise
 
 HZ, W1, W2 = 2.0 * np.pi, 0.0995, -0.9950
@@ -204,8 +205,9 @@ def figures(case, setting, solve=search_inner):
         elif optimum:
             at = weights.at(optimum.figures.omega_S, optimum.figures.omega_T)
             args = {"omega_low": inner.omega_low, "gamma_backoff": setting.backoff}
-            peaks = local_peaks(plant, synthesise(plant, at, **args).controller)
-            out[f"{name} peak"] = peaks[0][0] / HZ, PEAK[name]
+            K = synthesise(plant, at, **args).controller
+            peaks = peaks_of(Loop(plant.plant_si(), K))
+            out[f"{name} peak"] = peaks[0][0], PEAK[name]
     return out
 
 

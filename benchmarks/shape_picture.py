@@ -13,9 +13,9 @@ import fixed_structure as study
 import matplotlib.pyplot as plt
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.lti.loop import Loop
 
 ROW = "+-3 %, damping x 0.5 to 2, 10 kHz, 100 us, least_damping 0.05"
 

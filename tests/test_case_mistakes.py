@@ -41,7 +41,7 @@ MISTAKES: list[tuple[str, Any, str, str]] = [
     ("theta.m1.lower", "55", "theta.m1.lower", "give a finite number"),
     ("theta.m1.lower", False, "theta.m1.lower", "give a finite number"),
     ("theta.m1.unit", 3, "theta.m1.unit", "give a text in quotes"),
-    ("plant.model", 3, "plant.model", "known are two_mass"),
+    ("plant.model", 3, "plant.model", "known are cad_stage"),
     ("sampling.points", 5.0, "sampling.points", "give a whole number"),
     ("sampling.points", True, "sampling.points", "give a whole number"),
     ("sampling.points", 16**5000, "sampling.points", "give a whole number"),

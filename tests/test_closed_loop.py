@@ -16,10 +16,12 @@ from helpers import (
     two_mass,
 )
 
+from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.kernels.figures import Code, Figure
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks, measure, responses
+from ccd_casadi.synthesis.closed_loop import handed_out, measure, responses
 from ccd_casadi.synthesis.synthesis import Design, Outcome, figures_from_row, synthesise
 
 
@@ -115,8 +117,8 @@ def test_each_code_of_the_kernels_is_one_outcome(name: str) -> None:
 def test_every_peak_of_s_above_one_is_listed(made: tuple[ScaledPlant, Design]) -> None:
     plant, design = made
     system, K = plant.plant_si(), design.controller
-    found = local_peaks(plant, K)
-    omega = np.array([at for at, _ in found])
+    found = peaks_of(Loop(system, K))
+    omega = 2.0 * np.pi * np.array([hz for hz, _ in found])
     gain = np.array([value for _, value in found])
     assert (np.diff(omega) > 0.0).all()
     np.testing.assert_allclose(gain, sensitivity_gain(system, K, omega), rtol=1e-6)

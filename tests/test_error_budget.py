@@ -20,13 +20,14 @@ from ccd_casadi.budget import (
 )
 from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.budget.evaluation import variances
-from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
+from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.holding import noise_of_a_period
 from ccd_casadi.budget.loops import Process, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space, state_spaces
 from ccd_casadi.lti.hold import parts
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -87,7 +88,8 @@ def test_a_dense_table_of_a_filter_has_the_filters_budget(sampling: Sampling | N
         hz = np.geomspace(1e-2, 1e4, 500)
         table = TabulatedSpectrum(tuple(hz), tuple(source.spectrum.at(hz)))
         other = replace(source, spectrum=table)
-        pair = [evaluate_budget(made.G, made.K, ErrorBudget((one,), WINDOW), made.hold)
+        G, K = made.plant, made.controller
+        pair = [evaluate_budget(G, K, ErrorBudget((one,), WINDOW), made.sampling)
                 for one in (source, other)]  # fmt: skip
         figures = [[one.error, one.average, one.deviation, one.force] for one in pair]
         np.testing.assert_allclose(figures[1], figures[0], rtol=1e-3)
@@ -120,12 +122,12 @@ def test_derivatives_to_controller_and_plant(
         way = rng.normal(size=len(changes)) / np.sqrt(len(changes))
 
         def at(h: float, way: Array = way) -> Array:
-            G = made.G
+            G = made.plant
             for i, part in enumerate(to_theta):
                 x = h * way[len(kappa) + i]
                 G = StateSpace(*(getattr(G, n) + x * getattr(part, n) for n in "ABCD"))
             K = state_space(structure, kappa + h * way[: len(kappa)])
-            value = variance_slopes(Loop(G, K, made.hold), budget, [])
+            value = variance_slopes(Loop(G, K, made.sampling), budget, [])
             assert value is not None
             return np.log(value.value)
 
@@ -140,18 +142,18 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
     An independent path: no Van Loan, no doubling, forces held by an explicit queue.
     """
     made, _, _ = built(sampling)
-    assert made.hold is not None
+    assert made.sampling is not None
     T, steps = sampling.period, 20
-    whole, rest = parts(T, made.hold.delay)
+    whole, rest = parts(T, made.sampling.delay)
     for source in (SHAPED[0], SHAPED[1]):
-        model = process(made.G, made.K, source, made.hold)
+        model = process(made.plant, made.controller, source, made.sampling)
         moved = model.A + np.eye(len(model.A))
         P = _settled(moved, model.noise)
         found = variances(made, source, None)
         np.testing.assert_allclose(np.trace(model.C @ P @ model.C.T), found.error, rtol=1e-8)
         f = source.shaping()
-        A = np.block([[made.G.A, made.G.B @ f.C], [np.zeros((len(f.A), 4)), f.A]])
-        W = np.vstack([made.G.B @ f.D, f.B])
+        A = np.block([[made.plant.A, made.plant.B @ f.C], [np.zeros((len(f.A), 4)), f.A]])
+        W = np.vstack([made.plant.B @ f.D, f.B])
         # Simpson's rule for the noise of a period, with matrix exponentials at its points.
         points = np.linspace(0.0, T, 2 * steps + 1)
         weights = np.array([1.0, *([4.0, 2.0] * steps)[:-1], 1.0]) * T / (6.0 * steps)
@@ -161,14 +163,15 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
         # One free run of the loop from a state, in substeps, against the model's A.
         rng = np.random.default_rng(0)
         state = rng.normal(size=len(model.A))
-        n, nk = len(A), len(made.K.A)
+        n, nk = len(A), len(made.controller.A)
         x, k, old = state[:n], state[n : n + nk], list(state[n + nk :])
-        half = np.eye(nk) - 0.5 * T * made.K.A
-        e = float(-(made.G.C @ x[:4])[0])
-        middle = np.linalg.solve(half, k + 0.5 * T * made.K.B[:, 0] * e)  # (k_n + k_{n+1})/2
-        u = float((made.K.C @ middle)[0] + made.K.D[0, 0] * e)
+        half = np.eye(nk) - 0.5 * T * made.controller.A
+        e = float(-(made.plant.C @ x[:4])[0])
+        # (k_n + k_{n+1})/2
+        middle = np.linalg.solve(half, k + 0.5 * T * made.controller.B[:, 0] * e)
+        u = float((made.controller.C @ middle)[0] + made.controller.D[0, 0] * e)
         queue = [u, *old]
-        B = np.append(made.G.B[:, 0], np.zeros(len(f.A)))
+        B = np.append(made.plant.B[:, 0], np.zeros(len(f.A)))
         for length, force in ((rest, whole + 1), (T - rest, whole)):
             if length > 0.0:
                 drive = np.linalg.solve(A, (expm(A * length) - np.eye(n)) @ B)
@@ -193,7 +196,7 @@ def test_rms_equals_a_simulation_within_its_statistical_error(sampling: Sampling
     """10⁵ samples; six standard errors by the correlation of e², a Gaussian process."""
     made, _, _ = built(sampling, structure=Structure(biquads=0))
     for seed, source in enumerate((SHAPED[0], SHAPED[4], SHAPED[6])):
-        model = process(made.G, made.K, source, made.hold)
+        model = process(made.plant, made.controller, source, made.sampling)
         mean, error = simulated(model, 100_000, seed)
         found = variances(made, source, None)
         assert abs(mean - found.error) < 6.0 * error
@@ -232,7 +235,7 @@ def test_moving_average_and_deviation_share_the_variance() -> None:
     averages = [variances(made, source, window).average for window in (1e-3, 1e-2, 1e-1, 1e4)]
     assert (np.diff(averages) < 0.0).all()
     assert averages[-1] < 1e-3 * whole.error
-    slow = variances(Loop(made.G, made.K), source, 1e-9)
+    slow = variances(Loop(made.plant, made.controller), source, 1e-9)
     np.testing.assert_allclose(slow.average, slow.error, rtol=1e-9)
 
 
@@ -249,7 +252,7 @@ def test_the_matrix_of_the_moving_average_is_its_sum() -> None:
 
 def test_sources_add_in_squares_and_scale() -> None:
     made, _, _ = built(None)
-    whole = evaluate_budget(made.G, made.K, ErrorBudget((*SHAPED, *TABLES), WINDOW))
+    whole = evaluate_budget(made.plant, made.controller, ErrorBudget((*SHAPED, *TABLES), WINDOW))
     assert whole is not None
     squares = sum(item.error**2 for item in whole.sources)
     np.testing.assert_allclose(whole.error**2, squares, rtol=1e-12)
@@ -258,7 +261,7 @@ def test_sources_add_in_squares_and_scale() -> None:
         assert (np.diff(item.cumulative) >= 0.0).all()
         np.testing.assert_allclose(np.sqrt(item.cumulative[-1]), item.error, rtol=1e-6)
     twice = ErrorBudget(tuple(source.times(2.0) for source in (*SHAPED, *TABLES)), WINDOW)
-    double = evaluate_budget(made.G, made.K, twice)
+    double = evaluate_budget(made.plant, made.controller, twice)
     assert double is not None
     np.testing.assert_allclose([double.error, double.force], [2 * whole.error, 2 * whole.force])
 
@@ -272,10 +275,10 @@ def test_white_noise_that_reaches_the_force_undamped_has_no_rms() -> None:
 
 def test_an_unstable_loop_has_no_budget() -> None:
     made, _, _ = built(None)
-    K = made.K
+    K = made.controller
     wrong = StateSpace(K.A, K.B, -K.C, -K.D)
-    assert (loop_poles(Loop(made.G, wrong)).real > 0.0).any()
-    assert evaluate_budget(made.G, wrong, ErrorBudget(SHAPED)) is None
+    assert (Loop(made.plant, wrong).poles.real > 0.0).any()
+    assert evaluate_budget(made.plant, wrong, ErrorBudget(SHAPED)) is None
 
 
 @pytest.mark.parametrize("wrong", [

@@ -10,12 +10,13 @@ from helpers import few, random_plant
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.move import mass_feedforward, simulate
-from ccd_casadi.analysis.setpoint import Limits, Setpoint, setpoint
+from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
 from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics

@@ -6,17 +6,21 @@ are given; steps are of the model and of the plants where the margins are least.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop, constant_drive
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins, least_of
+from ccd_casadi.synthesis.classical_margins import (
+    ClassicalMargins,
+    classical_margins,
+    least_margins,
+    least_of,
+)
 
 PERIODS = 160.0  # of ω_b that a step is followed for
 PER_PERIOD = 100  # points of a continuous loop's step
@@ -59,7 +63,7 @@ def loop_figures(
 ) -> LoopFigures:
     """Of a stable loop on every plant, the model first; SI, ω_b in rad/s."""
     loops = [Loop(plant, controller, sampling) for plant in plants]
-    margins = [_least_margins(loop) for loop in loops]
+    margins = [least_margins(loop.responses, loop.grid()) for loop in loops]
     gain = [gain_margin(m) for m in margins]
     worst = {0, int(np.argmin([m.phase_deg for m in margins])), int(np.argmin(gain))}
     steps = [step_figures(loops[i], bandwidth) for i in sorted(worst)]
@@ -74,14 +78,6 @@ def loop_figures(
         ),
         growth=max(float((size / size[0]).max()) for size in sizes),
         light_roots=light_roots(controller, bandwidth),
-    )
-
-
-def _least_margins(loop: Loop) -> ClassicalMargins:
-    omega = loop.grid()
-    count = loop.plant.B.shape[1]
-    return least_of(
-        [classical_margins(partial(loop.open_at_input, i), omega) for i in range(count)]
     )
 
 

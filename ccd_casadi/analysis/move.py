@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.setpoint import Setpoint
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array

@@ -16,18 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.support.arrays import Array
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Stroke and bounds of velocity, acceleration, jerk and snap; unit of y and s."""
-
-    stroke: float
-    velocity: float
-    acceleration: float
-    jerk: float
-    snap: float
 
 
 @dataclass(frozen=True)

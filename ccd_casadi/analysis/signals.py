@@ -4,17 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop, constant_drive
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
-from ccd_casadi.analysis.setpoint import Limits, setpoint
+from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
+from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.lti.loop import Loop, constant_drive
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 
 STEP_POINTS = 240
 STEP_PERIODS = 5.0  # of the bandwidth
 WATCHED = 2.0  # durations of the move that are shown
-LIMITS = Limits(0.01, 0.1, 2.0, 100.0, 1e4)  # the move that is made where none is asked for
-WINDOW = 1e-6  # m
 NONE = np.zeros(0)
 AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
 

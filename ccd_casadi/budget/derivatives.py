@@ -15,7 +15,6 @@ import numpy as np
 
 from ccd_casadi.budget.evaluation import is_stable
 from ccd_casadi.budget.frequency import (
-    Loop,
     integrated,
     responses,
     sampled_plant,
@@ -25,6 +24,7 @@ from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
 from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -73,8 +73,8 @@ def rms_error_slope(found: VarianceSlopes) -> tuple[float, Array]:
 def _of_filter(
     loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
 ) -> tuple[Array, Array]:
-    plant = disturbed(loop.G, source, loop.hold)
-    model = closed(plant, loop.K)
+    plant = disturbed(loop.plant, source, loop.sampling)
+    model = closed(plant, loop.controller)
     scale = model.scales()
     model = model.transformed(scale)
     moved = [_moved(loop, plant, source, change).transformed(scale) for change in changes]
@@ -112,8 +112,8 @@ def _of_filter(
 def _moved(loop: Loop, plant: Disturbed, source: Source, change: Change) -> Process:
     """The process a step along the imaginary axis away."""
     if change.plant is not None:
-        plant = disturbed(_stepped(loop.G, change.plant), source, loop.hold)
-    return closed(plant, _stepped(loop.K, change.controller))
+        plant = disturbed(_stepped(loop.plant, change.plant), source, loop.sampling)
+    return closed(plant, _stepped(loop.controller, change.controller))
 
 
 def _stepped(system: StateSpace, change: StateSpace | None) -> StateSpace:
@@ -166,18 +166,18 @@ class _ResponseChanges:
     def __init__(self, loop: Loop, hz: Array) -> None:
         self.loop, self.hz = loop, hz
         omega = HZ * np.asarray(hz, float)
-        self.s = loop.sampled()[0].variable(omega)
+        self.s = loop.as_run[0].variable(omega)
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def of(self, change: Change) -> tuple[Any, Any, Any]:
-        hold = self.loop.hold
+        hold = self.loop.sampling
         dG = dK = dfree = np.zeros((len(self.hz), 1, 1))
         if change.plant is not None:
-            G = _stepped(self.loop.G, change.plant)
+            G = _stepped(self.loop.plant, change.plant)
             dfree = self._change("free", G, 1j * HZ * self.hz)
             dG = dfree if hold is None else self._change("G", sampled_plant(G, hold), self.s)
         if change.controller is not None:
-            K = _stepped(self.loop.K, change.controller)
+            K = _stepped(self.loop.controller, change.controller)
             dK = self._change("K", K if hold is None else tustin(K, hold.period), self.s)
         return dG, dK, dfree
 

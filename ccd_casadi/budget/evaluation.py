@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.frequency import Loop, integrated, loop_poles
+from ccd_casadi.budget.frequency import integrated
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.lyapunov import covariance
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.budget.sources import ErrorBudget, Source
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -103,12 +104,12 @@ def evaluate_budget(
 
 def is_stable(loop: Loop) -> bool:
     """Whether all poles of the loop are; a sampled one's by their logarithms."""
-    return bool((loop_poles(loop).real < 0.0).all())
+    return bool((loop.poles.real < 0.0).all())
 
 
 def variances(loop: Loop, source: Source, window: float | None) -> Variances:
     """σ² of a shaped source by Lyapunov's equation, exactly; of a stable loop."""
-    model = process(loop.G, loop.K, source, loop.hold).balanced()
+    model = process(loop.plant, loop.controller, source, loop.sampling).balanced()
     P = covariance(model.A, model.noise, sampled=model.sampled)
     error = np.trace(model.C @ P @ model.C.T)
     force = np.trace(model.F @ P @ model.F.T) + (model.V**2).sum()

@@ -16,9 +16,10 @@ from ccd_casadi.budget.holding import held
 from ccd_casadi.budget.loops import process
 from ccd_casadi.budget.quadrature import Integral, integrate
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.lti.closed_loop import closed_loop, sensitivity
+from ccd_casadi.lti.closed_loop import sensitivity
 from ccd_casadi.lti.grid import around
-from ccd_casadi.lti.hold import Sampling, delayed, tustin
+from ccd_casadi.lti.hold import Sampling, delayed
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -26,26 +27,6 @@ from ccd_casadi.support.units import HZ
 LOWEST, HIGHEST = 1e-9, 1e4  # of what is white: over the slowest and the fastest pole
 PER_DECADE = 6  # panels at least, so that a curve is drawn through their ends
 FLANKS = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # in half widths of a root
-
-
-@dataclass(frozen=True)
-class Loop:
-    """A plant without feedthrough and a controller in SI, sampled where there is a hold."""
-
-    G: StateSpace
-    K: StateSpace
-    hold: Sampling | None = None
-
-    @property
-    def period(self) -> float | None:
-        """T in s of a sampled loop."""
-        return None if self.hold is None else self.hold.period
-
-    def sampled(self) -> tuple[StateSpace, StateSpace]:
-        """Plant and controller as the loop has them, in s or in z."""
-        if self.hold is None:
-            return self.G, self.K
-        return sampled_plant(self.G, self.hold), tustin(self.K, self.hold.period)
 
 
 def sampled_plant(G: StateSpace, hold: Sampling) -> StateSpace:
@@ -76,17 +57,16 @@ class Responses:
 
 def responses(loop: Loop, hz: Array) -> Responses:
     """The loop at frequencies in Hz."""
-    plant, controller = loop.sampled()
     omega = HZ * np.asarray(hz, float)
-    G, K = plant.response(omega), controller.response(omega)
-    free = G if loop.hold is None else loop.G.response(omega)
+    G, K = (part.response(omega) for part in loop.as_run)
+    free = G if loop.sampling is None else loop.plant.response(omega)
     return Responses(G, K, free, sensitivity(G @ K))
 
 
 def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
     """f in Hz -> (S_e, S_u) as rows, of all channels together; one-sided, m²/Hz and N²/Hz."""
-    if loop.hold is not None and source.shaped:
-        return _folded(loop, source, loop.hold.period)
+    if loop.sampling is not None and source.shaped:
+        return _folded(loop, source, loop.sampling.period)
 
     def at(hz: Array) -> Array:
         found = responses(loop, hz).of(source.kind)
@@ -98,7 +78,7 @@ def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
 
 def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
     """The densities of the samples below half the rate, with all that is folded into them."""
-    model = process(loop.G, loop.K, source, loop.hold).balanced()
+    model = process(loop.plant, loop.controller, source, loop.sampling).balanced()
 
     def at(hz: Array) -> Array:
         z = np.expm1(1j * HZ * hz * T)
@@ -120,14 +100,14 @@ def panels(loop: Loop, source: Source) -> Array:
     A table's own range. What is white goes on from far below the slowest to far above the fastest
     pole, in a sampled loop to half the rate, beyond which the noise of samples is not counted.
     """
-    roots = np.concatenate([loop_poles(loop), loop.G.poles, loop.K.poles])
+    roots = np.concatenate([loop.poles, loop.plant.poles, loop.controller.poles])
     sizes = np.abs(roots[np.abs(roots) > 1e-9 * np.abs(roots).max()])
     corners = source.corners()
     if source.shaped:
         bends = np.concatenate([sizes, corners])
         low, high = LOWEST * bends.min(), HIGHEST * bends.max()
-        if loop.hold is not None:
-            high = np.pi / loop.hold.period
+        if loop.sampling is not None:
+            high = np.pi / loop.sampling.period
             low = min(low, 1e-6 * high)
     else:
         low, high = corners[0], corners[-1]
@@ -136,11 +116,6 @@ def panels(loop: Loop, source: Source) -> Array:
     joint = np.unique(joint[(joint >= low) & (joint <= high)])
     apart = np.concatenate([[True], np.diff(joint) > 1e-9 * joint[1:]])
     return np.asarray(joint[apart] / HZ)
-
-
-def loop_poles(loop: Loop) -> np.ndarray:
-    """Poles of the closed loop in 1/s; sampled ln(z)/T."""
-    return closed_loop(*loop.sampled()).S.rates
 
 
 def integrated(loop: Loop, source: Source, weight: Callable[[Array], Array]) -> Integral:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
@@ -24,6 +23,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -176,14 +176,14 @@ def with_function(
             for item in result["robust"]["set"]
         )
         seed = int(result["seed"])
-        of_error = tuple(tuple(map(float, k)) for k in result.get("error_anchors", ()))
+        slower = tuple(tuple(map(float, k)) for k in result.get("error_anchors", ()))
     except (KeyError, TypeError, ValueError):
         words = "anchors, robust.set and seed are not those of a solve; solve the case again"
         raise UserError(f"{path}: {words}") from None
     own = len(structure_of(problem).names)
-    if any(len(kappa) != own for kappa in (*anchors, *of_error)):
+    if any(len(kappa) != own for kappa in (*anchors, *slower)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
-    found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=of_error)
+    found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=slower)
     return with_range(replace(problem, sections=found))
 
 
@@ -223,7 +223,7 @@ def _with_directions(
 
 def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:
     """Raise UserError where a command is for mixed sensitivity only."""
-    if run.problem.sections is not None:
+    if run.kappa is not None:
         words = f'{command} is for controller.structure = "h_infinity" so far; {remedy}'
         raise UserError(f"{run.folder / 'case.toml'}: controller.structure: {words}")
 

@@ -9,7 +9,7 @@ the plant alone the set is widened step by step, each design polished on the pro
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -138,8 +138,8 @@ def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     problem, words = sampler.problem, str(best.result["reason"])
     if _verified(best):
         return words
-    if isinstance(best.verified, VerifiedDesign):
-        missed = missed_words(problem, best.verified.design.figures)
+    if best.verified is not None:
+        missed = missed_words(problem, cast(VerifiedDesign, best.verified).design.figures)
         parts = [words, missed, remedies(problem, share) if missed else ""]
         return "; ".join(part for part in parts if part)
     where = ""

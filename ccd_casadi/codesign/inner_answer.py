@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.design_entries import (
     compliance_dict,
@@ -23,10 +24,11 @@ from ccd_casadi.inner_problem.problem import (
     true_design,
 )
 from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out, local_peaks
+from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.statics import statics
 from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
 
@@ -116,8 +118,8 @@ def _design(
         "active": list(active_constraints(problem.inner, figures)) if feasible else [],
         "feasible": feasible,
         "local_peaks": [
-            {"hz": omega / HZ, "sensitivity": gain}
-            for omega, gain in local_peaks(plant, made.controller)
+            {"hz": hz, "sensitivity": gain}
+            for hz, gain in peaks_of(Loop(plant.plant_si(), made.controller))
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
         **budget_entry(problem, theta, made.controller),

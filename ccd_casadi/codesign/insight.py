@@ -21,8 +21,6 @@ def natural_hz(run: FinishedRun) -> tuple[float, ...]:
 
 def bandwidth_of(run: FinishedRun) -> float:
     """ω_b in rad/s: with sections that of every plant of the set."""
-    if run.problem.sections is None:
-        return run.figures.bandwidth
     return HZ * float(run.result["bandwidth_hz"])
 
 

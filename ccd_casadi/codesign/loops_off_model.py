@@ -111,6 +111,10 @@ class Loop:
         shape = -(w[:, :, None] ** 2) * np.eye(len(k)) + p.K
         return np.asarray(p.C @ np.linalg.solve(shape + 1j * w[:, :, None] * p.D, p.B + 0j))
 
+    def responses(self, omega: Array) -> tuple[np.ndarray, np.ndarray]:
+        """G (k, p, m) and K (k, m, p)."""
+        return self.respond(omega), self.controller(omega)
+
     def sensitivity(self, omega: Array) -> Array:
         """σ_max of S(jω)."""
         L = self.respond(omega) @ self.controller(omega)

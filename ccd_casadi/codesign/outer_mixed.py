@@ -6,6 +6,7 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -193,7 +194,7 @@ class MixedOuter(Outer):
         return failure_words(self.sampler, found, share)
 
     def verified(self, end: End, rounds: int) -> VerifiedDesign:
-        assert isinstance(end, MixedEnd)
+        end = cast(MixedEnd, end)
         problem, sampler, x = self.problem, self.sampler, end.x
         theta = tuple(float(v) for v in self.theta_of(x))
         final = _final(problem, theta, end.design.figures)

@@ -8,6 +8,7 @@ designed as any other case, from that controller.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -72,11 +73,12 @@ class ListedSections:
     def _anew(self, sampler: Sampler) -> Solution:
         quick = replace(self.formulation, box_points=0)  # a bound needs no look at the box
         first = searched(SectionsOuter(sampler), quick, self.seed)
-        if not isinstance(first.end, SectionsEnd):
+        if first.end is None:
             return _nothing(first.outcome.message)
-        more = sections_of_problem(first.end.asked.problem).members
+        end = cast(SectionsEnd, first.end)
+        more = sections_of_problem(end.asked.problem).members
         self.members = tuple(dict.fromkeys((*self.members, *more)))
-        return _found(first.end.asked.problem, first.end.best)
+        return _found(end.asked.problem, end.best)
 
     def _near(self, sampler: Sampler, near: Solution) -> Solution | None:
         """None where local steps from there find no design."""
@@ -116,11 +118,10 @@ def carried(
 
 def _start(found: Solution) -> CoDesignProblem:
     """The problem of a solution with its θ as the start and its controller as the anchor."""
-    made = found.verified
-    if made is None:
+    if found.verified is None:
         assert found.problem is not None
         return found.problem
-    assert isinstance(made, VerifiedSections)
+    made = cast(VerifiedSections, found.verified)
     return _at(made.problem, made.theta, tuple(map(float, made.design.kappa)))
 
 

@@ -9,10 +9,11 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import isfinite
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, too_slow, valued, with_range
-from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, valued, with_range
+from ccd_casadi.inner_problem.sections_error import least_from
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
@@ -56,11 +57,7 @@ def seeded_and_prepared(
     if stored is None:
         tell = teller("race at the start", quiet)
         found, made = prepared(problem, tell, workers)
-        if made.certified and sections_of_problem(problem).of_error:
-            made = too_slow(problem, made)
-        if made.certified and sections_of_problem(problem).of_error:
-            found, least = least_error_at(found, problem.start, made, tell)
-            made = least.design
+        found, made = least_from(found, problem.start, made, tell)
         sections = sections_of_problem(found)
         stored = {
             "anchors": [list(a) for a in sections.anchors],
@@ -74,11 +71,11 @@ def seeded_and_prepared(
         anchors = tuple(tuple(map(float, a)) for a in stored["anchors"])
         members = tuple((int(o), tuple(map(float, p))) for o, p in stored["members"])
         words = str(stored["words"])
-        of_error = tuple(tuple(map(float, a)) for a in stored.get("error_anchors", ()))
+        slower = tuple(tuple(map(float, a)) for a in stored.get("error_anchors", ()))
     except (KeyError, TypeError, ValueError) as error:
         raise store.damaged() from error
     sections = replace(
-        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=of_error
+        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=slower
     )
     return replace(problem, sections=sections), words
 
@@ -92,12 +89,10 @@ def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> Raced:
     stored = store.get_result(key)
     if stored is None:
         made = race(problem, theta, teller("race at the end", sampler.quiet), sampler.workers)
-        error = None
-        if made.certified and sections_of_problem(problem).of_error:
-            found = valued(problem, theta, plants_of(problem, theta), made, 1)
-            made, error = replace(found.design, local_optima=made.local_optima), found.error
+        found = valued(problem, theta, plants_of(problem, theta), made, 1)
+        made = replace(found.design, local_optima=made.local_optima)
         stored = {
-            "error": error if made.certified else None,
+            "error": found.error if isfinite(found.error) else None,
             "certified": made.certified,
             "bandwidth": float(made.bandwidth) if made.certified else 0.0,
             "kappa": [float(v) for v in made.kappa] if made.certified else [],

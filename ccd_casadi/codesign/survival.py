@@ -10,7 +10,6 @@ should be without.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -18,14 +17,12 @@ from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel,
 from ccd_casadi.codesign.reach import reach
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import ClassicalMargins, classical_margins
+from ccd_casadi.synthesis.classical_margins import least_margins
 from ccd_casadi.synthesis.statics import INTEGRATOR, Statics, statics
 
 REACH = 0.5  # of the frequency: how far a shift is followed
@@ -126,7 +123,7 @@ def survival(
         )
         return end if found == size else math.exp(sign * found)
 
-    margins = _margins(nominal)
+    margins = least_margins(nominal.responses, nominal.grid)
     poles = np.linalg.eigvals(loops.controller.continuous.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
     unstable = poles[(poles.real > np.maximum(1e-9 * sizes, INTEGRATOR * bandwidth))
@@ -135,9 +132,9 @@ def survival(
         stable_shift=shifts(lambda loop: loop.growth),
         S_max_shift=shifts(excess),
         stable_damping=(factor(FACTORS[0]), factor(FACTORS[1])),
-        gain=(max(m.gain_down for m in margins), min(m.gain_up for m in margins)),
-        phase_deg=min(m.phase_deg for m in margins),
-        delay=min(m.delay for m in margins),
+        gain=(margins.gain_down, margins.gain_up),
+        phase_deg=margins.phase_deg,
+        delay=margins.delay,
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
         statics=statics(
@@ -147,12 +144,3 @@ def survival(
             omega_low=omega_low,
         ),
     )
-
-
-def _margins(loop: Loop) -> list[ClassicalMargins]:
-    """Of each loop broken alone at the plant's inputs."""
-
-    def broken(i: int, w: Array) -> np.ndarray:
-        return open_alone(loop.controller(w) @ loop.respond(w), i)
-
-    return [classical_margins(partial(broken, i), loop.grid) for i in range(loop.plant.B.shape[1])]

@@ -30,8 +30,7 @@ from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
-from ccd_casadi.inner_problem.sections_plant_set import bounds_of, structure_of
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem, structure_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
@@ -43,7 +42,6 @@ DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 
 def deploy_as_designed(
     run: FinishedRun,
-    sections: SectionsProblem,
     timing: Timing,
     saturation: float | None,
     seed: int,
@@ -54,7 +52,7 @@ def deploy_as_designed(
     Where the case gives no rate, the one that is needed is searched as for any controller.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
-    G, designed = run.plant.plant_si(), sections.sampling
+    G, designed = run.plant.plant_si(), run.problem.sampling
     _require_own_bounds(run, designed, timing)
     orders = _channels(run)
     limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
@@ -105,8 +103,9 @@ def deploy_as_designed(
     )
     progress("simulation")
     return plants.deployment(
-        limits, K, full, trials, target, compliance_max=sections.compliance_max, seed=seed
-    )
+        limits, K, full, trials, target, seed=seed,
+        compliance_max=sections_of_problem(run.problem).compliance_max,
+    )  # fmt: skip
 
 
 def _require_own_bounds(run: FinishedRun, designed: Sampling | None, timing: Timing) -> None:

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
 from ccd_casadi.deployment.sampled import (
     sampled_figures,
@@ -28,6 +27,7 @@ from ccd_casadi.deployment.sampled import (
     sensitivity_loop,
 )
 from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
@@ -46,13 +46,12 @@ SECTIONS = {
 
 @dataclass(frozen=True)
 class Given:
-    """A controller in SI, e = r - y to u; in discrete time where `period` (s) is above 0.
+    """A controller in SI, e = r - y to u; in discrete time where its period is above 0.
 
     `delay` in s is that from reading y to the new u, of a discrete one.
     """
 
     system: StateSpace
-    period: float = 0.0
     delay: float = 0.0
 
 
@@ -109,7 +108,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
     if (K.C.shape[0], K.B.shape[1]) != (m, p):
         sizes = f"{K.B.shape[1]} inputs and {K.C.shape[0]} outputs"
         raise UserError(f"{path}: has {sizes}; this plant needs {p} and {m}")
-    if given.period == 0.0:
+    if not K.period:
         figures = measure(
             run.plant, K, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
         )
@@ -117,7 +116,7 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
-    sampled = Sampled(replace(K, period=given.period), given.delay)
+    sampled = Sampled(K, given.delay)
     stable, bandwidth, peak, growth = sampled.judge(run.plant)
     if not stable:
         words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
@@ -160,7 +159,7 @@ def _from_mat(path: Path) -> Given:
             if found.period and beside.exists():
                 told = read_json(beside).get("delay")
                 delay = float(told) if isinstance(told, int | float) else delay
-            return Given(found.system, found.period, delay)
+            return Given(replace(found.system, period=found.period), delay)
     raise UserError(f"{path}: holds no struct controller_discrete or controller")
 
 
@@ -178,7 +177,7 @@ def _from_matrices(path: Path, table: Mapping[str, Any]) -> Given:
     )
     if not fits or not (0.0 <= period < np.inf and 0.0 <= delay < np.inf):
         raise UserError(f"{path}: A, B, C, D (and period, delay) are of no state space")
-    return Given(StateSpace(A, B, C, D), period, delay)
+    return Given(StateSpace(A, B, C, D, period=period), delay)
 
 
 def _from_sections(path: Path, table: Mapping[str, Any]) -> StateSpace:

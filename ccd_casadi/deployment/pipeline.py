@@ -18,6 +18,7 @@ from ccd_casadi.deployment.rate_choice import ChannelLoops, choose, conversions_
 from ccd_casadi.deployment.reduction import Limits, Reduced, reductions, smallest
 from ccd_casadi.deployment.robust_set import Member, WorstFirst, members
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
@@ -47,8 +48,8 @@ def deploy(
     All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
     where no sampling rate is enough, or the given one is no rate for this loop.
     """
-    if run.problem.sections is not None:
-        return deploy_as_designed(run, run.problem.sections, timing, saturation, seed, progress)
+    if kind_of(run.problem).as_designed:
+        return deploy_as_designed(run, timing, saturation, seed, progress)
     inner, full = run.problem.inner, run.figures
     bandwidth_hz = full.bandwidth / HZ
     if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:

@@ -4,17 +4,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.signals import Signals, signals_of
 from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.design_loops import bounds_of_loop
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -74,7 +73,7 @@ def curves_of(look: Look) -> Curves | None:
     loop = Loop(plant.plant_si(), K, problem.sampling)
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
-    bounded = bounds_of_loop(problem, look.weights, gamma, look.bandwidth_hz)
+    bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)
     view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=False,
                      special=(look.figures.sensitivity_peak_frequency / HZ,))  # fmt: skip
     free = modal_plant(look.elements.system, Suspension(0.0, 0.0))

@@ -14,6 +14,7 @@ from ccd_casadi.explorer.designs import Elements, How, Look, elements_at, presen
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
 from ccd_casadi.explorer.modes import KnownModes, in_modal_form
 from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.machine import lumped, surface_modes_html
 from ccd_casadi.sampling.keys import problem_hash, sample_key
@@ -65,7 +66,7 @@ class Session:
         Of a fixed structure: the last controller, judged at this θ.
         """
         problem = self.problems.at(knobs)
-        if problem.sections is not None:
+        if kind_of(problem).as_designed:
             return self._held(problem, knobs)
         elements = self.elements(problem, knobs.theta)
         return present(problem, knobs, elements, (self.point[0], self.point[1]))

@@ -9,7 +9,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
-from ccd_casadi.fixed_structure.optimality import Envelope, log_bandwidth_envelope, optimality
+from ccd_casadi.fixed_structure.optimality import Envelope, envelope_of, optimality
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign, in_problem_units
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -35,7 +35,7 @@ def bandwidth_envelope(
     if not point.assessment.stable:
         return None
     found = optimality(problem, point)
-    envelope = log_bandwidth_envelope(problem, kappa, found)
+    envelope = envelope_of(problem, kappa, found)
     return None if envelope is None else envelope.times(design.bandwidth)
 
 

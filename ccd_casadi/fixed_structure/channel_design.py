@@ -19,15 +19,16 @@ from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, composite_problem
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
-from ccd_casadi.fixed_structure.design import Progress, synthesise_sections
+from ccd_casadi.fixed_structure.design import Progress, concluded, synthesise_sections
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import Point, ascend
-from ccd_casadi.fixed_structure.race import LocalOptimum, finished, local_optima, run_race, started
+from ccd_casadi.fixed_structure.local_search import Point
+from ccd_casadi.fixed_structure.race import LocalOptimum, run_race, started
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     SectionsDesign,
     SectionsOutcome,
     designed,
+    failed,
     in_problem_units,
     span_of,
 )
@@ -39,7 +40,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 TIGHTENED = (1.0, 0.6, 0.3)  # of the room that S_max leaves above 1, for channels of coupled plants
-RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
 def synthesise(
@@ -125,8 +125,8 @@ def synthesise(
                  if not one.certified]  # fmt: skip
         if short:
             name, one = short[0]
-            return _failed(problem, structure, span, one.outcome, f"channel {name}: {one.words}",
-                           seed, perf_counter() - begun)  # fmt: skip
+            words = f"channel {name}: {one.words}"
+            return failed(problem, one.outcome, words, seed, begun)
         return _joined(problem, plants, sampling, made, seed, begun)
     pool = [in_problem_units(problem, item) for item in initial if not isinstance(item, StateSpace)]
     pool = [np.clip(kappa, *problem.box) for kappa in pool]
@@ -148,30 +148,13 @@ def synthesise(
             if fresh:
                 break
     if not field:
-        return _failed(problem, structure, span, SectionsOutcome.NO_STABLE_START, "", seed,
-                       perf_counter() - begun)  # fmt: skip
+        return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
     runners = run_race(
         problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers
     )
-    evaluations += sum(runner.evaluations for runner in runners)
-    ends = finished(runners)
-    optima = local_optima(problem, ends)
-    best: SectionsDesign | None = None
-    for point in (runner.point for runner in ends):
-        if point.assessment.violation > MARGIN:
-            point = ascend(problem, point, iterations=30, penalty=RESTORING, radius=0.02).point
-        last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
-                      least_gain=1e-14)  # fmt: skip
-        evaluations += last.evaluations
-        made_whole = designed(problem, plants, sampling, last.point, optima, len(field),
-                              evaluations, seed, perf_counter() - begun)  # fmt: skip
-        if best is None or (made_whole.certified and not best.certified):
-            best = made_whole
-        if best.certified:
-            break
-    assert best is not None
-    tell(f"{best.outcome.value}: {best.bandwidth / (2.0 * np.pi):.2f} Hz")
-    return best
+    return concluded(
+        problem, plants, sampling, runners, len(field), evaluations, seed, begun, tell
+    )
 
 
 def _joined(
@@ -194,22 +177,6 @@ def _joined(
     starts = sum(one.starts for one in made)
     return designed(problem, plants, sampling, point, optima, starts, evaluations, seed,
                     perf_counter() - begun)  # fmt: skip
-
-
-def _failed(
-    problem: CompositeProblem,
-    structure: ChannelStructure,
-    span: tuple[float, float],
-    outcome: SectionsOutcome,
-    words: str,
-    seed: int,
-    seconds: float,
-) -> SectionsDesign:
-    nothing = np.full(len(problem.box[0]), np.nan)
-    return SectionsDesign(
-        outcome, words or outcome.value, structure, nothing, span, None, np.nan, None, {}, (),
-        np.nan, {}, (), 0, 0, seed, seconds,
-    )  # fmt: skip
 
 
 def _of_channel(

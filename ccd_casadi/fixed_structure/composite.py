@@ -26,7 +26,6 @@ from ccd_casadi.fixed_structure.loop_problem import (
     plant_of_row,
 )
 from ccd_casadi.kernels.limits import Curve
-from ccd_casadi.kernels.loop_rows import levels
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -233,16 +232,3 @@ def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
     for part, at, own in problem.split(found):
         out[at] = part.members[plant_of_row(part.problem, own.plant)]
     return out
-
-
-def largest_gains(problem: CompositeProblem, kappa: Array, v: Array) -> tuple[Array, Array, Array]:
-    """σ_max of S, KS and T of every plant at v (k,), each (P, k), in the problem's units."""
-    found = np.zeros((3, problem.count, len(v)))
-    curves = np.array([Curve.S_MAX, Curve.KS, Curve.T])
-    for part in problem.parts:
-        count = len(part.members)
-        loop = part.problem.loop(kappa[part.place], None)
-        every = np.tile(curves, (count, 1)), np.arange(count), np.tile(v, (count, 1))
-        gains = np.exp(levels(*every, loop, -np.inf)[..., 0])
-        found[:, part.members] = np.maximum(found[:, part.members], np.moveaxis(gains, -1, 0))
-    return found[0], found[1], found[2]

@@ -147,8 +147,7 @@ def is_decoupled(plant: ScaledPlant, decoupling: Decoupling) -> bool:
     whole = in_channels(plant, decoupling)
     poles = np.linalg.eigvals(whole.A)
     omega = np.concatenate([np.abs(poles[poles.imag >= 0.0]), np.geomspace(1e-3, 1e3, 19)])
-    eye = np.eye(len(whole.A))
-    G = np.abs(whole.C @ np.linalg.solve(1j * omega[:, None, None] * eye - whole.A, whole.B + 0j))
+    G = np.abs(whole.system.response(omega))
     own = np.sqrt(np.einsum("kii->ki", G))
     coupling = G / np.maximum(own[:, :, None] * own[:, None, :], 1e-300)
     coupling[:, range(len(own[0])), range(len(own[0]))] = 0.0

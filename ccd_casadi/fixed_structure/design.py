@@ -23,8 +23,8 @@ from ccd_casadi.fixed_structure.sections_design import (
     SectionsDesign,
     SectionsOutcome,
     designed,
+    failed,
     in_problem_units,
-    span_of,
 )
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, fitted, kept, redrawn
 from ccd_casadi.fixed_structure.structure import Structure
@@ -118,22 +118,29 @@ def synthesise_sections(
     if not only_initial:
         pool = np.concatenate([pool, _pool(problem, starts, rng)])
     tell = progress or (lambda words: None)
-    spanned = span_of(problem)
-
-    def failed(outcome: SectionsOutcome, words: str = "") -> SectionsDesign:
-        nothing = np.full(len(structure.names), np.nan)
-        return SectionsDesign(
-            outcome, words or outcome.value, structure, nothing, spanned, None, np.nan, None, {},
-            (), np.nan, {}, (), len(pool), 0, seed, perf_counter() - begun,
-        )  # fmt: skip
-
     if not len(pool):
-        return failed(SectionsOutcome.NO_STABLE_START)
+        return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
     runners = run_race(problem, pool, tell, workers)
     for _ in range(0 if only_initial else REDRAWS):
         fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)
         runners = run_race(problem, fresh, tell, workers, runners)
-    evaluations = sum(runner.evaluations for runner in runners)
+    return concluded(problem, plants, sampling, runners, len(pool), 0, seed, begun, tell)
+
+
+def concluded(
+    problem: LoopProblem,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    runners: Sequence[Runner],
+    starts: int,
+    spent: int,
+    seed: int,
+    begun: float,
+    tell: Progress,
+) -> SectionsDesign:
+    """The best end of a race that the judge confirms, brought within its bounds; `spent`: loops
+    looked at before it."""
+    evaluations = spent + sum(runner.evaluations for runner in runners)
     ends = finished(runners)
     best: SectionsDesign | None = None
     optima = local_optima(problem, ends)
@@ -145,9 +152,8 @@ def synthesise_sections(
         last = ascend(problem, point, iterations=25, radius=1e-3, least_radius=1e-10,
                       least_gain=1e-14)  # fmt: skip
         evaluations += last.evaluations
-        point = last.point
-        made = designed(problem, plants, sampling, point, optima, len(pool), evaluations, seed,
-                         perf_counter() - begun)  # fmt: skip
+        made = designed(problem, plants, sampling, last.point, optima, starts, evaluations, seed,
+                        perf_counter() - begun)  # fmt: skip
         if best is None or (made.certified and not best.certified):
             best = made
         if best.certified:

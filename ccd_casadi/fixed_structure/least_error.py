@@ -17,19 +17,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
-from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
-from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.design import Progress, problem_for
-from ccd_casadi.fixed_structure.figures import to_theta
-from ccd_casadi.fixed_structure.local_search import LoopModel, all_rows, descend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Problem
-from ccd_casadi.fixed_structure.optimality import Envelope
+from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Problem
+from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
 from ccd_casadi.fixed_structure.sections_design import (
     SectionsDesign,
     SectionsOutcome,
@@ -37,6 +33,7 @@ from ccd_casadi.fixed_structure.sections_design import (
 )
 from ccd_casadi.fixed_structure.structure import Structure, state_space, state_spaces
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.trust_region import Iterate
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -45,9 +42,7 @@ from ccd_casadi.support.units import HZ
 
 STEP = 1e-30  # of κ along the imaginary axis
 REWARD = 1e-6  # of ln ω_b in ln e
-RESIDUAL = 1e-3  # of ‖∇ ln e‖: above it there is no envelope gradient
 SLOWER = 0.1  # of the largest bandwidth: where a search from a given κ begins
-ACTIVE = 1e-5
 KEPT = 1.0 + 2e-6  # figure over bound that the search leaves
 
 
@@ -164,17 +159,15 @@ def least_error(
             continue
         end, count = descend(model, start, first_hessian, problem.margin)
         steps += count
-        made, active, conditions = _judged(problem, plants, sampling, end, design, floor)
+        made, conditions = _judged(problem, plants, sampling, end, design, floor)
         error = float(np.exp(end.value + REWARD * end.x[-1]))
         tell(f"{1e9 * error:.4g} nm RMS at {made.bandwidth / HZ:.2f} Hz, {count} steps: "
              f"{made.words}")  # fmt: skip
         if made.certified and error < best.error:
-            envelope = None
-            if made.kkt_residual <= RESIDUAL:
-                direct = goal.to_theta(made.kappa, plants)
-                slopes = to_theta(problem, end.x[:-1], active)
-                names = tuple(kinds_of_rows(problem, active))
-                envelope = Envelope(names, direct, slopes, *conditions).times(error)
+            direct = goal.to_theta(made.kappa, plants)
+            envelope = envelope_of(problem, end.x[:-1], conditions, direct)
+            if envelope is not None:
+                envelope = envelope.times(error)
             best = replace(best, design=made, error=error, envelope=envelope)
     return replace(best, steps=steps)
 
@@ -186,36 +179,14 @@ def _judged(
     end: Iterate[Assessment],
     design: SectionsDesign,
     floor: float,
-) -> tuple[SectionsDesign, Constraints, tuple[Array, Array, Array]]:
-    """The end as a design: certified by the judge, with residual and multipliers; what binds; and
-    the conditions of optimality as rows, goal and μ, rowsᵀ μ = goal.
-    """
+) -> tuple[SectionsDesign, Optimality]:
+    """The end as a design, certified by the judge, and its conditions of optimality."""
     structure, P = problem.structure, problem.plants
     inside, tau = end.x[:-1], float(end.x[-1])
     kappa = structure.in_units(inside, P.omega_0, P.force)
     controller = state_space(structure, kappa)
     judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
-    rows = all_rows(end.data)
-    active = rows.only(np.abs(rows.value) <= ACTIVE)
-    n = len(inside)
-    columns, names = [np.column_stack([active.to_kappa, active.to_tau])], []
-    for i, name in enumerate(structure.names):
-        for row, sign, word in ((0, -1.0, "lower"), (1, 1.0, "upper")):
-            if abs(inside[i] - problem.box[row, i]) <= ACTIVE:
-                columns.append(sign * np.eye(n + 1)[i : i + 1])
-                names.append((name, word))
-    if abs(tau - floor) <= ACTIVE:
-        columns.append(-np.eye(n + 1)[n:])
-    matrix = np.concatenate(columns).T
-    goal = -end.gradient
-    mu = nnls(matrix, goal, maxiter=100 * matrix.shape[1])[0] if matrix.shape[1] else np.zeros(0)
-    residual = float(np.abs(matrix @ mu - goal).max() / np.abs(goal).max())
-    multipliers: dict[str, float] = {}
-    for word, value in zip(kinds_of_rows(problem, active), mu, strict=False):
-        if value > 0.0:
-            multipliers[word] = multipliers.get(word, 0.0) + float(value)
-    count = len(active.v)
-    ends = tuple((*item, float(v)) for item, v in zip(names, mu[count:], strict=False))
+    found = optimality(problem, Point(inside, tau, end.data), -end.gradient, floor)
     least = float(np.exp(floor)) * P.omega_0
     good = judged.passed and judged.bandwidth >= least / KEPT
     made = replace(
@@ -226,9 +197,9 @@ def _judged(
         controller=controller,
         bandwidth=judged.bandwidth,
         certificate=judged,
-        multipliers=multipliers,
-        at_box=ends,
-        kkt_residual=residual,
+        multipliers=found.named(),
+        at_box=found.ends,
+        kkt_residual=found.residual,
         short={},
     )
-    return made, active, (matrix.T, goal, mu)
+    return made, found

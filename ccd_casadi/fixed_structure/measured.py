@@ -27,6 +27,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.lti.hold import tustin
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
@@ -157,11 +158,8 @@ def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
 
 def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
     """K at frequencies in Hz; with a period by Tustin's rule, without prewarping."""
-    s = 1j * HZ * np.asarray(hz, float)
-    if period is not None:
-        s = 2j / period * np.tan(0.5 * HZ * np.asarray(hz, float) * period)
-    whole = s[:, None, None] * np.eye(len(K.A)) - K.A
-    return np.asarray((K.C @ np.linalg.solve(whole, K.B + 0j) + K.D)[:, 0, 0])
+    runs = K if period is None else tustin(K, period)
+    return runs.response(HZ * np.asarray(hz, float))[:, 0, 0]
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ one between those (`Envelope`).
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import nnls
 
 from ccd_casadi.fixed_structure.composite import kinds_of_rows
 from ccd_casadi.fixed_structure.figures import to_theta
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Constraints, LoopProblem
+from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.support.arrays import Array
 
 ACTIVE = 1e-5  # ln of the share of its bound within which a constraint binds
@@ -52,65 +52,76 @@ class Envelope:
 
 @dataclass(frozen=True)
 class Optimality:
-    """What binds, its multipliers (change of ln ω_b per ln of a bound), the residual over ‖∇τ‖,
-    and by how much a bound is passed (logarithm).
+    """The conditions rowsᵀ μ = goal, μ >= 0, of what binds at a point, and how well they hold.
 
-    `kinds` names the bound of each that is active; `ends` are the parameters at an end of their
-    box, as (name, "lower" or "upper", multiplier); `rows` (M, n + 1) are the slopes to (κ, τ) of
-    what is active, the ends last.
+    `rows` (M, n + 1) are slopes to (κ, τ): first of the `active` bounds, each named in `kinds`,
+    then of the ends of κ's box, (name, "lower" or "upper"), and of a least τ. `multipliers` (M,):
+    change of the goal per ln of a bound; `residual` is over ‖goal‖∞; `violation`: by how much a
+    bound is passed (logarithm).
     """
 
     active: Constraints
     kinds: tuple[str, ...]
+    box_ends: tuple[tuple[str, str], ...]
+    rows: Array
+    goal: Array
     multipliers: Array
-    ends: tuple[tuple[str, str, float], ...]
     residual: float
     violation: float
-    rows: Array
+
+    @property
+    def ends(self) -> tuple[tuple[str, str, float], ...]:
+        """The parameters at an end of their box, with their multipliers."""
+        mu = self.multipliers[len(self.kinds) :]
+        return tuple((*end, float(value)) for end, value in zip(self.box_ends, mu, strict=False))
 
     def named(self) -> dict[str, float]:
         """The multipliers by kind of bound, summed over plants and peaks."""
         found: dict[str, float] = {}
-        for name, mu in zip(self.kinds, self.multipliers, strict=True):
+        for name, mu in zip(self.kinds, self.multipliers, strict=False):
             if mu > 0.0:
                 found[name] = found.get(name, 0.0) + float(mu)
         return found
 
 
-def optimality(problem: LoopProblem, point: Point) -> Optimality:
-    """Non-negative least squares on the active constraints of a point whose loops are stable."""
+def optimality(
+    problem: LoopProblem, point: Point, goal: Array | None = None, floor: float = -np.inf
+) -> Optimality:
+    """Non-negative least squares on the active constraints of a point whose loops are stable.
+
+    `goal` (n + 1,) is the gradient to (κ, τ) of what is made large, by default τ; `floor` the least
+    τ.
+    """
     peaks = point.assessment.peaks
     assert peaks is not None
     active = peaks.only(np.abs(peaks.value) <= ACTIVE)
     n = len(point.kappa)
-    columns = [np.column_stack([active.to_kappa, active.to_tau])]
-    ends = []
+    unit = np.eye(n + 1)
+    rows, ends = [np.column_stack([active.to_kappa, active.to_tau])], []
     for i, name in enumerate(problem.structure.names):
         for row, sign, word in ((0, -1.0, "lower"), (1, 1.0, "upper")):
             if abs(point.kappa[i] - problem.box[row, i]) <= ACTIVE:
-                columns.append(sign * np.eye(n + 1)[i : i + 1])
+                rows.append(sign * unit[i : i + 1])
                 ends.append((name, word))
-    matrix = np.concatenate(columns).T
-    goal = np.eye(n + 1)[n]
-    if matrix.shape[1] == 0:
-        return Optimality(active, (), np.zeros(0), (), 1.0, point.assessment.violation, matrix.T)
-    mu, _ = nnls(matrix, goal, maxiter=100 * matrix.shape[1])
-    residual = float(np.abs(matrix @ mu - goal).max())
-    count = len(active.v)
-    found = tuple((*end, float(value)) for end, value in zip(ends, mu[count:], strict=True))
-    kinds = tuple(kinds_of_rows(problem, active))
-    short = point.assessment.violation
-    return Optimality(active, kinds, mu[:count], found, residual, short, matrix.T)
+    if abs(point.tau - floor) <= ACTIVE:
+        rows.append(-unit[n:])
+    matrix, goal = np.concatenate(rows), unit[n] if goal is None else goal
+    return Optimality(
+        active, tuple(kinds_of_rows(problem, active)), tuple(ends), matrix, goal,
+        *non_negative(matrix, goal), point.assessment.violation,
+    )  # fmt: skip
 
 
-def log_bandwidth_envelope(
-    problem: LoopProblem, kappa: Array, found: Optimality
+def envelope_of(
+    problem: LoopProblem, kappa: Array, found: Optimality, direct: Array | None = None
 ) -> Envelope | None:
-    """That of ln ω_b*(θ); None where the conditions of optimality do not hold."""
+    """That of ln ω_b*(θ), or of a value made small whose slope at a fixed κ is `direct` (n_θ,).
+
+    None where the conditions of optimality do not hold.
+    """
     if found.residual > RESIDUAL or found.violation > ACTIVE:
         return None
-    slopes = -to_theta(problem, kappa, found.active)
-    n = found.rows.shape[1]
-    mu = np.append(found.multipliers, [value for _, _, value in found.ends])
-    goal = np.eye(n)[n - 1]
-    return Envelope(found.kinds, np.zeros(slopes.shape[1]), slopes, found.rows, goal, mu)
+    slopes = to_theta(problem, kappa, found.active)
+    if direct is None:
+        direct, slopes = np.zeros(slopes.shape[1]), -slopes
+    return Envelope(found.kinds, direct, slopes, found.rows, found.goal, found.multipliers)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from time import perf_counter
 
 import numpy as np
 
@@ -118,4 +119,15 @@ def designed(
         outcome, words, structure, kappa, span_of(problem), controller, bandwidth, judged,
         found.named(), found.ends, found.residual, short, optima, starts, evaluations, seed,
         seconds,
+    )  # fmt: skip
+
+
+def failed(
+    problem: LoopProblem, outcome: SectionsOutcome, words: str, seed: int, begun: float
+) -> SectionsDesign:
+    """A design without a controller, of a search that `begun` in seconds of `perf_counter`."""
+    nothing = np.full(len(problem.box[0]), np.nan)
+    return SectionsDesign(
+        outcome, words or outcome.value, problem.structure, nothing, span_of(problem), None,
+        np.nan, None, {}, (), np.nan, {}, (), 0, 0, seed, perf_counter() - begun,
     )  # fmt: skip

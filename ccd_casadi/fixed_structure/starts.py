@@ -157,10 +157,7 @@ def fitted(problem: Problem, controller: StateSpace, rng: np.random.Generator) -
     plants, structure = problem.plants, problem.structure
     v = np.geomspace(0.03, 3.0, 60)
     omega = plants.frequency(v) * plants.omega_0
-    n = len(controller.A)
-    solved = np.linalg.solve(1j * omega[:, None, None] * np.eye(n) - controller.A,
-                             controller.B + 0j)  # fmt: skip
-    goal = (controller.C @ solved + controller.D)[:, 0, 0] / plants.force
+    goal = controller.response(omega)[:, 0, 0] / plants.force
 
     def residual(kappa: Array) -> Array:
         difference = np.log(response(structure, kappa, 1j * v) / goal)

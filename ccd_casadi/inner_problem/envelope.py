@@ -6,8 +6,8 @@ x = (ln ω_S, ln ω_T), g the active constraints, ends of the ranges included.
 """
 
 import numpy as np
-from scipy.optimize import nnls
 
+from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
@@ -34,10 +34,7 @@ def bandwidth_gradient(
             sign = 1.0 if end == "upper" else -1.0
             columns.append(sign * np.eye(2)[0 if variable == "omega_S" else 1])
             slopes.append(zero)
-    gradient = optimum.to_theta[0].copy()
-    if not columns:
-        columns, slopes = [np.zeros(2)], [zero]
-    mu, residual = nnls(np.array(columns).T, x[0])
-    if residual > RESIDUAL * np.linalg.norm(x[0]):
-        return np.full_like(gradient, np.nan)
-    return gradient - mu @ np.array(slopes)
+    mu, residual = non_negative(np.reshape(columns, (-1, 2)), x[0])
+    if residual > RESIDUAL:
+        return np.full_like(zero, np.nan)
+    return optimum.to_theta[0] - mu @ np.reshape(slopes, (-1, len(zero)))

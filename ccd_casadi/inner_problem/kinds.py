@@ -11,7 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.analysis.loop_view import Bounded
+from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
@@ -20,6 +21,8 @@ from ccd_casadi.inner_problem.sections_robustness import LOOSE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.weights import Weights
 
 
 class InnerKind(ABC):
@@ -59,6 +62,10 @@ class InnerKind(ABC):
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
         """The extreme factors of damping and of gain in its set."""
 
+    @abstractmethod
+    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+        """What S, KS and T of a design may not exceed, over frequency."""
+
 
 class MixedSensitivity(InnerKind):
     """H∞ controllers by the weights W_S, W_KS and W_T, over their frequencies."""
@@ -90,6 +97,17 @@ class MixedSensitivity(InnerKind):
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
         robust = self.problem.robust
         return (1.0,) if robust is None else robust.damping, (1.0,)
+
+    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+        """γ/|W|."""
+
+        def over(hz: Array) -> Array:
+            return np.asarray(gamma / np.abs(weights.responses(HZ * hz)))
+
+        inner = self.problem.inner
+        words = ("its bound γ/|W|",) * 3
+        return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words,
+                       inner.compliance_max, False)  # fmt: skip
 
 
 class FixedStructure(InnerKind):
@@ -123,6 +141,29 @@ class FixedStructure(InnerKind):
     def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
         u = sections_of_problem(self.problem).uncertainty
         return u.damping, (1.0 - u.gain, 1.0, 1.0 + u.gain)
+
+    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+        """The shape, and weighted_level/|W| of KS (N/m) and T."""
+        problem, sections = self.problem, sections_of_problem(self.problem)
+        level, shape = (
+            np.nan if value is None else value
+            for value in (sections.weighted_level, sections.shape)
+        )
+
+        def over(hz: Array) -> Array:
+            size = np.abs(problem.weights.responses(HZ * hz))
+            below = hz <= bandwidth_hz
+            rising = shape * hz / bandwidth_hz * 2.0**-0.5
+            most = np.where(below, np.fmin(rising, 2.0**-0.5), rising)
+            holds = (below | (sections.shape_ends is ShapeEnd.S_MAX)) & (
+                most <= problem.inner.S_max
+            )
+            return np.array([np.where(holds, most, np.nan), *(level / size[1:])])
+
+        inner = problem.inner
+        words = ("its shape", "weighted_level/|W_KS|", "weighted_level/|W_T|")
+        return Bounded(inner.S_max, inner.S_low, inner.omega_low / HZ, over, words,
+                       sections.compliance_max, True)  # fmt: skip
 
 
 def kind_of(problem: CoDesignProblem) -> InnerKind:

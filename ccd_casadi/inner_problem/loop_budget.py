@@ -7,10 +7,10 @@ import numpy as np
 
 from ccd_casadi.budget import BudgetFigures, evaluate_budget
 from ccd_casadi.budget.derivatives import variance_slopes
-from ccd_casadi.budget.frequency import Loop
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 
 

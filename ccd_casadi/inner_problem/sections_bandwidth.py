@@ -18,6 +18,7 @@ from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
@@ -128,7 +129,7 @@ def valued(
 
 def require_bandwidth(problem: CoDesignProblem, command: str) -> None:
     """Raise UserError where J counts the RMS error, for a command that knows ω_b alone."""
-    if problem.sections is not None and problem.sections.of_error:
+    if problem.figure is not BANDWIDTH:
         words = f"{command} counts the bandwidth; solve, inner and retrain count the error"
         raise UserError(f'inner.minimise: is "rms_error", and {words}')
 

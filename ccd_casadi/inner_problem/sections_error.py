@@ -8,8 +8,9 @@ import numpy as np
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import LeastError, least_error
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import joined
+from ccd_casadi.inner_problem.sections_bandwidth import joined, too_slow
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_robustness import worst_members
 
@@ -44,3 +45,20 @@ def least_error_at(
         )
     assert found is not None
     return joined(problem, found.design.kappa, ()), found
+
+
+def least_from(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    progress: Progress | None = None,
+) -> tuple[CoDesignProblem, SectionsDesign]:
+    """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
+    one of least error, not certified where it has to be slower than is allowed."""
+    if problem.figure is BANDWIDTH or not made.certified:
+        return problem, made
+    made = too_slow(problem, made)
+    if not made.certified:
+        return problem, made
+    problem, found = least_error_at(problem, theta, made, progress)
+    return problem, found.design

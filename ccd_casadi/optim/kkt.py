@@ -87,7 +87,7 @@ class ActiveSet:
 
     def multipliers(self) -> Array:
         """The best μ >= 0 (m,), per share."""
-        return nnls(self.rows.T, -self.gradient)[0] if self.labels else np.empty(0)
+        return non_negative(self.rows, -self.gradient)[0]
 
     def residual(self, mu: Array) -> float:
         """‖∇J + Aᵀμ‖∞/‖∇J‖∞."""
@@ -113,6 +113,14 @@ class ActiveSet:
             objective_gradient=tuple(map(float, self.gradient)),
             kink=kink,
         )
+
+
+def non_negative(rows: Array, goal: Array) -> tuple[Array, float]:
+    """μ >= 0 (m,) that brings rowsᵀ μ nearest to `goal` (n,), and what is missing over ‖goal‖∞."""
+    mu = np.zeros(len(rows))
+    if len(rows):
+        mu = nnls(rows.T, goal, maxiter=100 * len(rows))[0]
+    return mu, float(np.abs(goal - mu @ rows).max()) / max(float(np.abs(goal).max()), 1e-300)
 
 
 def active_set(

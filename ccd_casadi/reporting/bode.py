@@ -11,7 +11,7 @@ from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.svg import BLACK, CYCLE
-from ccd_casadi.reporting.tables import spread
+from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
 
 ZERO = 1e-6  # of a direction's entry that counts as none
@@ -127,12 +127,12 @@ def caption_bode(loop: LoopView, channels: Sequence[Channel] = ()) -> str:
 
 def table_bode(loop: LoopView) -> Table:
     """Magnitudes, and phases of a scalar loop, at some frequencies."""
-    rows = spread(loop.hz, [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz])
+    special = [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz]
     if loop.plant.shape[1:] == (1, 1):
         head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
         G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])
         phases = [phase_deg(part[:, 0, 0]) for part in (loop.plant, loop.controller)]
-        columns = [loop.hz, G, phases[0], K, phases[1]]
+        columns = [G, phases[0], K, phases[1]]
     else:
         G, K = _singular_values(loop.plant), _singular_values(loop.controller)
         head = (
@@ -140,8 +140,8 @@ def table_bode(loop: LoopView) -> Table:
             *(f"σ{i + 1}(G) m/N" for i in range(G.shape[1])),
             *(f"σ{i + 1}(K) N/m" for i in range(K.shape[1])),
         )
-        columns = [loop.hz, *G.T, *K.T]
-    return Table(head, tuple(tuple(float(c[i]) for c in columns) for i in rows))
+        columns = [*G.T, *K.T]
+    return over_frequency(head, loop.hz, *columns, special=special)
 
 
 def _singular_values(response: NDArray[np.complex128]) -> Array:

@@ -18,8 +18,8 @@ from ccd_casadi.reporting.page import (
     table_html,
 )
 from ccd_casadi.reporting.svg import BLACK, CYCLE
+from ccd_casadi.reporting.tables import ROWS, over_frequency
 
-ROWS = 30  # of the figure's table
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
 DECADES = 3.5  # of the error's axis
 
@@ -100,13 +100,9 @@ def _figure(model: BudgetFigures) -> str:
     svg = figure_lines([[panel]], key="error-budget", heights=(3.4,),
                        title="Cumulative RMS error over frequency by source")  # fmt: skip
     grid = np.geomspace(*x, ROWS)
-    table = Table(
-        ("Hz", *(f"{item.source.name} µm" for item in shown), "together µm"),
-        tuple(
-            (float(f), *(1e6 * float(np.sqrt(np.interp(f, hz, part))) for part in (*parts, whole)))
-            for f in grid
-        ),
-    )
+    columns = (1e6 * np.sqrt(np.interp(grid, hz, part)) for part in (*parts, whole))
+    head = ("Hz", *(f"{item.source.name} µm" for item in shown), "together µm")
+    table = over_frequency(head, grid, *columns)
     words = (
         "Dynamic error budget: the RMS error that has come together up to each frequency, by "
         "source; the squares of the curves add up to the black one's. Where a curve rises is "

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.signals import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import State
@@ -14,10 +13,12 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import against, reason_words, short_status
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.deploy_move import move_html
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.index import write_index
@@ -82,7 +83,7 @@ def _conclusion(run: FinishedRun, found: Deployment) -> str:
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
-    how = "as designed" if run.problem.sections is not None else (
+    how = "as designed" if kind_of(run.problem).as_designed else (
         f"instead of {before} (synthesised: {len(run.controller.A)})"
     )  # fmt: skip
     return (

@@ -25,7 +25,7 @@ def front_walk(run: FinishedRun, front: Front) -> str:
         return ""
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
-    loops = [] if problem.sections is not None else [_loop(problem, point) for point in shown]
+    loops = [_loop(problem, point) for point in shown if np.isfinite(point.omega_S)]
     tops = [float(loop.gains[0].max()) for loop in loops]
     lows = [float(loop.gains[0].min()) for loop in loops]
     steps = []

@@ -6,9 +6,8 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.page import INDEX, Section, Table, escape, page, table_html
-from ccd_casadi.reporting.sections_page import sections_conclusion
+from ccd_casadi.reporting.sections_page import conclusion_of
 from ccd_casadi.reporting.verdict import refreshed, run_header
 from surrogates.files import write_whole
 
@@ -55,7 +54,7 @@ def write_index(folder: Path) -> None:
     )
     files = tuple((n, words) for n, words in FILES.items() if (folder / n).exists())
     name = folder.resolve().name
-    lead = sections_conclusion(result) if "race" in result else conclusion(result)
+    lead = conclusion_of(result)
     head = run_header(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
     sections = [
         Section("Pages", f"<ul>{items}</ul>"),

@@ -100,7 +100,7 @@ def table_front(problem: CoDesignProblem, front: Front) -> Table:
 def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
     """The parameters that the optimum answers to, per unit, in the units of the case file."""
     rows = []
-    swept = problem.sections is None
+    swept = any(item.ln_omega for item in found.responses)
     lower, upper = lifted_bounds(problem) if swept else box(problem)
     units = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     shown = [factor for _, factor in units]

@@ -83,7 +83,7 @@ def insight_html(run: FinishedRun, front: Front, responses: PostOptimal, index: 
 
 def _limits(run: FinishedRun, rule: str) -> str:
     """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
-    if run.problem.sections is not None:
+    if run.result.get("gamma") is None:
         held = binding_words(run.problem, run.result)
         without = (
             "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "

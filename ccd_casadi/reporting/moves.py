@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_figures import force_step
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
+from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.analysis.signals import LIMITS, WINDOW
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics

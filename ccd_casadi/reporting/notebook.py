@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.reporting.facts import conclusion, theta_table
+from ccd_casadi.reporting.facts import theta_table
 from ccd_casadi.reporting.loops import gains_html, view_of
 from ccd_casadi.reporting.page import (
     CSS,
@@ -28,7 +28,7 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
-from ccd_casadi.reporting.sections_page import controller_html, sections_conclusion
+from ccd_casadi.reporting.sections_page import conclusion_of, controller_html
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.units import HZ, shown_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -157,8 +157,7 @@ def _(item: ModalFit) -> str:
 
 
 def _result_head(result: Mapping[str, Any]) -> str:
-    said = sections_conclusion if "race" in result else conclusion
-    return run_header("Co-design", result, "", said(dict(result)))
+    return run_header("Co-design", result, "", conclusion_of(result))
 
 
 def _design_parts(

@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.reporting.facts import (
     Fact,
     binding,
+    conclusion,
     cost_words,
     loop_facts,
     theta_words,
@@ -28,8 +30,10 @@ if TYPE_CHECKING:
     pass
 
 
-def sections_conclusion(result: dict[str, Any]) -> str:
-    """One sentence with the key numbers."""
+def conclusion_of(result: Mapping[str, Any]) -> str:
+    """One sentence with the key numbers, for every kind of controller."""
+    if "race" not in result:
+        return conclusion(result)
     verdict = "a verified design" if result["status"] == "verified" else "an UNVERIFIED design"
     return (
         f"The {result['formulation']} formulation ends at {verdict}, {theta_words(result)}: a "
@@ -39,7 +43,7 @@ def sections_conclusion(result: dict[str, Any]) -> str:
     )
 
 
-def _plants(result: dict[str, Any]) -> str:
+def _plants(result: Mapping[str, Any]) -> str:
     designed, judged = (result[name]["plants"] for name in ("certificate", "robust"))
     if designed == judged == 1:
         return "the model, the only plant of its set"
@@ -74,7 +78,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     mu, kink = result["controller"]["multipliers"], result["kkt"].get("kink")
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
-    gain = "lower the RMS error" if sections_of_problem(problem).of_error else "raise ω_b"
+    gain = "raise ω_b" if problem.figure is BANDWIDTH else "lower the RMS error"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
              "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
@@ -157,15 +161,14 @@ def sections_facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
     on = counted(certificate["plants"], "plant")
     worst = f"largest of {counted(robust['plants'], 'plant')} of the box"
     kkt = r["kkt"]["stationarity"]
-    of_error = sections_of_problem(problem).of_error
     predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
-    if of_error:
+    if problem.figure is not BANDWIDTH:
         e, guess = (1e9 * r[key] for key in ("error_rms_of_set", "surrogate_error_rms"))
         words = f"{number(e, 6)} nm over the set (predicted {number(guess, 6)})"
         predicted = ("RMS error e", words)
     return [
         ("Objective J", number(r["objective"], 7),
-         f"{problem.w1:g} f(θ) + ({problem.w2:g}) {'e, in m' if of_error else 'ω_b'}"),
+         f"{problem.w1:g} f(θ) + ({problem.w2:g}) {problem.figure.symbol}"),
         ("Hardware cost f(θ)", cost_words(r, 6), ""),
         ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", "on every plant of the set"),
         (*predicted, f"relative error {number(r['verification_error'], 2)}"),

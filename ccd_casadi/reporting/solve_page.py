@@ -19,7 +19,7 @@ from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
 from ccd_casadi.reporting.budget_section import budget_section
-from ccd_casadi.reporting.facts import binding, conclusion, design_facts, theta_table, theta_words
+from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance
 from ccd_casadi.reporting.history import (
     caption_history,
@@ -55,8 +55,8 @@ from ccd_casadi.reporting.sections_page import (
     bandwidths_html,
     beside_html,
     binding_words,
+    conclusion_of,
     controller_html,
-    sections_conclusion,
     sections_facts,
 )
 from ccd_casadi.reporting.slices import (
@@ -119,7 +119,7 @@ def report_html(
         title,
         result,
         f"{case.path.name} · {result['formulation']} formulation · {now}",
-        sections_conclusion(result) if "proof" in result else conclusion(result),
+        conclusion_of(result),
     )
     work = (folder, case, problem, solution)
     parts = _parts(*work)

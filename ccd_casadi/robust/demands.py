@@ -3,8 +3,7 @@
 import argparse
 from dataclasses import dataclass
 
-from ccd_casadi.analysis.setpoint import Limits
-from ccd_casadi.analysis.signals import LIMITS, WINDOW
+from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, Limits
 from surrogates.options import positive
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop import Loop
 from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
@@ -13,7 +12,8 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.later_lines import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.inner_problem.design_loops import bounds_of_loop
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import Tolerances, tolerances
@@ -112,7 +112,7 @@ def tried(
     d = demands or Demands()
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None
-    bounded = bounds_of_loop(run.problem, run.weights, run.figures.gamma, np.nan)
+    bounded = kind_of(run.problem).bounded(run.weights, run.figures.gamma, np.nan)
     hz = loop_view([loop], bounded, bandwidth_hz=run.figures.bandwidth / HZ).hz
     if loop.sampling is not None:
         hz = np.append(hz, NYQUIST * 0.5 / loop.sampling.period)

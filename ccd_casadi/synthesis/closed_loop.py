@@ -7,9 +7,7 @@ import numpy as np
 from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.kernels.frequency import prepare, response
-from ccd_casadi.kernels.sensitivity import sensitivity_gain
 from ccd_casadi.lti.closed_loop import sensitivity
-from ccd_casadi.lti.peaks import climbed, local_maxima
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -34,7 +32,7 @@ def measure(
 
     The figures end where the certificate fails; ω_low in rad/s.
     """
-    w0 = plant.omega_0
+    w0, K = plant.omega_0, controller.in_units(plant.omega_0, plant.force)
     row = np.full(int(Figure.COUNT), np.nan)
     row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Figure.LIMITED_BY_BOUND] = 0.0
@@ -42,10 +40,10 @@ def measure(
         plant.A,
         plant.B,
         plant.C,
-        np.ascontiguousarray(controller.A / w0),
-        np.ascontiguousarray(controller.B / w0),
-        np.ascontiguousarray(controller.C / plant.force),
-        np.ascontiguousarray(controller.D / plant.force),
+        np.ascontiguousarray(K.A),
+        np.ascontiguousarray(K.B),
+        np.ascontiguousarray(K.C),
+        np.ascontiguousarray(K.D),
         weights.scaled(w0),
         weights.delta,
         gamma,
@@ -76,21 +74,6 @@ def handed_out(plant: ScaledPlant, made: Design, omega_low: float) -> Design:
     return replace(made, figures=replace(made.figures, outcome=Outcome.LOST_IN_ROUNDING))
 
 
-def local_peaks(plant: ScaledPlant, controller: StateSpace) -> list[tuple[float, float]]:
-    """Local maxima above 1 of σ_max(S) as (ω in rad/s, gain), in order of frequency."""
-    G, K, Dk = _prepared(plant, controller)
-    grid = np.geomspace(1e-3, 1e3, 3001)
-    gain = np.array([sensitivity_gain(G, K, Dk, omega) for omega in grid])
-    found = []
-    for i in local_maxima(gain):
-        if gain[i] > 1.0:
-            omega, top = climbed(
-                lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1], 1e-9
-            )
-            found.append((omega * plant.omega_0, top))
-    return found
-
-
 def responses(
     plant: ScaledPlant, controller: StateSpace, omega: Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -103,8 +86,6 @@ def responses(
 
 
 def _prepared(plant: ScaledPlant, controller: StateSpace) -> tuple:
-    w0, force = plant.omega_0, plant.force
-    G = prepare(plant.A, plant.B, plant.C)
-    parts = (controller.A / w0, controller.B / w0, controller.C / force, controller.D / force)
-    A, B, C, D = (np.ascontiguousarray(part) for part in parts)
-    return G, prepare(A, B, C), D
+    K = controller.in_units(plant.omega_0, plant.force)
+    A, B, C, D = (np.ascontiguousarray(getattr(K, part)) for part in "ABCD")
+    return prepare(plant.A, plant.B, plant.C), prepare(A, B, C), D

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, open_alone, sensitivity
+from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, sensitivity
 from ccd_casadi.lti.grid import around, frequency_grid
 from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -54,10 +54,6 @@ class Loop:
         """S = (I + GK)⁻¹ (k, p, p)."""
         return sensitivity(self.plant_response(omega) @ self.controller_response(omega))
 
-    def open_at_input(self, number: int, omega: Array) -> np.ndarray:
-        """L (k,) of the loop that is cut at one input of the plant, the others closed."""
-        return open_alone(self.controller_response(omega) @ self.plant_response(omega), number)
-
     @cached_property
     def closed(self) -> ClosedLoop:
         """The closed loop, sampled at its instants; a disturbing force is held, and not delayed."""
@@ -67,6 +63,11 @@ class Loop:
         force = np.zeros((len(found.A), self.plant.B.shape[1]))
         force[: len(self.plant.A)] = sampled(self.plant, self.sampling.period, 0.0).B
         return replace(found, B_d=force)
+
+    @property
+    def period(self) -> float | None:
+        """T in s of a sampled loop."""
+        return None if self.sampling is None else self.sampling.period
 
     @property
     def stable(self) -> bool:
