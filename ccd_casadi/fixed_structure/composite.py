@@ -232,4 +232,3 @@ def plants_of_rows(problem: LoopProblem, found: Constraints) -> np.ndarray:
     for part, at, own in problem.split(found):
         out[at] = part.members[plant_of_row(part.problem, own.plant)]
     return out
-

@@ -157,10 +157,10 @@ class LoopProblem:
         found[1] = np.linalg.inv(into)[:count]
         return found
 
-    def loop(self, kappa: Array, tau: float | None) -> Loop:
-        """What the kernels take at κ and τ; without bounds where τ is None."""
-        limits = np.zeros_like(self.limits) if tau is None else self.limits.copy()
-        limits[Curve.SHAPE] -= tau or 0.0
+    def loop(self, kappa: Array, tau: float) -> Loop:
+        """What the kernels take at κ and τ."""
+        limits = self.limits.copy()
+        limits[Curve.SHAPE] -= tau
         plants = self.plants
         return Loop(self._factors[0], np.exp(kappa), self._factors[1], plants.into, plants.out,
                     *plants.modes, limits, self._rows)  # fmt: skip
