@@ -23,8 +23,8 @@ class Weights:
 
     >>> w = Weights(M_S=2.0, A_S=1e-4, omega_S=100.0, c_K=1e4, omega_K=600.0, M_K=2e7,
     ...             A_l=1.0, A_u=1e-2, omega_T=250.0)
-    >>> [round(float(v), 4) for v in abs(w.responses(np.array([100.0]))[:, 0])]
-    [1.118, 0.0, 1.077]
+    >>> tuple(round(float(v), 4) for v in abs(w.responses(np.array([100.0]))[:, 0]))
+    (1.118, 0.0, 1.077)
     """
 
     M_S: float
