@@ -20,6 +20,7 @@ from ccd_casadi.codesign.outer_problem import (
     OuterFailure,
     solve_program,
 )
+from ccd_casadi.codesign.sections_entries import bound_words
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -247,7 +248,7 @@ def front_point(
         predicted=predicted,
         omega_S=sample.omega_S,
         omega_T=sample.omega_T,
-        active=sample.active,
+        active=tuple(bound_words(sample.active)) if sample.kappa else sample.active,
         verified=not reason,
         reason=reason,
     )

@@ -1,6 +1,6 @@
 """A controller of fixed structure as values of result.json and controller.json."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -101,9 +101,18 @@ def _loop_entry(
 
 def active_of(made: SectionsDesign) -> list[str]:
     """What binds the controller."""
+    return bound_words(name for name, mu in made.multipliers.items() if mu > 1e-6)
+
+
+def bound_words(names: Iterable[str]) -> list[str]:
+    """Bounds on the loop as a reader knows them, of rows by kind and channel.
+
+    >>> bound_words(["KS", "CROSSING", "S_MAX of z"])
+    ['S_max of channel z', 'weighted_level of KS']
+    """
     order = list(BINDS)
-    names = [kind_and_channel(name) for name, mu in made.multipliers.items() if mu > 1e-6]
-    bounds = [(order.index(kind), channel) for kind, channel in names if kind in BINDS]
+    found = [kind_and_channel(name) for name in names]
+    bounds = [(order.index(kind), channel) for kind, channel in found if kind in BINDS]
     return [
         BINDS[order[kind]] + (f" of channel {channel}" if channel else "")
         for kind, channel in sorted(bounds)
