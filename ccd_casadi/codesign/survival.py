@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.reach import reach
-from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
@@ -27,7 +27,7 @@ from ccd_casadi.synthesis.statics import INTEGRATOR, Statics, statics
 
 REACH = 0.5  # of the frequency: how far a shift is followed
 FACTORS = (0.1, 10.0)  # of the damping
-PEAK = 1e-6  # relative: by how much S_max may be passed within its range
+PEAK = MixedSensitivity.slack  # relative: by how much S_max may be exceeded within its range
 E_FOLD = 0.1  # step of the logarithm of the damping
 
 
