@@ -18,11 +18,11 @@ from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.sections_direct import polish_sections
-from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
 from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
@@ -104,7 +104,7 @@ class SectionsOuter(ThetaOuter):
         gap = problem.figure.gain(raced.value, best.value) if raced.certified else 0.0
         return SectionsEnd(
             np.array(theta), best.value, objective_of(problem, best),
-            sections_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
+            theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
             found.envelope, raced, worst, members,
         )  # fmt: skip
 
@@ -125,7 +125,7 @@ class SectionsOuter(ThetaOuter):
         problem = asked.problem
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
+        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
             beside = full_order_beside(problem, best.theta, made)

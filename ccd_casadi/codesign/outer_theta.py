@@ -17,16 +17,14 @@ from ccd_casadi.codesign.front_learners import NestedLearner
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.sections_direct import pieces_from, solve_direct_value
-from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
 from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.theta_direct import SETTLED, pieces_from, solve_direct_value
+from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-
-SETTLED = 1e-7  # of J: what local solves of a look promise less than that is not looked for
 
 
 class ThetaOuter(Outer, ABC):
@@ -61,7 +59,7 @@ class ThetaOuter(Outer, ABC):
         problem, truth = self.problem, TrueBandwidth(self.sampler, "polishing")
         with self.sampler.spent.on("polish"):
             best, _ = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
-        kkt = sections_kkt(problem, best, truth)
+        kkt = theta_kkt(problem, best, truth)
         return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
 
     def resumed(
@@ -89,7 +87,7 @@ class ThetaOuter(Outer, ABC):
         J = objective_of(problem, best)
         if not np.isfinite(J):
             return None
-        stationary = sections_kkt(problem, best).stationarity <= SMOOTH
+        stationary = theta_kkt(problem, best).stationarity <= SMOOTH
         return Place(np.array(best.theta), J, stationary)
 
     def learner(self, samples: int, seed: int) -> NestedLearner:
