@@ -29,7 +29,7 @@ FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
-def solve_direct_sections(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
+def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
     """IPOPT on the true ω_b*(θ) from the case's start and a Sobol set of starts."""
     problem = sampler.problem
     lower, upper = box(problem)
