@@ -27,6 +27,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, best_choice, scale
 from ccd_casadi.inner_problem.sections_bandwidth import prepared
 from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -66,7 +67,7 @@ def figures(problem: CoDesignProblem, theta: tuple[float, ...], K: StateSpace) -
     plain = scaled_plant(replace(problem, robust=None), theta)
     loop = closed_loop(plain.plant_si(), K).GS
     static = np.linalg.norm(loop.C @ np.linalg.solve(loop.A, loop.B), 2)
-    if problem.sections is not None:
+    if isinstance(problem.controller, SectionsProblem):
         uncertain = uncertain_plant(problem, theta)
         others = uncertain.plants(uncertain.corners())
     else:
@@ -164,9 +165,9 @@ def main() -> None:
                         continue
                     # no less bandwidth than the first kind has, or half of one's own
                     least = min(HZ * first, raced.bandwidth) if biquads else 0.5 * raced.bandwidth
-                    assert ready.sections is not None
+                    assert isinstance(ready.controller, SectionsProblem)
                     ready = replace(
-                        ready, sections=replace(ready.sections, bandwidth_least=least)
+                        ready, controller=replace(ready.controller, bandwidth_least=least)
                     )  # fmt: skip
                     began = time.process_time()
                     ready, found = least_error_at(ready, theta, raced)

@@ -48,14 +48,14 @@ THETA = 2e-2  # of the box: J is flat there
 def problems() -> dict[str, CoDesignProblem]:
     """By name, what is solved."""
     found = kinds()
-    sections = found["sections"].sections
+    sections = found["sections"].controller
     assert sections is not None
     for name, changes in {
         "set": {"uncertainty": Uncertainty(resonance_shift=0.03)},
         "sampled": {"sampling": Sampling(8000.0, 80.0)},
     }.items():
         other = replace(sections, **changes)  # type: ignore[arg-type]
-        found[f"sections, {name}"] = replace(found["sections"], sections=other)
+        found[f"sections, {name}"] = replace(found["sections"], controller=other)
     for name, path in FILES.items():
         found[name] = ccd.problem_of(ccd.load_case(ROOT / path))
     return found

@@ -121,7 +121,7 @@ def on_the_whole_set(
     `worst_excess`: by how much a last search of the box, with another seed, passed a bound.
     """
     sections = replace(sections_of_problem(problem), anchors=(tuple(map(float, kappa)),))
-    asked = replace(problem, sections=sections, start=theta)
+    asked = replace(problem, controller=sections, start=theta)
     asked, made = prepared(asked, lambda words: print(f"  {words}", flush=True), None, True)
     if not made.certified or made.certificate is None:
         return {"certified": False, "reason": made.words}

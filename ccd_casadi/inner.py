@@ -22,6 +22,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.measured_case import measured_case
+    from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
+    from ccd_casadi.codesign.sections_inner_answer import sections_answer
+    from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
+    from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+    from ccd_casadi.support.errors import UserError
+    from ccd_casadi.support.process_pool import Workers
 
     began = perf_counter()
     measured = measured_case(options.case)
@@ -38,25 +44,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     if (omega_S_hz is None) != (omega_T_hz is None):
         raise CaseError(f"{case.path}: give both --omega-s-hz and --omega-t-hz, or neither")
     point = None if omega_S_hz is None else (HZ * omega_S_hz, HZ * omega_T_hz)
-    if problem.sections is None:
-        from ccd_casadi.codesign.inner_answer import mixed_answer
-
-        if options.begin_at is not None:
-            raise CaseError(f'{case.path}: --begin-at is for structure = "sections"; leave it out')
-        return _print(mixed_answer(problem, theta, point), options, began)
-    from ccd_casadi.codesign.sections_inner_answer import sections_answer
-    from ccd_casadi.support.process_pool import Workers
-
-    if point is not None:
-        raise CaseError(
-            f"{case.path}: sections have no weights' frequencies; leave out --omega-s-hz and "
-            "--omega-t-hz"
-        )
+    answer = {MixedSensitivityProblem: mixed_answer, SectionsProblem: sections_answer}
     with Workers(options.workers) as workers:
-        found = sections_answer(
-            problem, theta, seed=options.seed, workers=workers, begin_at=options.begin_at,
-            progress=_progress(options),
-        )  # fmt: skip
+        how = InnerOptions(options.seed, workers, _progress(options), point, options.begin_at)
+        try:
+            found = answer[type(problem.controller)](problem, theta, how)
+        except UserError as error:
+            raise CaseError(f"{case.path}: {error}") from error
     return _print(found, options, began)
 
 

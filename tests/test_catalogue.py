@@ -407,7 +407,7 @@ def test_what_sections_spend_is_counted_over_all_nodes(
 
     monkeypatch.setattr(SectionsOuter, "formulated", formulated)
     monkeypatch.setattr(outer_sections, "seeded_and_prepared", lambda _, own, *__: (own, ""))
-    own = problem(sections=SectionsProblem())
+    own = problem(controller=SectionsProblem())
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
         searched(SectionsOuter(sampler.of(own)), Direct(), 0)

@@ -17,6 +17,7 @@ from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.schema import case_schema
 from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.robust import demands
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -79,7 +80,7 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
     begin = next(i for i, line in enumerate(lines) if line == "# [controller]")
     built = lines[:begin] + [line.removeprefix("# ") for line in lines[begin:]]
     (folder / "built.toml").write_text("\n".join(built))
-    assert problem_of(load_case(folder / "built.toml")).sections is not None
+    assert isinstance(problem_of(load_case(folder / "built.toml")).controller, SectionsProblem)
     schema = json.loads((folder / "case.schema.json").read_text())
     jsonschema.validate(tomllib.loads(case.read_text()), schema)
 

@@ -66,7 +66,7 @@ def test_sections_agree_with_themselves(seed: int) -> None:
         uncertainty=uncertainty[seed],
         starts=2,
     )
-    case = boxed(problem(sections=sections), rng)
+    case = boxed(problem(controller=sections), rng)
     upper = tuple(low + 0.05 for low in case.lower)
     case = replace(case, upper=upper, start=case.lower)
     result = solve(case, Nested(plan="sobol", points=3, max_refinements=1), seed=seed).result

@@ -17,6 +17,7 @@ from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, prepared, sections_value
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.sampler import Sampler
@@ -63,10 +64,10 @@ def test_a_double_pole_does_not_spoil_the_judge() -> None:
 @pytest.fixture(scope="module")
 def anchored() -> CoDesignProblem:
     problem = problem_of(load_case(CASE))
-    assert problem.sections is not None
+    assert isinstance(problem.controller, SectionsProblem)
     # where |S| may leap at ω_b the optimum lies on a kink
-    few = replace(problem.sections, starts=4, shape_ends=ShapeEnd.CROSSING)
-    found, made = prepared(replace(problem, sections=few))
+    few = replace(problem.controller, starts=4, shape_ends=ShapeEnd.CROSSING)
+    found, made = prepared(replace(problem, controller=few))
     assert made.certified
     return found
 

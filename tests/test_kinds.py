@@ -25,6 +25,7 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.sampling import sampler
@@ -96,8 +97,9 @@ def test_the_value_is_that_of_the_controller(run: Run) -> None:
     G, K = reference_plant(mechanics(model(), theta)), run.controller
     hz = np.geomspace(0.1, 1e3, 4000)
     found = first_crossing(lambda w: sensitivity_gain(G, K, w), HZ * hz, np.sqrt(0.5)) / HZ
-    if run.problem.sections is not None:  # ω_b is the largest that the shape allows
-        shape = run.problem.sections.shape
+    # ω_b is the largest that the shape allows
+    if isinstance(run.problem.controller, SectionsProblem):
+        shape = run.problem.controller.shape
         gain = sensitivity_gain(G, K, HZ * hz)
         found = min(found, float((shape * hz / gain).min()) * np.sqrt(0.5))
     assert run.result["bandwidth_hz"] == pytest.approx(found, rel=1e-4)

@@ -185,7 +185,7 @@ def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate
 
 def case() -> CoDesignProblem:
     sections = SectionsProblem(structure=Structure(biquads=0))
-    return replace(problem(sections=sections), w1=0.0, w2=-1.0)
+    return replace(problem(controller=sections), w1=0.0, w2=-1.0)
 
 
 def line(kkt: KktCertificate) -> Any:
@@ -271,7 +271,7 @@ class TwoControllers(SimpleNamespace):
 
     def bandwidths(self, theta: np.ndarray, label: str) -> list[BandwidthSample]:
         z = (float(theta[0]) - 55.0) / 15.0
-        better = z < self.cliff or (1.0,) in self.problem.sections.anchors
+        better = z < self.cliff or (1.0,) in self.problem.controller.anchors
         value = 300.0 + self.slope * z - 40.0 * z**2 if better else 250.0 + 10.0 * z
         bent = self.slope - 80.0 * z if better else 10.0
         at, kappa, nan = tuple(map(float, theta)), (1.0 if better else 2.0,), float("nan")
@@ -283,7 +283,7 @@ class TwoControllers(SimpleNamespace):
 @few(max_examples=20)
 @given(st.floats(0.1, 0.3), st.floats(30.0, 60.0))
 def test_a_jump_of_the_bandwidth_is_passed_by_its_controller(cliff: float, slope: float) -> None:
-    case = problem(sections=SectionsProblem(anchors=((2.0,),)), w1=0.0, w2=-1.0)
+    case = problem(controller=SectionsProblem(anchors=((2.0,),)), w1=0.0, w2=-1.0)
     truth = TrueBandwidth(cast(Any, TwoControllers(problem=case, slope=slope, cliff=cliff)), "")
     after, best = by_pieces(truth, truth.at(np.array([55.0, 60.0])))
     assert best.theta[0] == pytest.approx(55.0 + 15.0 * slope / 80.0, abs=0.02)

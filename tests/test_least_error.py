@@ -88,6 +88,6 @@ def test_a_case_asks_for_the_least_error(tmp_path: Path) -> None:
         '\n[controller]\nstructure = "sections"\n[budget.force]\nunit = "N/rtHz"\nlevel = 0.01\n'
     )
     path.write_text(text + added)
-    sections = problem_of(load_case(path)).sections
+    sections = problem_of(load_case(path)).controller
     assert sections is not None
     assert (sections.minimise, sections.bandwidth_least) == ("rms_error", 10.0 * HZ)

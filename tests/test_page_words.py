@@ -11,6 +11,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.deployment.words import against
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.robustness_figures import shown_peak, shown_until
@@ -23,8 +24,8 @@ def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> Non
     problem = problem_of(load_case("runs/two_mass_built.toml"))
     hz = np.geomspace(0.1, 5000.0, 300)
     S, KS, T = kind_of(problem).bounded(problem.weights, np.nan, 50.0).over(hz)
-    assert problem.sections is not None
-    ended = replace(problem, sections=replace(problem.sections, shape_ends=ShapeEnd.CROSSING))
+    assert isinstance(problem.controller, SectionsProblem)
+    ended = replace(problem, controller=replace(problem.controller, shape_ends=ShapeEnd.CROSSING))
     short = kind_of(ended).bounded(problem.weights, np.nan, 50.0).over(hz)[0]
     _, W_KS, W_T = np.abs(problem.weights.responses(HZ * hz))
     assert np.allclose(W_KS * KS, 8.426)

@@ -23,6 +23,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     uncertain_plant,
     with_channels,
 )
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.sampling.keys import problem_hash
@@ -58,10 +59,10 @@ def test_the_shipped_case_comes_back_and_says_what_it_means(tmp_path: Path) -> N
     assert replace(load_case(again), path=case.path) == case
     problem = problem_of(case)
     assert problem.robust is None
-    assert problem.sections is not None
-    assert problem.sections.structure.order == 8
-    assert problem.sections.sampling is not None
-    assert problem.sections.sampling.delay == pytest.approx(1e-4)
+    assert isinstance(problem.controller, SectionsProblem)
+    assert problem.controller.structure.order == 8
+    assert problem.controller.sampling is not None
+    assert problem.controller.sampling.delay == pytest.approx(1e-4)
     bounds = bounds_of(problem)
     assert (bounds.S_max, bounds.shape, bounds.weighted_level) == (1.75, 1.1, 8.426)
     assert bounds.weights is not None
@@ -243,8 +244,8 @@ def test_the_built_stage_has_its_channels_and_its_option_sets() -> None:
     assert isinstance(structure, ChannelStructure)
     assert structure.decoupling.names == ("z", "tip", "tilt", "twist")
     assert structure.decoupling.orthogonal
-    assert problem.sections is not None
-    options = [dict(item) for item in problem.sections.uncertainty.options]
+    assert isinstance(problem.controller, SectionsProblem)
+    options = [dict(item) for item in problem.controller.uncertainty.options]
     assert [item["modes"] for item in options] == [20, 20]
     assert options[0]["mesh"] == "fine"
     assert "point_masses" in options[1]

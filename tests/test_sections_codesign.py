@@ -36,7 +36,7 @@ PID = SectionsProblem(
 
 
 def quick(sections: SectionsProblem = PID) -> CoDesignProblem:
-    case = problem(sections=sections, start=(60.0, 60.0))
+    case = problem(controller=sections, start=(60.0, 60.0))
     return replace(case, inner=replace(case.inner, S_low=0.2))
 
 
@@ -128,8 +128,8 @@ def test_the_set_holds_on_the_box_that_it_stands_for(anchored: CoDesignProblem) 
 def test_the_range_of_frequencies_is_that_of_the_start() -> None:
     """Alike at every θ, or ω_b* would move with it where it binds."""
     case = with_range(quick())
-    assert case.sections is not None
-    assert case.sections.frequencies is not None
+    assert isinstance(case.controller, SectionsProblem)
+    assert case.controller.frequencies is not None
     assert with_range(replace(case, start=(70.0, 70.0))) == replace(case, start=(70.0, 70.0))
 
 

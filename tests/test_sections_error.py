@@ -22,7 +22,7 @@ from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
-from ccd_casadi.inner_problem.sections_problem import Uncertainty
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError
@@ -59,8 +59,8 @@ def test_the_gradient_is_the_slope_of_the_least_error(
     sampling: Sampling | None, tmp_path: Path
 ) -> None:
     case = anchored(least(sampling), tmp_path)
-    assert case.sections is not None
-    assert case.sections.error_anchors
+    assert isinstance(case.controller, SectionsProblem)
+    assert case.controller.error_anchors
     theta, h = np.array([61.0, 59.0]), 0.05
     value = sections_value(case, theta)
     assert value.feasible

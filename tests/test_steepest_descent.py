@@ -10,7 +10,7 @@ from helpers import problem
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.studies import steepest_descent as module
+from ccd_casadi.studies import baselines as module
 from ccd_casadi.studies.steepest_descent import steepest_descent
 
 
@@ -31,7 +31,7 @@ def test_a_step_is_accepted_by_what_its_gradient_is_of(
 
     monkeypatch.setattr(module, "sections_value", value)
     case = problem(
-        sections=SectionsProblem(minimise="rms_error") if of_error else SectionsProblem(),
+        controller=SectionsProblem(minimise="rms_error") if of_error else SectionsProblem(),
         w1=0.0, w2=1.0 if of_error else -1.0,
     )  # fmt: skip
     found = steepest_descent(case, (62.0, 61.0), first_step=0.2)

@@ -6,8 +6,9 @@ from ccd_casadi.cases.budget import error_budget
 from ccd_casadi.cases.case import CaseError, options_in
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
-from ccd_casadi.cases.kinds import disturbance_of, require_channels, sections_problem, weights_of
+from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
 from ccd_casadi.cases.sections import Case, RobustSection
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.robust_set import RobustSet
@@ -36,6 +37,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     if case.plant.function is not None:
         name, function = case.plant.function.rsplit(":", 1)
         file = str((case.path.parent / name).resolve())
+    structured = case.controller.structure == "sections"
     options = tuple(sorted((key, _frozen(value)) for key, value in case.plant.options.items()))
     problem = CoDesignProblem(
         source=PlantSource(
@@ -65,24 +67,22 @@ def problem_of(case: Case) -> CoDesignProblem:
             gamma_backoff=inner.gamma_backoff,
             sweep_points=inner.sweep_points,
             # sections bound it themselves, on every plant of theirs
-            compliance_max=None
-            if case.controller.structure == "sections"
-            else inner.compliance_max,
+            compliance_max=None if structured else inner.compliance_max,
         ),
         suspension=Suspension(case.suspension.frequency_hz, case.suspension.damping_ratio),
         method=inner.method,
-        robust=None if case.controller.structure == "sections" else _robust(case.robust),
-        sections=sections_problem(
+        robust=None if structured else _robust(case.robust),
+        controller=sections_problem(
             case.controller, case.loop, case.robust, inner, _option_sets(case)
-        ),
+        )
+        if structured
+        else MixedSensitivityProblem(),
         budget=error_budget(case.budget),
     )
     try:
-        plants = [plant_of(problem)]
-        if problem.sections is not None:
-            sets = problem.sections.uncertainty.options
-            plants += [plant_of(with_options(problem, item)) for item in sets]
-            require_channels(plants, problem.sections)
+        others = problem.controller.plant_options
+        plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
+        problem.controller.require_plants(plants)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:

@@ -1,7 +1,7 @@
 """Kinds of inner problem in a case file: which keys go with which, and the sections' problem."""
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,11 @@ from ccd_casadi.budget import Kind
 from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
 from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.fixed_structure.decoupling import given_decoupling
 from ccd_casadi.inner_problem.sections_problem import (
     ChannelProblem,
     SectionsProblem,
     Uncertainty,
 )
-from ccd_casadi.plants.plant import Plant
-from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.weights import Weights
 
@@ -168,49 +165,14 @@ def read_options(path: Path) -> dict[str, Any]:
     return found
 
 
-def require_channels(plants: Sequence[Plant], sections: SectionsProblem) -> None:
-    """Raise PlantError unless every plant has as many inputs as outputs, and channels for them."""
-    for plant in plants:
-        m, p = plant.inputs, plant.outputs
-        if m != p:
-            words = f'has {m} inputs and {p} outputs; controller.structure = "sections" needs as'
-            raise PlantError(
-                f'{words} many of one as of the other: leave some out, or "h_infinity"'
-            )
-        if p > 1 and sections.minimise == "rms_error":
-            words = 'has several outputs; inner.minimise = "rms_error" is for one: drop it'
-            raise PlantError(words)
-        if not sections.channels:
-            continue
-        given = sections.channels[0].outputs is not None
-        found = [channel.name for channel in sections.channels]
-        if p == 1:
-            raise PlantError("has one output: drop the tables [controller.channel]")
-        if len(found) == p and all(c.bandwidth_ratio > 1.0 for c in sections.channels):
-            words = "every one of its channels has a bandwidth_ratio above 1; drop it at the"
-            raise PlantError(f"{words} slowest, whose bandwidth is ω_b")
-        if given:
-            channels = [(c.name, c.outputs or (), c.inputs or ()) for c in sections.channels]
-            given_decoupling(*(list(part) for part in zip(*channels, strict=True)))
-            if len(found) != p:
-                raise PlantError(f"has {p} outputs; give as many tables [controller.channel.NAME]")
-        elif not set(found) <= {str(i + 1) for i in range(p)}:
-            words = (
-                f"has channels 1 to {p} where none gives outputs; name one of them, or give them"
-            )
-            raise PlantError(words)
-
-
 def sections_problem(
     controller: ControllerSection,
     loop: LoopSection,
     robust: RobustSection,
     inner: InnerSection,
     options: tuple[tuple[tuple[str, object], ...], ...],
-) -> SectionsProblem | None:
-    """The problem of a fixed structure; None where the case asks for none."""
-    if controller.structure != "sections":
-        return None
+) -> SectionsProblem:
+    """The problem of a fixed structure."""
     return SectionsProblem(
         structure=structure_of(controller),
         shape=SHAPE if inner.shape is None else inner.shape,

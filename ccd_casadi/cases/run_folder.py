@@ -6,7 +6,7 @@ checked, and the controller is certified again on the plant that the case file d
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -18,10 +18,11 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import with_range
-from ccd_casadi.inner_problem.sections_plant_set import structure_of
-from ccd_casadi.inner_problem.sections_problem import ChannelProblem
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -106,8 +107,17 @@ def read_run(folder: str | Path) -> FinishedRun:
     case = load_case(folder / "case.toml")
     problem = problem_of(case)
     theta = _theta(folder / "result.json", result, problem)
-    if problem.sections is not None:
-        return _read_sections(folder, case, problem, theta, result)
+    return _READERS[type(problem.controller)](folder, case, problem, theta, result)
+
+
+def _read_mixed(
+    folder: Path,
+    case: Case,
+    problem: CoDesignProblem,
+    theta: tuple[float, ...],
+    result: Mapping[str, Any],
+) -> FinishedRun:
+    """A run of mixed sensitivity: its controller, certified again at the γ that it had."""
     frequencies = [_number(folder / "result.json", result, k) for k in ("omega_S_hz", "omega_T_hz")]
     weights = problem.weights.at(HZ * frequencies[0], HZ * frequencies[1])
     plant = scaled_plant(problem, theta)
@@ -169,8 +179,7 @@ def with_function(
 
     Raises UserError where result.json holds others.
     """
-    sections = problem.sections
-    assert sections is not None
+    sections = sections_of_problem(problem)
     if "anchors" not in result:
         return problem  # of an earlier version
     try:
@@ -188,7 +197,7 @@ def with_function(
     if any(len(kappa) != own for kappa in (*anchors, *slower)):
         raise UserError(f"{path}: anchors: are of another structure; solve the case again")
     found = replace(sections, anchors=anchors, members=members, seed=seed, error_anchors=slower)
-    return with_range(replace(problem, sections=found))
+    return with_range(replace(problem, controller=found))
 
 
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
@@ -206,8 +215,8 @@ def _with_directions(
     problem: CoDesignProblem, table: Mapping[str, Any] | None, path: Path
 ) -> CoDesignProblem:
     """The problem with the directions of channels that the controller was designed in."""
-    sections = problem.sections
-    if sections is None or not isinstance(table, Mapping) or "channels" not in table:
+    sections = sections_of_problem(problem)
+    if not isinstance(table, Mapping) or "channels" not in table:
         return problem
     own = {channel.name: channel for channel in sections.channels}
     try:
@@ -222,7 +231,16 @@ def _with_directions(
     except (KeyError, TypeError, ValueError):
         words = "sections.channels: names no directions; solve the case again"
         raise UserError(f"{path}: {words}") from None
-    return replace(problem, sections=replace(sections, channels=channels))
+    return replace(problem, controller=replace(sections, channels=channels))
+
+
+Reader = Callable[
+    [Path, Case, CoDesignProblem, tuple[float, ...], Mapping[str, Any]], FinishedRun
+]
+_READERS: dict[type[ControllerProblem], Reader] = {
+    MixedSensitivityProblem: _read_mixed,
+    SectionsProblem: _read_sections,
+}
 
 
 def refuse_sections(run: FinishedRun, command: str, remedy: str) -> None:

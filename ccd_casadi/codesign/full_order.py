@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, SectionsDesign, certify
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     design_choices,
@@ -78,7 +79,7 @@ def full_order_beside(
 ) -> Beside:
     """What mixed sensitivity reaches at θ beside a certified design of fixed structure."""
     sections, kappa = sections_of_problem(problem), made.kappa
-    plain = replace(problem, sections=None, robust=None)
+    plain = replace(problem, controller=MixedSensitivityProblem(), robust=None)
     plants, bounds = plants_of(problem, theta), bounds_of(problem)
     on_model, weights, gamma_opt = _fastest([plain], theta, plants, bounds)
     norm = float("nan")
@@ -161,6 +162,6 @@ def _climbed(
 ) -> float:
     """ω_b in rad/s where the climbs from the design and the anchors end on another set or loop."""
     sections = replace(sections, minimise="bandwidth")
-    asked = joined(replace(problem, sections=sections), kappa, ())
+    asked = joined(replace(problem, controller=sections), kappa, ())
     value = sections_value(asked, theta)
     return value.bandwidth if value.feasible else float("nan")

@@ -1,7 +1,8 @@
 """The inner problem at one θ under the contract's keys: by mixed sensitivity, as JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,9 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.statics import statics
@@ -46,6 +49,21 @@ class InnerAnswer:
     rows: tuple[DesignFigures, ...] = ()
 
 
+@dataclass(frozen=True)
+class InnerOptions:
+    """How an inner problem is searched: seed and processes, and what one kind only knows.
+
+    `point`: (ω_S, ω_T) in rad/s of a single synthesis. `begin_at`: a run folder whose controller
+    the search goes on from.
+    """
+
+    seed: int
+    workers: Pool
+    progress: Callable[[str], None] | None = None
+    point: tuple[float, float] | None = None
+    begin_at: Path | None = None
+
+
 def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
     """θ by name, and what the hardware costs."""
     return {
@@ -55,9 +73,12 @@ def head_of(problem: CoDesignProblem, theta: Sequence[float]) -> dict[str, Any]:
 
 
 def mixed_answer(
-    problem: CoDesignProblem, theta: tuple[float, ...], point: tuple[float, float] | None = None
+    problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
-    """The true ω_b*(θ) by mixed sensitivity; at `point` (ω_S, ω_T), rad/s, that synthesis alone."""
+    """The true ω_b*(θ) by mixed sensitivity; at `options.point` that synthesis alone."""
+    if options.begin_at is not None:
+        raise UserError('--begin-at is for structure = "sections"; leave it out')
+    point = options.point
     head = head_of(problem, theta)
     rows: tuple[DesignFigures, ...] = ()
     if point is not None:

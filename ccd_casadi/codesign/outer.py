@@ -7,6 +7,7 @@ inner problem at θ has to say against it, and how the design that is left is ju
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Verified
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -60,6 +61,8 @@ class Outer(ABC):
 
     kkt_level: float  # residual up to which an end counts as stationary
     look_is_cheap: bool  # whether local solves may start from points that are no better
+    learns_from_others: bool  # whether surrogates of other problems can begin a formulation
+    beside_theta: tuple[str, ...] = ()  # what else x holds, logarithms
 
     def __init__(self, sampler: Sampler) -> None:
         self.sampler = sampler
@@ -73,8 +76,21 @@ class Outer(ABC):
         """θ of a point."""
         return np.asarray(x, float)[: len(self.problem.names)]
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of x."""
+        return box(self.problem)
+
+    def point_at(self, theta: Array) -> Array:
+        """x where a polish at θ begins."""
+        return theta
+
     def prepared(self, seed: int) -> "Outer":
         """With what every search needs before it begins."""
+        return self
+
+    def continued(self, folder: Path, seed: int) -> "Outer":
+        """With what the run in a folder ended with, where its kind needs that."""
         return self
 
     @abstractmethod

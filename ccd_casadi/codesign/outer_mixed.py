@@ -75,6 +75,19 @@ class MixedOuter(Outer):
 
     kkt_level = VerifiedDesign.kkt_level
     look_is_cheap = True
+    learns_from_others = True
+    beside_theta = ("omega_S", "omega_T")
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return lifted_bounds(self.problem)
+
+    def point_at(self, theta: Array) -> Array:
+        inner = self.sampler.bandwidths(theta, "verifying")[0]
+        if inner.feasible:
+            return joint_point(inner)
+        lower, upper = self.bounds
+        return np.array([*theta, *(0.5 * (lower + upper))[-2:]])
 
     def formulated(
         self, formulation: Formulation, seed: int, given: Surrogates | None = None

@@ -7,10 +7,12 @@ what they find joins, and the outer problem is solved again.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 
+from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
@@ -67,6 +69,7 @@ class SectionsOuter(Outer):
 
     kkt_level = VerifiedSections.kkt_level
     look_is_cheap = False
+    learns_from_others = False
 
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
@@ -83,6 +86,14 @@ class SectionsOuter(Outer):
         sampler.raced(sampler.hash)
         lost = words and not sections_of_problem(problem).anchors
         return SectionsOuter(sampler.of(problem), words if lost else "")
+
+    def continued(self, folder: Path, seed: int) -> "SectionsOuter":
+        """With the anchors and the plant set of a run, or those of a race where it has none."""
+        path, sampler = folder / "result.json", self.sampler
+        if not path.exists():
+            return self.prepared(seed)
+        problem = with_function(path, sampler.problem, read_json(path))
+        return SectionsOuter(sampler.of(problem)).prepared(seed)
 
     def formulated(
         self, formulation: Formulation, seed: int, given: Surrogates | None = None

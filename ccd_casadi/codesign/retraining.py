@@ -19,16 +19,15 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
-from ccd_casadi.codesign.outer_problem import lifted_bounds, unmet_constraint
+from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.run import outer_of, require_solvable
 from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import concluded_at
-from ccd_casadi.codesign.sections_races import seeded_and_prepared
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
 from ccd_casadi.inner_problem.constraints import constraint_sizes
@@ -67,16 +66,15 @@ def open_run(
     with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
         case = load_case(folder / "case.toml")
         problem = problem_of(case)
-        require_solvable(problem, False)
+        require_solvable(problem)
         formulation = _formulation(folder)
         with (
             pool(scheduler, workers, PATIENCE) as evaluators,
             SampleStore(folder / "samples.sqlite") as store,
         ):
-            if problem.sections is not None:
-                problem = _function_of(folder, problem, store, seed, quiet)
-            sampler = Sampler(problem, store, evaluators, quiet=quiet)
-            yield CoDesignTruth(folder, case, sampler, formulation, write_page, tolerance, seed)
+            outer = outer_of(Sampler(problem, store, evaluators, quiet=quiet))
+            outer = outer.continued(folder, seed)
+            yield CoDesignTruth(folder, case, outer, formulation, write_page, tolerance, seed)
 
 
 class CoDesignTruth:
@@ -86,21 +84,23 @@ class CoDesignTruth:
         self,
         folder: Path,
         case: Case,
-        sampler: Sampler,
+        outer: Outer,
         formulation: str,
         write_page: PageWriter,
         tolerance: float | None = None,
         seed: int = 0,
     ) -> None:
-        problem = sampler.problem
-        self.folder, self.case, self.sampler, self.seed = folder, case, sampler, seed
+        problem = outer.problem
+        self.folder, self.case, self.outer, self.seed = folder, case, outer, seed
+        self.sampler = outer.sampler
         self.write_page = write_page
         self.formulation = formulation
-        self.over_theta = problem.sections is not None or formulation == "nested"  # x = θ
-        self.names = problem.names if self.over_theta else (*problem.names, "omega_S", "omega_T")
+        beside = () if formulation == "nested" else outer.beside_theta
+        self.over_theta = not beside  # x = θ
+        self.names = (*problem.names, *beside)
         more = () if self.over_theta else OUTPUTS[1 : 1 + len(problem.inner.bounds)]
         self.outputs = (problem.figure.key, *more)
-        self.lower, self.upper = box(problem) if self.over_theta else lifted_bounds(problem)
+        self.lower, self.upper = box(problem) if self.over_theta else outer.bounds
         self.tolerance = case.outer.tolerance if tolerance is None else tolerance
         self.objective, self.constraints = _functions(problem, len(self.lower), len(self.outputs))
         form = "nested" if formulation == "nested" else "lifted"  # direct has no surrogates
@@ -138,7 +138,7 @@ class CoDesignTruth:
         if before is not None and before["retraining"] == mark | {"x": before["retraining"]["x"]}:
             return str(before["status"])
         start = None if x is None else self._start(x, before)
-        processes, outer = tuple(surrogates), outer_of(self.sampler)
+        processes, outer = tuple(surrogates), self.outer
         outcome = FormulationResult(start, None, (), processes, None, True, "")
         if start is None:
             words = unmet_constraint(self.sampler.problem, self.case.outer.starts, self.seed)
@@ -166,19 +166,11 @@ class CoDesignTruth:
         return found if known and (self.folder / "report.html").exists() else None
 
     def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
-        """Where to verify: x with its break frequencies, or the verified design that is by it."""
-        problem = self.sampler.problem
-        if problem.sections is not None:
-            return x
-        if self.over_theta:
-            inner = self.sampler.bandwidths(x, "verifying")[0]
-            if not inner.feasible:
-                lower, upper = lifted_bounds(problem)
-                return np.array([*x, *(0.5 * (lower + upper))[-2:]])
-            x = np.array([*inner.theta, np.log(inner.omega_S), np.log(inner.omega_T)])
+        """Where to verify: a point of the outer problem, or the verified design that is by it."""
+        x = self.outer.point_at(x) if self.over_theta else x
         if before is not None and before["retraining"]["x"] is not None:
             old = np.array(before["retraining"]["x"])
-            lower, upper = lifted_bounds(problem)
+            lower, upper = self.outer.bounds
             if np.abs((old - x) / (upper - lower)).max() <= CLOSE:
                 return old
         return x
@@ -199,18 +191,6 @@ class CoDesignTruth:
             return Observations(X, Y)
         dY = np.array([s.gradient for s in samples]).reshape(-1, 1, d)
         return Observations(X, Y, dY)
-
-
-def _function_of(
-    folder: Path, problem: CoDesignProblem, store: SampleStore, seed: int, quiet: bool
-) -> CoDesignProblem:
-    """The problem with the run's anchors and plant set, or where it has none those of a race."""
-    path = folder / "result.json"
-    if path.exists():
-        found = with_function(path, problem, read_json(path))
-        if found.sections is not None and found.sections.anchors:
-            return found
-    return seeded_and_prepared(store, problem, seed, quiet)[0]
 
 
 def _functions(problem: CoDesignProblem, d: int, k: int) -> tuple[ca.Function, ca.Function]:

@@ -22,7 +22,9 @@ from ccd_casadi.codesign.sections_lists import ListedSections
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
@@ -83,7 +85,9 @@ def co_design(
     began = perf_counter()
     name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
     outer = outer_of(sampler)
-    require_solvable(sampler.problem, given is not None)
+    require_solvable(sampler.problem)
+    if given is not None and not outer.learns_from_others:
+        raise UserError("--surrogate: starts no solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
@@ -103,7 +107,14 @@ def co_design(
 
 def outer_of(sampler: Sampler) -> Outer:
     """The outer problem of the kind of controller that a sampler's problem has."""
-    return MixedOuter(sampler) if sampler.problem.sections is None else SectionsOuter(sampler)
+    return OUTERS[type(sampler.problem.controller)](sampler)
+
+
+# One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
+OUTERS: dict[type[ControllerProblem], type[Outer]] = {
+    MixedSensitivityProblem: MixedOuter,
+    SectionsProblem: SectionsOuter,
+}
 
 
 def verify(sampler: Sampler, x: Array) -> Verified:
@@ -117,18 +128,16 @@ def verify(sampler: Sampler, x: Array) -> Verified:
         return outer.verified(end, 1)
 
 
-def require_solvable(problem: CoDesignProblem, given: bool) -> None:
-    """Raise UserError where J rewards what it should not, or `given` surrogates are of no use."""
-    if problem.sections is not None and given:
-        raise UserError("--surrogate: starts no solve with sections; solve the case without it")
+def require_solvable(problem: CoDesignProblem) -> None:
+    """Raise UserError where J rewards what it should not."""
     if not problem.figure.larger_is_better and not problem.w2 > 0.0:
         words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
         raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
-    """A co-design with parameters from lists."""
-    if sampler.problem.sections is not None:
+    """A co-design with parameters from lists: local searches near by where these know how."""
+    if isinstance(outer_of(sampler), SectionsOuter):
         of = ListedSections(formulation, seed, lambda each: co_design(each, formulation, seed))
         return best_of_lists(sampler, of.search, of.search, of.judge)
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box

@@ -1,54 +1,51 @@
 """The inner problem of a fixed structure at one θ: race, worst plants, judge and proof; as JSON."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.budget_result import budget_entry
-from ccd_casadi.codesign.inner_answer import InnerAnswer, head_of
+from ccd_casadi.codesign.inner_answer import InnerAnswer, InnerOptions, head_of
 from ccd_casadi.codesign.sections_entries import (
     active_of,
     design_dict,
     proof_dict,
     sections_controller,
 )
+from ccd_casadi.inner_problem.figure import RMS_ERROR
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
 from ccd_casadi.inner_problem.sections_error import least_error_at
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 
 
 def sections_answer(
-    problem: CoDesignProblem,
-    theta: tuple[float, ...],
-    *,
-    seed: int,
-    workers: Pool,
-    begin_at: Path | None = None,
-    progress: Callable[[str], None] | None = None,
+    problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
 ) -> InnerAnswer:
     """The largest bandwidth (or least error) of the structure at θ, judged over its box.
 
-    `begin_at`: the search goes on from the controller of that run folder alone, without a race.
+    From the controller of the folder `options.begin_at` alone, where there is one, without a race.
     """
+    if options.point is not None:
+        words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
+        raise UserError(words)
+    begin_at, progress, workers = options.begin_at, options.progress, options.workers
     head = head_of(problem, theta)
-    sections = replace(sections_of_problem(problem), seed=seed)
-    asked = replace(with_range(replace(problem, sections=sections)), start=theta)
+    sections = replace(sections_of_problem(problem), seed=options.seed)
+    asked = replace(with_range(replace(problem, controller=sections)), start=theta)
     if begin_at is not None:
         anchors = (sections_kappa(begin_at, structure_of(asked)),)
-        asked = replace(asked, sections=replace(sections_of_problem(asked), anchors=anchors))
+        asked = replace(asked, controller=replace(sections_of_problem(asked), anchors=anchors))
     asked, made = prepared(asked, progress, workers, begin_at is not None)
     if not made.certified:
         return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
     value = made.bandwidth
-    if sections.of_error:
+    if problem.figure is RMS_ERROR:
         slow = too_slow(asked, made)
         if not slow.certified:
             return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})

@@ -128,9 +128,8 @@ def _start(found: Solution) -> CoDesignProblem:
 def _at(
     problem: CoDesignProblem, theta: tuple[float, ...], kappa: tuple[float, ...]
 ) -> CoDesignProblem:
-    of_error = sections_of_problem(problem).of_error
-    own = with_sections(problem, anchors=(kappa,), error_anchors=(kappa,) if of_error else ())
-    return replace(own, start=theta)
+    own = replace(sections_of_problem(problem), anchors=(kappa,), error_anchors=())
+    return replace(problem, controller=own.with_anchor(kappa, 1), start=theta)
 
 
 def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:

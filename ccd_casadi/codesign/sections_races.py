@@ -37,7 +37,7 @@ class Raced:
 
 
 def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
-    return with_range(replace(problem, sections=replace(sections_of_problem(problem), seed=seed)))
+    return with_range(replace(problem, controller=replace(sections_of_problem(problem), seed=seed)))
 
 
 def seeded_and_prepared(
@@ -77,7 +77,7 @@ def seeded_and_prepared(
     sections = replace(
         sections_of_problem(problem), anchors=anchors, members=members, error_anchors=slower
     )
-    return replace(problem, sections=sections), words
+    return replace(problem, controller=sections), words
 
 
 def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> Raced:

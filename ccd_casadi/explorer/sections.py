@@ -53,7 +53,7 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
         mine, anchors=theirs.anchors, members=members, channels=theirs.channels,
         frequencies=theirs.frequencies, seed=theirs.seed,
     )  # fmt: skip
-    return replace(problem, sections=taken, start=known.start)
+    return replace(problem, controller=taken, start=known.start)
 
 
 def designed(task: tuple[CoDesignProblem, Knobs]) -> Designed:
@@ -65,7 +65,7 @@ def designed(task: tuple[CoDesignProblem, Knobs]) -> Designed:
     designs = problem_hash(problem.identity())
     inner = problem_hash({"problem": designs, "inner": problem.inner_identity()})
     own = sample_key(inner, knobs.theta, 0.0, 0.0)
-    rows, (_, theta, payload) = sections_unit(problem, own, knobs.theta)
+    rows, (_, theta, payload) = sections_unit(problem, designs, own, knobs.theta)
     kappa = np.array(payload["kappa"]) if payload["kappa"] else None
     return Designed(
         problem, knobs, kappa, payload["shortfall"], tuple(rows), (own, inner, theta, payload)

@@ -2,8 +2,8 @@
 
     v(θ) = max ω_b or min e over the controllers of a kind, within their bounds on every plant
 
-A kind knows no hardware cost and no weights of J. `kind_of` is where a problem is told to be of one
-kind or another; what works on problems asks the kind.
+A kind knows no hardware cost and no weights of J. What works on problems of any kind is written
+against `InnerKind`.
 """
 
 from abc import ABC, abstractmethod
@@ -13,10 +13,12 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import LOOSE
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -41,6 +43,10 @@ class InnerKind(ABC):
     @abstractmethod
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
         """v(θ) in SI and its gradient (n,); NaN where no controller is certified."""
+
+    @abstractmethod
+    def described(self) -> tuple[str, str]:
+        """The kind of controller, and how it runs or is searched, for the eye."""
 
     @abstractmethod
     def require_function(self) -> None:
@@ -79,6 +85,12 @@ class MixedSensitivity(InnerKind):
             return np.nan, np.full(len(theta), np.nan)
         bounded = tuple(self.problem.inner.bounds)
         return found.bandwidth, bandwidth_gradient(found.optimum, found.active, bounded)
+
+    def described(self) -> tuple[str, str]:
+        inner = self.problem.inner
+        ranges = (("ω_S", inner.omega_S), ("ω_T", inner.omega_T))
+        words = (f"{name} {a / HZ:.5g} to {b / HZ:.5g} Hz" for name, (a, b) in ranges)
+        return "mixed sensitivity", ", ".join(words)
 
     def require_function(self) -> None:
         """It always is."""
@@ -119,6 +131,11 @@ class FixedStructure(InnerKind):
     def value(self, theta: Sequence[float]) -> tuple[float, Array]:
         found = sections_value(self.problem, theta)
         return found.value, np.array(found.gradient)
+
+    def described(self) -> tuple[str, str]:
+        sampling = self.problem.sampling
+        runs = "in continuous time" if sampling is None else f"at {sampling.rate_hz:.5g} Hz"
+        return "of fixed structure", runs
 
     def require_function(self) -> None:
         if not sections_of_problem(self.problem).anchors:
@@ -168,4 +185,11 @@ class FixedStructure(InnerKind):
 
 def kind_of(problem: CoDesignProblem) -> InnerKind:
     """The kind of inner problem."""
-    return MixedSensitivity(problem) if problem.sections is None else FixedStructure(problem)
+    return KINDS[type(problem.controller)](problem)
+
+
+# One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
+KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
+    MixedSensitivityProblem: MixedSensitivity,
+    SectionsProblem: FixedStructure,
+}

@@ -5,17 +5,17 @@ beside the samples that it determines.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.figure import Figure
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
-from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
 from ccd_casadi.plants.plant import Mechanics, Plant, mechanics
@@ -54,7 +54,7 @@ class CoDesignProblem(Shown):
     suspension: Suspension
     method: str = "search"  # how the inner problem is solved: "search" or "sweep"
     robust: RobustSet | None = None
-    sections: SectionsProblem | None = None  # a fixed structure instead of mixed sensitivity
+    controller: ControllerProblem = field(default_factory=MixedSensitivityProblem)
     budget: ErrorBudget | None = None  # what moves the stage: judged, no part of a synthesis
     cost_unit: str = ""  # of f(θ)
     listed: tuple[tuple[str, tuple[float, ...]], ...] = ()  # parameters that are one of a few
@@ -68,11 +68,7 @@ class CoDesignProblem(Shown):
         w, robust = self.weights, self.robust
         with_disturbance = (w.disturbance,) if w.disturbance else ()
         perturbed: dict[str, object] = {} if robust is None else {"robust": vars(robust)}
-        if self.sections is not None:
-            perturbed["sections"] = self.sections.identity() | {"omega_T": w.omega_T}
-            if self.sections.of_error:
-                assert self.budget is not None
-                perturbed["budget"] = asdict(self.budget)
+        perturbed |= self.controller.identity_with(w, self.budget)
         if self.inner.compliance_max is not None:
             perturbed["compliance"] = True
         return {
@@ -89,12 +85,12 @@ class CoDesignProblem(Shown):
     @property
     def figure(self) -> Figure:
         """What J counts of the controller."""
-        return BANDWIDTH if self.sections is None else self.sections.figure
+        return self.controller.figure
 
     @property
     def sampling(self) -> Sampling | None:
         """Rate and delay that the controller is designed for; None: continuous."""
-        return None if self.sections is None else self.sections.sampling
+        return self.controller.sampling
 
     @property
     def parameter_units(self) -> dict[str, str]:
@@ -220,10 +216,9 @@ def true_design(
 
 
 def _require_mixed(problem: CoDesignProblem) -> None:
-    if problem.sections is not None:
-        raise UserError(
-            "the problem asks for a fixed structure; use sections_value(problem, theta)"
-        )
+    if not isinstance(problem.controller, MixedSensitivityProblem):
+        words = "the problem is not one of mixed sensitivity; use sections_value(problem, theta)"
+        raise UserError(words)
 
 
 def box(problem: CoDesignProblem) -> tuple[Array, Array]:

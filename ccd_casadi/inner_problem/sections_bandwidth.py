@@ -18,7 +18,7 @@ from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
@@ -116,7 +116,7 @@ def valued(
     """A design of largest bandwidth as a value of ω_b*(θ), or as the start to the least error."""
     point = tuple(float(v) for v in theta)
     error, envelope = np.nan, None
-    if made.certified and sections_of_problem(problem).of_error:
+    if made.certified and problem.figure is RMS_ERROR:
         made, error, envelope = _least_error(problem, plants, made)
     elif made.certified:
         sampling = sections_of_problem(problem).sampling
@@ -255,9 +255,7 @@ def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
 def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
     """The problem with one more anchor, first, of what it minimises, and more members."""
     sections = sections_of_problem(problem)
-    own = tuple(float(v) for v in kappa)
-    name = "error_anchors" if sections.of_error else "anchors"
-    known = getattr(sections, name)
-    anchors = (own, *(a for a in known if a != own))[: MOST_ANCHORS + 1]
-    problem = with_sections(problem, **{name: anchors})
-    return with_sections(problem, members=(*sections.members, *members))
+    sections = sections.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
+    return replace(
+        problem, controller=replace(sections, members=(*sections.members, *members))
+    )

@@ -41,7 +41,7 @@ def least_error_at(
         if not members or turn == ROUNDS - 1:
             break
         problem = replace(
-            problem, sections=replace(sections, members=(*sections.members, *members))
+            problem, controller=replace(sections, members=(*sections.members, *members))
         )
     assert found is not None
     return joined(problem, found.design.kappa, ()), found

@@ -20,8 +20,8 @@ from ccd_casadi.support.arrays import Array
 
 def sections_of_problem(problem: CoDesignProblem) -> SectionsProblem:
     """The sections of a problem that has them."""
-    assert problem.sections is not None
-    return problem.sections
+    assert isinstance(problem.controller, SectionsProblem)
+    return problem.controller
 
 
 def bounds_of(problem: CoDesignProblem) -> Bounds:
@@ -124,4 +124,4 @@ def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[i
 
 
 def with_sections(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:
-    return replace(problem, sections=replace(sections_of_problem(problem), **changes))  # type: ignore[arg-type]
+    return replace(problem, controller=replace(sections_of_problem(problem), **changes))  # type: ignore[arg-type]

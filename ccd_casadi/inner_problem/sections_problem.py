@@ -7,13 +7,19 @@
 Everything is plain values, as in `problem`: it is hashed, sent to workers and kept in the store.
 """
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Self
 
+from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.decoupling import given_decoupling
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, Options
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR, Figure
+from ccd_casadi.plants.plant import Plant
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.synthesis.weights import Weights
 
-Options = tuple[tuple[str, object], ...]
 Member = tuple[int, tuple[float, ...]]
 
 
@@ -56,7 +62,7 @@ class ChannelProblem:
 
 
 @dataclass(frozen=True)
-class SectionsProblem:
+class SectionsProblem(ControllerProblem):
     """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
 
     `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as
@@ -90,13 +96,57 @@ class SectionsProblem:
 
     @property
     def figure(self) -> Figure:
-        """What J counts of the controller."""
-        return RMS_ERROR if self.of_error else BANDWIDTH
+        """The least RMS error in m where that is minimised, else ω_b*."""
+        return RMS_ERROR if self.minimise == RMS_ERROR.key else BANDWIDTH
 
     @property
-    def of_error(self) -> bool:
-        """Whether the inner problem's value is the least RMS error in m, not ω_b*."""
-        return self.minimise == "rms_error"
+    def plant_options(self) -> tuple[Options, ...]:
+        """Loads and positions."""
+        return self.uncertainty.options
+
+    def require_plants(self, plants: Sequence[Plant]) -> None:
+        """Raise PlantError unless each has as many inputs as outputs, and channels for them."""
+        for plant in plants:
+            m, p = plant.inputs, plant.outputs
+            if m != p:
+                words = 'controller.structure = "sections" needs as many of one as of the other'
+                counts = f"has {m} inputs and {p} outputs"
+                raise PlantError(f'{counts}; {words}: leave some out, or "h_infinity"')
+            if p > 1 and self.figure is RMS_ERROR:
+                words = 'has several outputs; inner.minimise = "rms_error" is for one: drop it'
+                raise PlantError(words)
+            if not self.channels:
+                continue
+            given = self.channels[0].outputs is not None
+            found = [channel.name for channel in self.channels]
+            if p == 1:
+                raise PlantError("has one output: drop the tables [controller.channel]")
+            if len(found) == p and all(c.bandwidth_ratio > 1.0 for c in self.channels):
+                words = "every one of its channels has a bandwidth_ratio above 1; drop it at the"
+                raise PlantError(f"{words} slowest, whose bandwidth is ω_b")
+            if given:
+                channels = [(c.name, c.outputs or (), c.inputs or ()) for c in self.channels]
+                given_decoupling(*(list(part) for part in zip(*channels, strict=True)))
+                if len(found) != p:
+                    words = "give as many tables [controller.channel.NAME]"
+                    raise PlantError(f"has {p} outputs; {words}")
+            elif not set(found) <= {str(i + 1) for i in range(p)}:
+                words = "where none gives outputs; name one of them, or give them"
+                raise PlantError(f"has channels 1 to {p} {words}")
+
+    def with_anchor(self, kappa: tuple[float, ...], most: int) -> Self:
+        """With one more anchor of what it minimises, first, `most` at most."""
+        name = "error_anchors" if self.figure is RMS_ERROR else "anchors"
+        others = (anchor for anchor in getattr(self, name) if anchor != kappa)
+        return replace(self, **{name: (kappa, *others)[:most]})  # type: ignore[arg-type]
+
+    def identity_with(self, weights: Weights, budget: ErrorBudget | None) -> dict[str, Any]:
+        """Its own, ω_T that bounds KS and T, and what moves the stage where that counts."""
+        found = {"sections": self.identity() | {"omega_T": weights.omega_T}}
+        if self.figure is RMS_ERROR:
+            assert budget is not None
+            found["budget"] = asdict(budget)
+        return found
 
     def identity(self) -> dict[str, Any]:
         """What determines ω_b*(θ), as plain values."""
@@ -119,6 +169,6 @@ class SectionsProblem:
             found["shape_ends"] = self.shape_ends.value
         if self.channels:
             found["channels"] = [channel.identity() for channel in self.channels]
-        if self.of_error:
+        if self.figure is RMS_ERROR:
             found["least_error"] = [self.bandwidth_least, self.error_anchors]
         return found

@@ -10,6 +10,7 @@ from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.race import started
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -28,8 +29,8 @@ def warm_starts(
     crossover moves with; a notch stays on its resonance. Of several channels each is moved on its
     own, with the first mode that it sees.
     """
-    sections = problem.sections
-    if sections is None or not sections.anchors:
+    sections = sections_of_problem(problem)
+    if not sections.anchors:
         return []
     first = scaled_plant(problem, problem.start)
     anchors = [np.array(kappa) for kappa in sections.anchors]

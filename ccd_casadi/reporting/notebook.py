@@ -13,6 +13,7 @@ from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
@@ -94,14 +95,7 @@ def _(item: CoDesignProblem) -> str:
     ]
     if inner.compliance_max is not None:
         facts.append(("Compliance |GS|", f"≤ {1e6 * inner.compliance_max:g} µm/N", ""))
-    if item.sections is not None:
-        sampling = item.sampling
-        runs = "in continuous time" if sampling is None else f"at {number(sampling.rate_hz)} Hz"
-        facts.append(("Controller", "of fixed structure", runs))
-    else:
-        ranges = (("ω_S", inner.omega_S), ("ω_T", inner.omega_T))
-        words = (f"{name} {number(a / HZ)} to {number(b / HZ)} Hz" for name, (a, b) in ranges)
-        facts.append(("Controller", "mixed sensitivity", ", ".join(words)))
+    facts.append(("Controller", *kind_of(item).described()))
     if item.robust is not None:
         shifts = f"resonances ±{100.0 * item.robust.shift:g} %"
         facts.append(("Robust set", shifts, f"made on the plant: {item.robust.design_at}"))

@@ -3,28 +3,38 @@
 One θ's inner problem, or a chunk of single designs at (θ, ω_S, ω_T).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter
 
 import numpy as np
 
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
 from ccd_casadi.sampling.keys import sample_key
 from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.support.arrays import Array
 
+# Rows of the store; key, θ and payload of the inner problem.
+Unit = tuple[list[Sample], tuple[str, tuple[float, ...], dict]]
+
 
 def inner_unit(
     task: tuple[CoDesignProblem, str, str, tuple[float, ...]],
-) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
+) -> Unit:
     """Solve the inner problem at one θ; every synthesis becomes a row."""
     problem, problem_key, key, theta = task
-    if problem.sections is not None:
-        return sections_unit(problem, key, theta)
+    return UNITS[type(problem.controller)](problem, problem_key, key, theta)
+
+
+def mixed_unit(
+    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]
+) -> Unit:
+    """The search of (ω_S, ω_T) at one θ."""
     began = perf_counter()
     result = true_inner(problem, theta)
     each = (perf_counter() - began) / max(result.syntheses, 1)
@@ -61,8 +71,8 @@ def unit_of(
 
 
 def sections_unit(
-    problem: CoDesignProblem, key: str, theta: tuple[float, ...]
-) -> tuple[list[Sample], tuple[str, tuple[float, ...], dict]]:
+    problem: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]
+) -> Unit:
     """The best design of a fixed structure at one θ: one row, without weights' frequencies."""
     value = sections_value(problem, theta)
     design, judged = value.design, value.design.certificate
@@ -100,6 +110,11 @@ def sections_unit(
         "syntheses": value.syntheses,
     }
     return [row], (key, theta, payload)
+
+
+# One entry for each class of `CoDesignProblem.controller`; another kind adds its own.
+UNITS: dict[type[ControllerProblem], Callable[[CoDesignProblem, str, str, tuple[float, ...]], Unit]]
+UNITS = {MixedSensitivityProblem: mixed_unit, SectionsProblem: sections_unit}
 
 
 def design_unit(

@@ -9,7 +9,7 @@ from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
-from ccd_casadi.reporting.loops import figure_gains, synthesised_loop, table_gains
+from ccd_casadi.reporting.loops import figure_gains, table_gains
 from ccd_casadi.reporting.maps import figure_landscape
 from ccd_casadi.reporting.page import (
     Section,
@@ -26,6 +26,7 @@ from ccd_casadi.reporting.solve_page import stage_sections
 from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import verdict_html, worst
+from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.methods import (
     LABELS,
@@ -38,7 +39,7 @@ from ccd_casadi.studies.methods import (
     theta_paths,
 )
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import shown_unit
 from surrogates.files import write_whole
 
 
@@ -179,7 +180,7 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
         "for a better one stands beside them. A descent's are those of its best run; all runs are "
         "in compare.json."
     )
-    if problem.sections is not None:
+    if not baseline_of(problem).swept:
         words = (
             "Each formulation ends with a polish and a KKT certificate on the true problem. A "
             "synthesis is a climb from the anchors, or a race; the descent and the sequential "
@@ -241,10 +242,6 @@ def _loops(comparison: Comparison, best: str) -> str:
 def _loop(problem: CoDesignProblem, method: Method) -> LoopView:
     figures = method.figures
     theta = tuple(figures["theta"][name] for name in problem.names)
-    if method.sections is not None:
-        made = method.sections
-        assert made.controller is not None
-        return design_view(problem, theta, made.controller, bandwidth_hz=made.bandwidth / HZ,
-                           label=LABELS[method.name])  # fmt: skip
-    omega = HZ * figures["omega_S_hz"], HZ * figures["omega_T_hz"]
-    return synthesised_loop(problem, theta, *omega, LABELS[method.name])
+    assert method.controller is not None
+    return design_view(problem, theta, method.controller, bandwidth_hz=figures["bandwidth_hz"],
+                       label=LABELS[method.name])  # fmt: skip

@@ -10,31 +10,26 @@ import numpy as np
 
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
-from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.verified_sections import VerifiedSections
-from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler, TraceEntry
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.studies.baselines import AnyDesign, Gradient, baseline_of
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.studies.published import PUBLISHED
 from ccd_casadi.studies.sequential import HardwareDesign, design_hardware, first_resonance
-from ccd_casadi.studies.steepest_descent import Descent, Gradient, steepest_descent
+from ccd_casadi.studies.steepest_descent import Descent, steepest_descent
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
-from ccd_casadi.synthesis.derivatives import Sensitivities
 from surrogates import latin_hypercube
 
 
@@ -42,7 +37,7 @@ from surrogates import latin_hypercube
 class Method:
     """One method's entry: its JSON figures, its path over θ, and J against syntheses spent.
 
-    `sections` is the design of a fixed structure, of whatever method.
+    `controller` (SI) is that of its design; None where it found none.
     """
 
     name: str
@@ -51,7 +46,7 @@ class Method:
     trace: tuple[TraceEntry, ...]
     solution: Solution | None = None
     descent: Descent | None = None
-    sections: SectionsDesign | None = None
+    controller: StateSpace | None = None
 
 
 @dataclass(frozen=True)
@@ -84,16 +79,11 @@ def compare(
     ]
     problem = _chosen(problem, methods)
     descents = _descents(case, problem, workers, seed, quiet)
-    for gradient in gradients_of(problem):
+    for gradient in baseline_of(problem).gradients:
         methods.append(_best_descent(problem, descents, gradient))
     for name, starts in (("sequential", 0), ("sequential_global", 8)):
         methods.append(_sequential(case, problem, folder, workers, name, starts, seed))
     return Comparison(case, problem, tuple(methods), tuple(descents), perf_counter() - began)
-
-
-def gradients_of(problem: CoDesignProblem) -> tuple[Gradient, ...]:
-    """The gradients that a descent can follow."""
-    return tuple(Gradient) if problem.sections is None else (Gradient.TOTAL,)
 
 
 def _chosen(problem: CoDesignProblem, methods: Sequence[Method]) -> CoDesignProblem:
@@ -128,9 +118,8 @@ def _formulation(
     if solution.verified is not None:
         path = (*path, solution.verified.theta)
         figures["first_resonance_hz"] = _resonance(problem, solution.verified.theta)
-    end = solution.verified
-    made = end.design if isinstance(end, VerifiedSections) else None
-    return Method(name, figures, path, trace, solution=solution, sections=made)
+    made = None if solution.verified is None else solution.verified.controller
+    return Method(name, figures, path, trace, solution=solution, controller=made)
 
 
 def _descents(
@@ -145,7 +134,7 @@ def _descents(
         starts += [tuple(float(v) for v in theta) for theta in spread]
     tasks = [
         (problem, start, gradient, step, base.max_iterations)
-        for gradient in gradients_of(problem)
+        for gradient in baseline_of(problem).gradients
         for start in starts
         for step in base.steps
     ]
@@ -197,8 +186,8 @@ def _best_descent(
         for item in best.iterates
     )
     path = tuple(item.theta for item in best.iterates)
-    made = best.design if isinstance(best.design, SectionsDesign) else None
-    return Method(name, clean(figures), path, trace, descent=best, sections=made)
+    made = baseline_of(problem).controller(theta, best.design)
+    return Method(name, clean(figures), path, trace, descent=best, controller=made)
 
 
 def _sequential(
@@ -223,42 +212,31 @@ def _sequential(
         if not sample.feasible:
             figures = {"status": "infeasible", "reason": sample.shortfall, **spent_entry(spent)}
             return Method(name, figures, (hardware.theta,), trace)
-        design: Sensitivities | SectionsDesign
-        if problem.sections is None:
-            x = np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-            design = sampler.truth.at(x)
-        else:
-            design = sections_value(problem, sample.theta).design
+    baseline = baseline_of(problem)
+    design = baseline.design_of(sample)
     figures = _figures(problem, hardware.theta, design, spent, perf_counter() - began)
     figures |= {"resonance_met": hardware.met, "active": list(sample.active)}
-    made = design if isinstance(design, SectionsDesign) else None
-    return Method(name, clean(figures), (hardware.theta,), trace, sections=made)
+    made = baseline.controller(hardware.theta, design)
+    return Method(name, clean(figures), (hardware.theta,), trace, controller=made)
 
 
 def _figures(
     problem: CoDesignProblem,
     theta: tuple[float, ...],
-    design: Sensitivities | SectionsDesign,
+    design: AnyDesign,
     spent: dict[str, int],
     seconds: float,
 ) -> dict[str, Any]:
     """The contract's keys for a design that no formulation made."""
     cost = hardware_cost(plant_of(problem), theta)
-    if isinstance(design, SectionsDesign):
-        own = design_dict(problem, theta, design)
-        feasible, bandwidth = design.certified, design.bandwidth
-        active = active_of(design)
-    else:
-        figures = design.figures
-        own, feasible = figures_dict(figures), problem.inner.feasible(figures)
-        bandwidth, active = figures.bandwidth, list(active_constraints(problem.inner, figures))
+    own = baseline_of(problem).figures(theta, design)
     return {
-        **own,
-        "status": "verified" if feasible else "not_verified",
+        **own.entries,
+        "status": "verified" if own.feasible else "not_verified",
         "theta": dict(zip(problem.names, theta, strict=True)),
         "hardware_cost": cost,
-        "objective": objective(problem, theta, bandwidth),
-        "active": active,
+        "objective": objective(problem, theta, own.bandwidth),
+        "active": own.active,
         "first_resonance_hz": _resonance(problem, theta),
         "surrogate_bandwidth_hz": None,
         "verification_error": None,
@@ -297,7 +275,7 @@ def comparison_dict(comparison: Comparison, seed: int) -> dict[str, Any]:
                 }
                 for descent in comparison.descents
             ],
-            "published": {} if comparison.problem.sections else PUBLISHED.get(model, {}),
+            "published": PUBLISHED.get(model, {}) if baseline_of(comparison.problem).swept else {},
             "conclusions": conclusions(comparison.problem, entries),
             "seconds": comparison.seconds,
             "seed": seed,

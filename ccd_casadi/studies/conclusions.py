@@ -2,9 +2,9 @@
 
 from typing import Any
 
-import numpy as np
-
-from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.studies.baselines import baseline_of
+from ccd_casadi.support.units import HZ
 
 EQUAL = 1e-6  # relative difference of J that counts as none
 
@@ -50,10 +50,8 @@ def _descent(
     gap = run["objective"] - best["objective"]
     ratio = run["syntheses"] / best["syntheses_to_optimum"]
     theta = tuple(run["theta"].values())
-    swept_loss = 0.0  # sections are not swept
-    if problem.sections is None:
-        truth = true_inner(problem, theta)
-        swept_loss = (truth.bandwidth - 2 * np.pi * run["bandwidth_hz"]) * abs(problem.w2)
+    baseline = baseline_of(problem)
+    swept_loss = baseline.swept_loss(theta, HZ * run["bandwidth_hz"])
     moved = max(
         abs(a - b) / (high - low)
         for a, b, low, high in zip(
@@ -78,7 +76,7 @@ def _descent(
         f"{gap:.3g} above, after {run['syntheses']} syntheses, {ratio:.0f} times as many; "
         f"all its runs together took {run['syntheses_of_all_runs']}."
     ]
-    if gap > EQUAL * abs(best["objective"]) and problem.sections is not None:
+    if gap > EQUAL * abs(best["objective"]) and not baseline.swept:
         words.append(
             f"It stopped because of: {run['stop']}. Its theta is {100 * moved:.2g} % of the box "
             "from the best one."

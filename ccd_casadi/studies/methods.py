@@ -10,6 +10,7 @@ from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.maps import ThetaPath
 from ccd_casadi.reporting.page import Table
 from ccd_casadi.reporting.svg import CYCLE, axis_label
+from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Method
 from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import HZ, shown_unit
@@ -130,7 +131,7 @@ def caption_histories(descent: Descent) -> str:
 
 def table_histories(problem: CoDesignProblem, descent: Descent) -> Table:
     """One row an iterate."""
-    swept = problem.sections is None
+    swept = baseline_of(problem).swept
     head = (
         "iteration", *problem.names, "J", "bandwidth (Hz)",
         *(("ω_S (Hz)", "ω_T (Hz)") if swept else ()), "syntheses",

@@ -20,30 +20,16 @@ With a controller of fixed structure nothing is swept: ω_b*(θ) is that of the 
 its envelope gradient the only one there is.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
-from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.objective import hardware_at, objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
-from ccd_casadi.inner_problem.sweep import evaluate
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.studies.baselines import Answer, AnyDesign, Gradient, baseline_of
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.derivatives import Sensitivities
-from ccd_casadi.synthesis.synthesis import DesignFigures, sweep
-
-LOCAL_POINTS = (7, 7)
-LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
-
-
-class Gradient(StrEnum):
-    """Which dω_b/dθ the descent follows."""
-
-    FIXED = "fixed"
-    TOTAL = "total"
 
 
 class Stop(StrEnum):
@@ -81,7 +67,7 @@ class Descent:
     start: tuple[float, ...]
     first_step: float
     iterates: tuple[DescentIterate, ...]
-    design: Sensitivities | SectionsDesign | None
+    design: AnyDesign | None
     stop: Stop
     syntheses: int
     seconds: float = 0.0
@@ -90,20 +76,6 @@ class Descent:
     def objective(self) -> float:
         """J at the end; infinite where no feasible start was found."""
         return self.iterates[-1].objective if self.iterates else np.inf
-
-
-@dataclass(frozen=True)
-class _Answer:
-    """The best design at a θ: ω_b (rad/s), what J counts, that one's slope, (ω_S, ω_T) or NaN."""
-
-    design: Sensitivities | SectionsDesign
-    bandwidth: float
-    value: float
-    slope: Array
-    frequencies: tuple[float, float] = (np.nan, np.nan)
-
-
-_Ask = Callable[[Array, tuple[float, float] | None], tuple[_Answer | None, int]]
 
 
 def steepest_descent(
@@ -119,17 +91,16 @@ def steepest_descent(
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     width = upper - lower
     spent = 0
+    baseline = baseline_of(problem)
 
-    ask = _swept(problem, gradient) if problem.sections is None else _structured(problem)
-
-    def asked(theta: Array, around: tuple[float, float] | None) -> _Answer | None:
+    def answered(theta: Array, around: tuple[float, float] | None) -> Answer | None:
         nonlocal spent
-        found, used = ask(theta, around)
+        found, used = baseline.answer(theta, gradient, around)
         spent += used
         return found
 
     theta = np.array(start, float)
-    answer = asked(theta, None)
+    answer = answered(theta, None)
     if answer is None:
         return Descent(gradient, tuple(start), first_step, (), None, Stop.INFEASIBLE, spent)
     step, history = first_step, []
@@ -149,7 +120,7 @@ def steepest_descent(
         accepted = None
         while step >= smallest_step:
             trial = np.clip(theta + step * direction / size * width, lower, upper)
-            found = asked(trial, answer.frequencies)
+            found = answered(trial, answer.frequencies)
             if found is not None and objective(problem, trial, found.value) < history[-1].objective:
                 accepted = trial, found
                 break
@@ -161,70 +132,10 @@ def steepest_descent(
     return Descent(gradient, tuple(start), first_step, tuple(history), answer.design, stop, spent)
 
 
-def _structured(problem: CoDesignProblem) -> _Ask:
-    """ω_b*(θ) of a fixed structure; climbs and races are what it spends."""
-
-    def ask(theta: Array, _: tuple[float, float] | None) -> tuple[_Answer | None, int]:
-        value = sections_value(problem, theta.tolist())
-        if not value.feasible:
-            return None, value.syntheses
-        slope = np.array(value.gradient)
-        return _Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
-
-    return ask
-
-
-def _swept(problem: CoDesignProblem, gradient: Gradient) -> _Ask:
-    """The paper's sweep of (ω_S, ω_T), with the gradient that is asked for."""
-
-    def ask(theta: Array, around: tuple[float, float] | None) -> tuple[_Answer | None, int]:
-        design, spent = _sweep(problem, theta, around)
-        if design is None:
-            return None, spent
-        figures = design.figures
-        slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
-        frequencies = (figures.omega_S, figures.omega_T)
-        omega = figures.bandwidth
-        return _Answer(design, omega, omega, np.asarray(slope, float), frequencies), spent
-
-    return ask
-
-
-def _sweep(
-    problem: CoDesignProblem, theta: Array, around: tuple[float, float] | None
-) -> tuple[Sensitivities | None, int]:
-    """The best feasible design of a sweep, wide or small; and the syntheses that it took."""
-    inner = problem.inner
-    local = inner
-    if around is not None:
-        ranges = [
-            (max(low, centre / LOCAL_FACTOR), min(high, centre * LOCAL_FACTOR))
-            for (low, high), centre in zip((inner.omega_S, inner.omega_T), around, strict=True)
-        ]
-        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
-    plant = scaled_plant(problem, tuple(theta))
-    rows = sweep(
-        plant,
-        problem.weights,
-        *local.axes(),
-        omega_low=inner.omega_low,
-        gamma_backoff=inner.gamma_backoff,
-    )
-    feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]
-    if not feasible:
-        if around is None:
-            return None, len(rows)
-        wide, used = _sweep(problem, theta, None)
-        return wide, used + len(rows)
-    best = max(feasible, key=lambda row: row.bandwidth)
-    # The derivative at the swept optimum is no new synthesis: the paper has K at hand too.
-    return evaluate(plant, problem.weights, inner, (best.omega_S, best.omega_T)), len(rows)
-
-
 def _iterate(
     problem: CoDesignProblem,
     theta: Array,
-    answer: _Answer,
+    answer: Answer,
     gradient: Array,
     step: float,
     spent: int,

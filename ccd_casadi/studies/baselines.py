@@ -1,0 +1,204 @@
+"""What the paper's methods need of one kind of controller: its best design at a θ, and its figures.
+
+At the first θ the paper's sweep covers the whole box of (ω_S, ω_T), afterwards a small range around
+the last optimum (paper, section 3.1.2). A controller of fixed structure is not swept: its designs
+are those of the problem's anchors.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.codesign.design_entries import figures_dict
+from ccd_casadi.codesign.sections_entries import active_of, design_dict
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    scaled_plant,
+    true_design,
+    true_inner,
+)
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import DesignFigures, sweep, synthesise
+
+LOCAL_POINTS = (7, 7)
+LOCAL_FACTOR = 1.25  # the small range reaches from ω/1.25 to 1.25 ω
+AnyDesign = Any  # Sensitivities or SectionsDesign: what a baseline gives and takes back
+
+
+class Gradient(StrEnum):
+    """Which dω_b/dθ the descent follows."""
+
+    FIXED = "fixed"
+    TOTAL = "total"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The best design at a θ: ω_b (rad/s), what J counts, that one's slope, (ω_S, ω_T) or NaN."""
+
+    design: AnyDesign
+    bandwidth: float
+    value: float
+    slope: Array
+    frequencies: tuple[float, float] = (np.nan, np.nan)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A design under the contract's keys, whether it keeps its bounds, and ω_b in rad/s."""
+
+    entries: dict[str, Any]
+    feasible: bool
+    bandwidth: float
+    active: list[str]
+
+
+class Baseline(ABC):
+    """One kind of controller, for a problem; `swept` over weights' frequencies."""
+
+    gradients: tuple[Gradient, ...]
+    swept: bool
+
+    def __init__(self, problem: CoDesignProblem) -> None:
+        self.problem = problem
+
+    @abstractmethod
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        """The best design at θ, near (ω_S, ω_T) where these are given, and the syntheses spent."""
+
+    @abstractmethod
+    def design_of(self, sample: BandwidthSample) -> AnyDesign:
+        """The design of a sample of ω_b*(θ)."""
+
+    @abstractmethod
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
+        """A design's figures."""
+
+    @abstractmethod
+    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
+        """Its controller, SI."""
+
+    def swept_loss(self, theta: tuple[float, ...], bandwidth: float) -> float:
+        """What J loses to the true inner problem at θ where ω_b (rad/s) is of a coarse sweep."""
+        return 0.0
+
+
+class MixedBaseline(Baseline):
+    """The paper's own: a sweep of (ω_S, ω_T)."""
+
+    gradients = tuple(Gradient)
+    swept = True
+
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        design, spent = _sweep(self.problem, theta, around)
+        if design is None:
+            return None, spent
+        figures = design.figures
+        slope = design.fixed_controller if gradient is Gradient.FIXED else design.to_theta[0]
+        frequencies = (figures.omega_S, figures.omega_T)
+        omega = figures.bandwidth
+        return Answer(design, omega, omega, np.asarray(slope, float), frequencies), spent
+
+    def design_of(self, sample: BandwidthSample) -> Sensitivities:
+        return true_design(self.problem, sample.theta, sample.omega_S, sample.omega_T)
+
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
+        found, inner = design.figures, self.problem.inner
+        active = list(active_constraints(inner, found))
+        return Figures(figures_dict(found), inner.feasible(found), found.bandwidth, active)
+
+    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
+        problem, figures = self.problem, design.figures
+        plant = scaled_plant(problem, theta)
+        made = synthesise(
+            plant, problem.weights.at(figures.omega_S, figures.omega_T),
+            omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
+        )  # fmt: skip
+        return made.controller
+
+    def swept_loss(self, theta: tuple[float, ...], bandwidth: float) -> float:
+        return (true_inner(self.problem, theta).bandwidth - bandwidth) * abs(self.problem.w2)
+
+
+class SectionsBaseline(Baseline):
+    """Climbs from the anchors; climbs and races are what it spends."""
+
+    gradients = (Gradient.TOTAL,)
+    swept = False
+
+    def answer(
+        self, theta: Array, gradient: Gradient, around: tuple[float, float] | None
+    ) -> tuple[Answer | None, int]:
+        value = sections_value(self.problem, theta.tolist())
+        if not value.feasible:
+            return None, value.syntheses
+        slope = np.array(value.gradient)
+        return Answer(value.design, value.bandwidth, value.value, slope), value.syntheses
+
+    def design_of(self, sample: BandwidthSample) -> SectionsDesign:
+        return sections_value(self.problem, sample.theta).design
+
+    def figures(self, theta: tuple[float, ...], design: AnyDesign) -> Figures:
+        entries = design_dict(self.problem, theta, design)
+        return Figures(entries, design.certified, design.bandwidth, active_of(design))
+
+    def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
+        assert design.controller is not None
+        return design.controller
+
+
+def baseline_of(problem: CoDesignProblem) -> Baseline:
+    """The baseline's inner problem."""
+    return BASELINES[type(problem.controller)](problem)
+
+
+BASELINES: dict[type[ControllerProblem], type[Baseline]] = {
+    MixedSensitivityProblem: MixedBaseline,
+    SectionsProblem: SectionsBaseline,
+}
+
+
+def _sweep(
+    problem: CoDesignProblem, theta: Array, around: tuple[float, float] | None
+) -> tuple[Sensitivities | None, int]:
+    """The best feasible design of a sweep, wide or small; and the syntheses that it took."""
+    inner = problem.inner
+    local = inner
+    if around is not None:
+        ranges = [
+            (max(low, centre / LOCAL_FACTOR), min(high, centre * LOCAL_FACTOR))
+            for (low, high), centre in zip((inner.omega_S, inner.omega_T), around, strict=True)
+        ]
+        local = replace(inner, omega_S=ranges[0], omega_T=ranges[1], sweep_points=LOCAL_POINTS)
+    plant = scaled_plant(problem, tuple(theta))
+    rows = sweep(
+        plant,
+        problem.weights,
+        *local.axes(),
+        omega_low=inner.omega_low,
+        gamma_backoff=inner.gamma_backoff,
+    )
+    feasible: list[DesignFigures] = [row for row in rows if inner.feasible(row)]
+    if not feasible:
+        if around is None:
+            return None, len(rows)
+        wide, used = _sweep(problem, theta, None)
+        return wide, used + len(rows)
+    best = max(feasible, key=lambda row: row.bandwidth)
+    # The derivative at the swept optimum is no new synthesis: the paper has K at hand too.
+    return evaluate(plant, problem.weights, inner, (best.omega_S, best.omega_T)), len(rows)
