@@ -7,20 +7,13 @@ samples and 8 inputs, mean with gradient: 0.07 ms so, 0.25 ms unrolled in SX (an
 
 from collections.abc import Sequence
 from functools import singledispatch
+from math import factorial
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from surrogates.covariance import ROOT5, Kernel
-from surrogates.flat_limit import (
-    UNDER_ROOT,
-    FlatLimit,
-    even_odd,
-    matern_series,
-    remainder_of_exp,
-    remainder_of_matern,
-)
 from surrogates.gaussian_process import VARIANCE_FLOOR, GaussianProcess
 from surrogates.interface import Array, Surrogate
 from surrogates.polynomial import Polynomial
@@ -28,12 +21,8 @@ from surrogates.polynomial import Polynomial
 # Below this distance (in length scales) the Matérn kernel is replaced by its Taylor
 # polynomial of degree 9, whose remainder (√5 r)^10 · 10⁻⁵ is below 1e-20 there.
 NEAR = 1e-2
-
-
-class _Symbols:
-    exp = staticmethod(ca.exp)
-    sqrt = staticmethod(ca.sqrt)
-    choose = staticmethod(ca.if_else)
+# Added to s under the root of the odd terms, which start at r³: AD finds 0 · 1e15 and not 0 · inf.
+UNDER_ROOT = 1e-30
 
 
 def to_casadi(
@@ -61,9 +50,6 @@ def to_casadi(
     return ca.Function(name, [x], outputs, ["x"], ["mean", "std"][: len(outputs)])
 
 
-SYMBOLS = _Symbols()
-
-
 @singledispatch
 def expression(surrogate: Surrogate, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     """Return (mean,) or, with `std`, (mean, std) of a surrogate at the symbol x (d).
@@ -81,16 +67,13 @@ def _(process: GaussianProcess, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
     unit = in_unit_box(process, x)
     z, s = squared_distances(unit, process.X, lengths)
     phi = radial_expression(process.kernel, s, int(process.has_gradients))
-    if process.flat is not None:
-        scaled = flat_mean(process.flat, unit)
-    else:
-        weights = process.weights.reshape(-1, n)
-        total = ca.dot(ca.DM(weights[0]), phi[0])
-        if process.has_gradients:
-            # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
-            along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
-            total -= 2.0 * ca.dot(along, phi[1])
-        scaled = p.signal_variance * total
+    weights = process.weights.reshape(-1, n)
+    total = ca.dot(ca.DM(weights[0]), phi[0])
+    if process.has_gradients:
+        # Σ_aj weights_aj cov(f, ∂_j f_a), with the sum over j inside.
+        along = ca.sum1(z * ca.DM(weights[1:] / lengths[:, None])).T
+        total -= 2.0 * ca.dot(along, phi[1])
+    scaled = p.signal_variance * total
     mean = process.output_mean + process.output_scale * scaled
     if not std:
         return (mean,)
@@ -118,27 +101,6 @@ def _(polynomial: Polynomial, x: ca.MX, std: bool) -> tuple[ca.MX, ...]:
 def in_unit_box(surrogate: Surrogate, x: ca.MX) -> ca.MX:
     """x̂ = (x - lower) / (upper - lower)."""
     return (x - ca.DM(surrogate.lower)) / ca.DM(surrogate.upper - surrogate.lower)
-
-
-def flat_mean(flat: FlatLimit, unit: ca.MX) -> ca.MX:
-    """`FlatLimit.mean` of a symbol."""
-    p = ca.dot(ca.DM(flat.polynomial), legendre_products(flat.exponents, 2.0 * unit - 1.0))
-    x = (unit - 0.5) / ca.DM(flat.lengths)
-    if flat.kernel is Kernel.RBF:
-        u = ca.mtimes(ca.DM(flat.points), x)
-        total = ca.dot(ca.DM(flat.values), remainder_of_exp(u, flat.degree, SYMBOLS))
-        if flat.slopes is not None:
-            along = ca.mtimes(ca.DM(flat.slopes), x)
-            total += ca.dot(along, remainder_of_exp(u, flat.degree - 1, SYMBOLS))
-        return ca.exp(-0.5 * ca.sumsqr(x)) * (p + total)
-    z = ca.repmat(x, 1, len(flat.points)) - ca.DM(flat.points.T)
-    s = ca.sum1(z * z).T
-    remainders = remainder_of_matern(s, int(flat.slopes is not None), SYMBOLS)
-    total = ca.dot(ca.DM(flat.values), remainders[0])
-    if flat.slopes is not None:
-        along = ca.sum1(z * ca.DM(flat.slopes.T)).T
-        total -= 2.0 * ca.dot(along, remainders[1])
-    return p + total
 
 
 def legendre_products(exponents: Array, v: ca.MX) -> ca.MX:
@@ -180,6 +142,25 @@ def radial_expression(kernel: Kernel, s: ca.MX, order: int) -> list[ca.MX]:
         ca.if_else(s < NEAR**2, inner, outer)
         for inner, outer in zip(taylor[: order + 1], closed, strict=False)
     ]
+
+
+def even_odd(c: list[float], first_odd: int, s: ca.MX, r: ca.MX) -> ca.MX:
+    """Σ c_m r^m by Horner in s = r², the odd terms from first_odd with one r outside."""
+    even = odd = 0.0 * s
+    for coefficient in reversed(c[0::2]):
+        even = coefficient + s * even
+    for coefficient in reversed(c[first_odd::2]):
+        odd = coefficient + s * odd
+    return even + s ** ((first_odd - 1) // 2) * r * odd
+
+
+def matern_series(terms: int) -> list[float]:
+    """Taylor coefficients in r of (1 + a r + a² r²/3) e^(-a r), a = √5, degrees 0 to terms - 1.
+
+    (-a)^m (m - 1)(m - 3) / (3 m!): those of r and r³ vanish, which makes the kernel twice
+    differentiable.
+    """
+    return [(-ROOT5) ** m * ((m - 1) * (m - 3)) / (3.0 * factorial(m)) for m in range(terms)]
 
 
 def products_of(exponents: Array, powers: list[ca.MX]) -> ca.MX:

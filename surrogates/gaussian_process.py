@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
 from surrogates.covariance import Hyperparameters, Kernel, covariance, radial
-from surrogates.flat_limit import FlatLimit, flat_limit
 from surrogates.interface import Array, Errors, box, freeze, points_in
 from surrogates.likelihood import factorise, symmetric_inverse
 from surrogates.samples import Samples, checked
@@ -95,11 +94,6 @@ class GaussianProcess:
             self.sample_noise,
         )[0]
 
-    @cached_property
-    def flat(self) -> FlatLimit | None:
-        """The mean without cancellation, where large weights of a smooth function would cancel."""
-        return flat_limit(self.kernel, self.hyperparameters, self.X, self.weights)
-
     @overload
     def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Array: ...
     @overload
@@ -114,14 +108,11 @@ class GaussianProcess:
             ValueError: X does not have the inputs of the box.
         """
         unit = (points_in(self, X) - self.lower) / (self.upper - self.lower)
-        if not return_std and self.flat is not None:
-            return self.output_mean + self.output_scale * self.flat.mean(unit)
         p = self.hyperparameters
         k = p.signal_variance * covariance(
             self.kernel, unit, self.X, p.length_scales, gradients_of_b=self.has_gradients
         )
-        scaled = k @ self.weights if self.flat is None else self.flat.mean(unit)
-        mean = self.output_mean + self.output_scale * scaled
+        mean = self.output_mean + self.output_scale * (k @ self.weights)
         if not return_std:
             return mean
         v = solve_triangular(self.factor, k.T, lower=True)

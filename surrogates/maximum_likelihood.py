@@ -1,8 +1,7 @@
 """Hyperparameters of a process by maximum marginal likelihood.
 
 Values alone go through scikit-learn's regressor; values with gradients, which it
-does not know, through `likelihood.log_likelihood` and L-BFGS-B. Values without noise are
-polished by their profile likelihood.
+does not know, through `likelihood.log_likelihood` and L-BFGS-B.
 """
 
 import warnings
@@ -22,7 +21,6 @@ from surrogates.likelihood import (
     log_likelihood,
     maximised,
 )
-from surrogates.profile_likelihood import polished
 from surrogates.samples import Samples
 
 # The likelihood costs O(N³) a look. Several starts are tried on at most START_ORDER
@@ -78,24 +76,13 @@ def estimate(
         noise = 0.0 if own.size else float(samples.noise_variances[0])
     rng = np.random.default_rng(seed)
     if samples.dY is None:
-        found = _by_scikit_learn(kernel, samples.unit, samples.targets, noise, own, rng, starts)
-        exact = noise == 0.0 and not own.size and float(np.ptp(samples.targets)) > 0.0
-        if exact and len(samples.X) <= POLISH_ORDER:
-            # What polishing gains in likelihood it may lose in a mode that rounding made up.
-            better = polished(kernel, samples.unit, samples.targets, found)
-            return min(found, better, key=lambda p: _left_out(p, samples, kernel))
-        return found
+        return _by_scikit_learn(kernel, samples.unit, samples.targets, noise, own, rng, starts)
     slope_noise = None
     if gradient_noise is not None:
         slope_noise = (gradient_noise / samples.scaling[1]) ** 2
     return _by_joint_likelihood(
         kernel, samples.unit, samples.targets, [noise, slope_noise], own, rng, starts
     )
-
-
-def _left_out(parameters: Hyperparameters, samples: Samples, kernel: Kernel) -> float:
-    """The error left out of the process of these hyperparameters, about its own mean."""
-    return centred(conditioned(parameters, samples, kernel, np.empty(0))).loo.rms
 
 
 def uneven_noise(samples: Samples) -> Array:

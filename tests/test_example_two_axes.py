@@ -13,7 +13,7 @@ import pytest
 from ccd_casadi.cases.case import parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
-from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.deployment.as_designed import _require_own_bounds
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign
@@ -102,12 +102,12 @@ def test_where_two_channels_are_equally_fast_both_gradients_count() -> None:
     close, near = (thin, thick), thin.theta[0]
     kink, envelope = at(meeting(*close))
     assert kink.bandwidth > max(one.bandwidth for one in (thin, thick, *close)) * (1.0 - 1e-9)
-    assert sections_kkt(problem, kink, None, envelope).stationarity < 1e-5
-    assert sections_kkt(problem, kink).stationarity > 0.1  # one side's gradient alone
+    assert theta_kkt(problem, kink, None, envelope).stationarity < 1e-5
+    assert theta_kkt(problem, kink).stationarity > 0.1  # one side's gradient alone
     beside, other = at(near + 1e-4)
-    assert sections_kkt(problem, beside, None, other).stationarity > 0.1
+    assert theta_kkt(problem, beside, None, other).stationarity > 0.1
     dearer = replace(problem, w1=1e3 * problem.w1)  # no balance of the two makes up for that
-    assert sections_kkt(dearer, kink, None, envelope).stationarity > 0.9
+    assert theta_kkt(dearer, kink, None, envelope).stationarity > 0.9
 
 
 def test_what_is_judged_as_designed_is_deployed_as_designed() -> None:

@@ -1,6 +1,7 @@
 """Fixed structures: the search, the judge, the envelope gradient and the box of plants."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ccd_casadi.fixed_structure import (
     ShapeEnd,
     Structure,
     bandwidth_and_gradient,
+    certificate,
     certify,
     synthesise_sections,
 )
@@ -337,11 +339,48 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
     K = StateSpace(np.array([[-300.0]]), np.array([[1.0]]), np.array([[2e4]]), np.zeros((1, 1)))
     bounds = Bounds(S_max=3.0, S_low=0.9, omega_low=HZ, shape=None)
     alone = scale_state_space(StateSpace(A[:2, :2], B[:2], C[:, :2], np.zeros((1, 1))), 1.0)
-    assert judged(alone, K, bounds, sampling, False).stable
+    assert judged([alone], K, bounds, sampling, False)[0].stable
     for _ in range(20):
         T = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         turned = StateSpace(T @ A @ T.T, T @ B, C @ T.T, np.zeros((1, 1)))
-        assert not judged(scale_state_space(turned, 1.0), K, bounds, sampling, False).stable
+        other = scale_state_space(turned, 1.0)
+        assert not judged([other], K, bounds, sampling, False)[0].stable
+
+
+def test_plants_judged_together_are_each_as_alone(
+    design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of several sizes and in batches, an unstable one among them, with one grid for each."""
+    louder = replace(design.controller, C=3.0 * design.controller.C)
+    plants = [plant(0.01 * i, 0.5 + 0.1 * i) for i in range(4)]
+    plants[2:2] = [rigid(110.0), plant(-0.3, 1e-3)]
+    monkeypatch.setattr(certificate, "AT_ONCE", 3)
+    together = certify(plants, louder, EASY).plants
+    assert {one.stable for one in together} == {True, False}
+    for own, one in zip(plants, together, strict=True):
+        alone = certify([own], louder, EASY).plants[0]
+        assert one.stable == alone.stable
+        for name, value in vars(alone).items():
+            if name != "channels":
+                assert getattr(one, name) == pytest.approx(value, rel=1e-7, nan_ok=True)
+
+
+def test_a_peak_that_the_grid_lost_is_not_confirmed(
+    design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The level test finds what lies above it, and the norm is the larger of both."""
+    sought = design.certificate.plants[0].S_peak
+
+    def lower(*given: Any) -> dict[str, Any]:
+        found = peaks(*given)
+        return found | {"S": (0.9 * found["S"][0], found["S"][1])}
+
+    peaks = certificate.peaks
+    monkeypatch.setattr(certificate, "peaks", lower)
+    judged = certify([plant()], design.controller, EASY)
+    assert not judged.passed
+    assert not judged.plants[0].confirmed
+    assert judged.plants[0].S_peak == pytest.approx(sought, rel=1e-8)
 
 
 def test_a_redrawn_controller_differs_from_its_end_in_one_section() -> None:

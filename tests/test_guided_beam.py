@@ -10,9 +10,9 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.sections_direct import polish_sections
-from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
@@ -99,7 +99,7 @@ def test_the_co_design_ends_on_a_kink_that_is_an_optimum(
         found = sections_value(anchored, best.theta)
         assert best.bandwidth / HZ == pytest.approx(118.3463, abs=2e-4)
         truth = TrueBandwidth(sampler, "certificate")
-        certificate = sections_kkt(anchored, best, truth, found.envelope)
+        certificate = theta_kkt(anchored, best, truth, found.envelope)
     assert certificate.active == ("volume",)
     assert certificate.stationarity < 1e-5
     assert certificate.kink is not None
@@ -121,6 +121,6 @@ def test_elsewhere_on_the_kink_the_beam_is_not_optimal(anchored: CoDesignProblem
     found = kink(anchored, 0.0597)
     with Workers(1) as pool, SampleStore(Path(":memory:")) as store:
         sample = Sampler(anchored, store, pool).bandwidths(np.array(found.theta))[0]
-    certificate = sections_kkt(anchored, sample, envelope=found.envelope)
+    certificate = theta_kkt(anchored, sample, envelope=found.envelope)
     assert certificate.active == ()
     assert certificate.stationarity > 0.1

@@ -11,8 +11,8 @@ from helpers import few, problem
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.sections_direct import by_pieces
-from ccd_casadi.codesign.sections_kkt import joint_residual, sections_kkt
+from ccd_casadi.codesign.sections_polish import by_pieces
+from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_sections import VerifiedSections
@@ -180,7 +180,7 @@ def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate
     lower, width = np.array(told.case.lower), np.subtract(told.case.upper, told.case.lower)
     envelope = replace(envelope_of(slopes), to_theta=-slopes / width)
     sample = replace(told.at(lower + width * z), gradient=tuple(-slopes[0] / width))
-    return sections_kkt(told.case, sample, cast(TrueBandwidth, told), envelope)
+    return theta_kkt(told.case, sample, cast(TrueBandwidth, told), envelope)
 
 
 def case() -> CoDesignProblem:

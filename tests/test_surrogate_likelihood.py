@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
@@ -17,7 +16,6 @@ from surrogates import (
     design,
     fit,
     loo_errors,
-    profile_likelihood,
 )
 from surrogates.covariance import covariance, observed_covariance, radial
 from surrogates.likelihood import log_likelihood
@@ -108,30 +106,3 @@ def test_fitted_mean_is_the_best_linear_unbiased_one(with_gradients: bool) -> No
     assert abs(left) < 1e-6
     residuals, _ = loo_errors(gp)
     assert gp.loo.rms == pytest.approx(np.sqrt(np.mean(residuals**2)))
-
-
-@KERNELS
-def test_the_profile_likelihood_is_the_likelihood_with_mean_and_variance_eliminated(
-    kernel: Kernel,
-) -> None:
-    X = design("sobol", [0, 0], [1, 1], 24, seed=3)
-    t = np.sin(3.0 * X[:, 0]) + X[:, 1] ** 2 + 5.0
-    lengths = np.array([0.25, 0.35])  # longer ones drown the differences in rounding
-    value, slope = profile_likelihood.profile_likelihood(kernel, X, t, lengths)
-    C = covariance(kernel, X, X, lengths) + profile_likelihood.JITTER * np.eye(24)
-
-    def negative(mean_and_log_variance: np.ndarray) -> float:
-        mean, variance = mean_and_log_variance[0], np.exp(mean_and_log_variance[1])
-        residual = t - mean
-        log_det = np.linalg.slogdet(C)[1]
-        inside = residual @ np.linalg.solve(C, residual) / variance
-        return 0.5 * (24 * np.log(variance) + log_det + inside)
-
-    least = minimize(negative, [5.0, 0.0], method="Nelder-Mead", options={"fatol": 1e-10}).fun
-    assert 12.0 - value == pytest.approx(least, abs=1e-6)  # ½ n of the quadratic form
-    for j, e in enumerate(1e-5 * np.eye(2)):
-        up, down = (
-            profile_likelihood.profile_likelihood(kernel, X, t, lengths * np.exp(sign * e))[0]
-            for sign in (1.0, -1.0)
-        )
-        assert slope[j] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-6)

@@ -22,7 +22,6 @@ from surrogates import (
     fit,
     fit_outputs,
     loo_errors,
-    profile_likelihood,
     quality_of,
 )
 from surrogates.calibration import calibrated
@@ -293,24 +292,3 @@ def test_many_close_samples_without_noise_are_fitted() -> None:
     Y = np.sin(2 * X[:, 0] + X[:, 1]) + (X[:, 0] + 2 * X[:, 1]) ** 2 / 2
     gp = fit(X, Y, lower=[0, 0], upper=[1, 1], noise=0.0, starts=1)
     assert gp.loo.rms < 1e-4
-
-
-def test_exact_samples_are_polished_about_their_own_mean() -> None:
-    # Far from zero mean in its own units: the sample mean is a poor one at long length scales.
-    X = design("lhs", [0] * 6, [1] * 6, 80, seed=2)
-    Y = np.exp(X @ [1.0, 0.8, 0.5, 0.0, 0.1, 0.3])
-    gp = fit(X, Y, lower=[0] * 6, upper=[1] * 6, kernel="rbf", noise=0.0)
-    samples = checked(X, Y, [0] * 6, [1] * 6, None, 0.0)
-    found = profile_likelihood.polished(
-        Kernel.RBF, samples.unit, samples.targets, gp.hyperparameters
-    ).length_scales
-    value, slope = profile_likelihood.profile_likelihood(
-        Kernel.RBF, samples.unit, samples.targets, found
-    )
-    before = profile_likelihood.profile_likelihood(
-        Kernel.RBF, samples.unit, samples.targets, gp.hyperparameters.length_scales
-    )[0]
-    assert np.abs(slope[found < 900]).max() < 0.05
-    assert value >= before - 1e-9
-    repeated = fit(np.repeat(X, 1, 0), np.ones(80), lower=[0] * 6, upper=[1] * 6, noise=0.0)
-    assert repeated.predict(X[:3]) == pytest.approx(1.0)

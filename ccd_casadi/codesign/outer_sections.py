@@ -5,7 +5,6 @@ end a full race and a search for worse plants ask whether these were good enough
 what they find joins, and the outer problem is solved again.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -13,21 +12,17 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
-from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
-from ccd_casadi.codesign.front_learners import NestedLearner
 from ccd_casadi.codesign.full_order import full_order_beside
-from ccd_casadi.codesign.nested import Nested, solve_nested
-from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.outer import End
+from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.sections_direct import pieces_from, polish_sections, solve_direct_sections
-from ccd_casadi.codesign.sections_kkt import SMOOTH, sections_kkt
+from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
 from ccd_casadi.codesign.sections_responses import sections_responses
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import SectionsDesign
@@ -47,7 +42,6 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 
 BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
-SETTLED = 1e-7  # of J: what local solves of a look promise less than that is not looked for
 
 
 @dataclass(frozen=True)
@@ -64,12 +58,10 @@ class SectionsEnd(End):
     members: tuple[Member, ...]
 
 
-class SectionsOuter(Outer):
+class SectionsOuter(ThetaOuter):
     """See the module; `words` say why a race at the start found no anchors."""
 
     kkt_level = VerifiedSections.kkt_level
-    look_is_cheap = False
-    learns_from_others = False
 
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
@@ -95,21 +87,6 @@ class SectionsOuter(Outer):
         problem = with_function(path, sampler.problem, read_json(path))
         return SectionsOuter(sampler.of(problem)).prepared(seed)
 
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
-    ) -> FormulationResult:
-        """Nested; what is lifted are the exact gradients, as there are no ω_S and ω_T."""
-        if isinstance(formulation, Direct):
-            with self.sampler.spent.on("search"):
-                return solve_direct_sections(self.sampler, formulation.starts, seed=seed)
-        if isinstance(formulation, Nested):
-            return solve_nested(self.sampler, formulation, seed=seed, given=given)
-        options = Nested(
-            "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
-            formulation.tolerance, formulation.max_refinements, formulation.kernel,
-        )  # fmt: skip
-        return solve_nested(self.sampler, options, seed=seed, given=given, gradients=True)
-
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """None: every θ has had its own race. Why, in words."""
         nearest = self.sampler.nearest
@@ -127,7 +104,7 @@ class SectionsOuter(Outer):
         gap = problem.figure.gain(raced.value, best.value) if raced.certified else 0.0
         return SectionsEnd(
             np.array(theta), best.value, objective_of(problem, best),
-            sections_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
+            theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
             found.envelope, raced, worst, members,
         )  # fmt: skip
 
@@ -142,41 +119,13 @@ class SectionsOuter(Outer):
             trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
         return SectionsOuter(self.sampler.of(joined(end.asked.problem, kappa, end.members)))
 
-    def resumed(
-        self,
-        formulation: Formulation,
-        outcome: FormulationResult,
-        x: Array,
-        sampled: Sequence[tuple[float, ...]],
-        seed: int,
-    ) -> FormulationResult:
-        if isinstance(formulation, Direct):
-            return replace(outcome, x=x, agreed=True)
-        thetas = np.unique(np.array([*sampled, tuple(x)]), axis=0)
-        found = self.formulated(formulation, seed, Surrogates((), thetas, ()))
-        if found.x is None:
-            return replace(outcome, x=x)
-        return replace(found, iterates=(*outcome.iterates, *found.iterates))
-
-    def solved_from(
-        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
-    ) -> Place | None:
-        problem = self.problem
-        truth = TrueBandwidth(self.sampler, "local solve")
-        best, _ = pieces_from(truth, sample, SETTLED if settled is None else settled)
-        J = objective_of(problem, best)
-        if not np.isfinite(J):
-            return None
-        stationary = sections_kkt(problem, best).stationarity <= SMOOTH
-        return Place(np.array(best.theta), J, stationary)
-
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
         asked, best, made, worst = end.asked, end.best, end.design, end.worst
         problem = asked.problem
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = sections_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
+        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
             beside = full_order_beside(problem, best.theta, made)
@@ -201,9 +150,6 @@ class SectionsOuter(Outer):
             rounds=rounds,
             beside=beside,
         )
-
-    def learner(self, samples: int, seed: int) -> NestedLearner:
-        return NestedLearner(self.sampler, seed=seed)
 
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]

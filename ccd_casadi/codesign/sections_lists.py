@@ -23,7 +23,7 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.outer_sections import SectionsEnd, SectionsOuter
 from ccd_casadi.codesign.search import searched
-from ccd_casadi.codesign.sections_direct import by_pieces
+from ccd_casadi.codesign.sections_polish import by_pieces
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections

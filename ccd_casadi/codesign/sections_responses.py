@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.post_optimal import WEAK, PostOptimal, Response
-from ccd_casadi.codesign.sections_kkt import sections_kkt
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
@@ -29,7 +29,7 @@ def sections_responses(
     """
     theta, names = np.array(sample.theta), problem.names
     plant, width = plant_of(problem), np.subtract(problem.upper, problem.lower)
-    kkt = sections_kkt(problem, sample, envelope=found.envelope)
+    kkt = theta_kkt(problem, sample, envelope=found.envelope)
     loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
     size = float(np.abs(kkt.objective_gradient).max())
     strong = [name for name in kkt.active if kkt.multipliers.get(name, 0.0) > WEAK * size]

@@ -3,10 +3,11 @@
 Of plants with several inputs and outputs the whole loop is judged, by largest singular values.
 
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
-stability; S, KS, T and GS are evaluated by dense solves on grids through every pole and zero of
-plant, controller and closed loop (`certificate_curves`). For S the largest gain is confirmed by a
-Hamiltonian matrix (`norms`). A sampled loop is judged in z, its hold and delay exact, K by Tustin's
-rule; what happens between samples is not in it.
+stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
+zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. For
+S the largest gain is confirmed by a Hamiltonian matrix (`certificate_norms`). A sampled loop is
+judged in z, its hold and delay exact, K by Tustin's rule; what happens between samples is not in
+it.
 """
 
 from collections.abc import Sequence
@@ -17,13 +18,14 @@ from scipy.linalg import expm
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ChannelBounds
 from ccd_casadi.fixed_structure.certificate_curves import (
-    Responses,
+    alike,
     crossing_and_bandwidth,
     frequency_grid,
     peaks,
 )
+from ccd_casadi.fixed_structure.certificate_norms import norms
+from ccd_casadi.fixed_structure.certificate_responses import Responses
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
@@ -31,7 +33,7 @@ from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
-CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
+AT_ONCE = 64  # plants
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
 
@@ -104,11 +106,17 @@ def certify(
     Of channels with bounds of their own the rows besides. `integrator`: the shape counts from 0 on,
     else from ω_low. ω_b is the least of all plants. The plants are spread over `workers`.
     """
+    sizes = [(plant.A.shape, plant.B.shape, plant.C.shape) for plant in plants]
+    alike = [[i for i, own in enumerate(sizes) if own == size] for size in dict.fromkeys(sizes)]
+    parts = [same[i : i + AT_ONCE] for same in alike for i in range(0, len(same), AT_ONCE)]
     tasks = [
-        (i, (plant, controller, bounds, sampling, integrator)) for i, plant in enumerate(plants)
+        (number, ([plants[i] for i in part], controller, bounds, sampling, integrator))
+        for number, part in enumerate(parts)
     ]
-    each = dict((workers or Workers(1)).map_unordered(_judge, tasks))
-    found = [each[i] for i in range(len(tasks))]
+    each: dict[int, PlantFigures] = {}
+    for number, part in (workers or Workers(1)).map_unordered(_judge, tasks):
+        each |= zip(parts[number], part, strict=True)
+    found = [each[i] for i in range(len(plants))]
     unstable = [i for i, figures in enumerate(found, 1) if not figures.stable]
     if unstable:
         words = f"unstable on plant {unstable[0]} of {len(found)}"
@@ -134,95 +142,105 @@ def certify(
     return Certificate(passed, bandwidth, tuple(found), worst, words)
 
 
-Task = tuple[ScaledPlant, StateSpace, Bounds, Sampling | None, bool]
+Task = tuple[list[ScaledPlant], StateSpace, Bounds, Sampling | None, bool]
 
 
-def _judge(task: tuple[int, Task]) -> tuple[int, PlantFigures]:
+def _judge(task: tuple[int, Task]) -> tuple[int, list[PlantFigures]]:
     return task[0], judged(*task[1])
 
 
 def judged(
-    plant: ScaledPlant,
+    plants: Sequence[ScaledPlant],
     controller: StateSpace,
     bounds: Bounds,
     sampling: Sampling | None,
     integrator: bool,
-) -> PlantFigures:
-    """The figures of one loop."""
-    si = plant.plant_si()
-    G = StateSpace(*balanced(si.A, si.B, si.C), si.D)
-    K = StateSpace(*balanced(controller.A, controller.B, controller.C), controller.D)
-    loop = G, K
+) -> list[PlantFigures]:
+    """The figures of every plant's loop; the plants have matrices of one size."""
+    free = [_balanced(plant.plant_si()) for plant in plants]
+    K = _balanced(controller)
+    G, held = free, K
     if sampling is not None:
-        loop = sampled(G, sampling), _tustin(K, sampling.period)
-    S = _sensitivity(*loop)
-    poles = np.linalg.eigvals(S.A)
-    stability = float(poles.real.max() if sampling is None else np.abs(poles).max() - 1.0)
-    if not stability < -_rounding(S.A):
-        return _unstable(stability)
-    roots = [poles, np.linalg.eigvals(loop[0].A), np.linalg.eigvals(loop[1].A)]
-    roots += [x.zeros(_size(x)) for x in (G, K) if not x.D.any()]
+        G, held = [sampled(one, sampling) for one in free], _tustin(K, sampling.period)
+    loops = [_sensitivity(one, held) for one in G]
+    poles = [np.linalg.eigvals(S.A) for S in loops]
+    grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
+    found = [_unstable(one) for one in grown]
+    good = [i for i, S in enumerate(loops) if grown[i] < -_rounding(S.A)]
+    if not good:
+        return found
     corner = 0.0
     if bounds.weights is not None:
         w = bounds.weights
         corner = max(w.c_K * w.omega_K, w.omega_T / w.A_u)
-    grid = frequency_grid(roots, sampling, bounds.omega_low, _size(G), corner)
-    table = Responses(G, loop[0], loop[1], sampling, bounds)
-    values, low = table.at(grid), table.at(np.array([bounds.omega_low]))
+    own, grids = np.linalg.eigvals(held.A), []
+    zeros = [] if K.D.any() else [K.zeros(_size(K))]
+    for i in good:
+        roots = [poles[i], np.linalg.eigvals(G[i].A), own, free[i].zeros(_size(free[i])), *zeros]
+        grids.append(frequency_grid(roots, sampling, bounds.omega_low, _size(free[i]), corner))
+    grid, rows = alike(grids), np.arange(len(good))
+    table = Responses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
+    values = table.at(rows, grid)
+    low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
+    rest = low if integrator else table.at(rows, REST * grid[:, :1])
     tops = peaks(table, grid, values)
-    top, at = tops["S"]
-    norm = _norm(S, table.period)
-    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], bounds, integrator)
-    rows, confirmed = [], abs(norm / top - 1.0) <= CONFIRMED
-    for own in bounds.channels:
-        figures, certain = _row(own, S, table, grid, values, tops, integrator)
-        rows.append(figures)
-        confirmed = confirmed and certain
-        if own.bandwidth_ratio > 1.0:
-            bandwidth = min(bandwidth, figures.bandwidth / own.bandwidth_ratio)
-    weighted = [tops[name][0] if name in tops else np.nan for name in ("weighted KS", "weighted T")]
-    return PlantFigures(
-        stable=True,
-        stability=stability,
-        S_peak=max(top, norm),
-        S_peak_frequency=at,
-        S_low=float(low["S"][0]),
-        crossing=crossing,
-        bandwidth=bandwidth,
-        KS=tops["KS"][0],
-        T=tops["T"][0],
-        GS=tops["GS"][0],
-        weighted_KS=weighted[0],
-        weighted_T=weighted[1],
-        # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
-        static_compliance=0.0 if integrator else float(table.at(REST * grid[:1])["GS"][0]),
-        low_compliance=float(low["GS"][0]),
-        confirmed=confirmed,
-        channels=tuple(rows),
-    )
+    loops = [loops[i] for i in good]
+    crossing, bandwidth = crossing_and_bandwidth(table, grid, values["S"], integrator)
+    norm, confirmed = norms(loops, table, *tops["S"])
+    channels: list[list[ChannelFigures]] = [[] for _ in good]
+    for one in bounds.channels:
+        of_rows, certain = _rows(one, loops, table, grid, values, tops, integrator)
+        for k, figures in enumerate(of_rows):
+            channels[k].append(figures)
+            if one.bandwidth_ratio > 1.0:
+                bandwidth[k] = min(bandwidth[k], figures.bandwidth / one.bandwidth_ratio)
+        confirmed &= certain
+    missing = np.full(len(good), np.nan)
+    weighted = [tops.get(name, (missing, missing))[0] for name in ("weighted KS", "weighted T")]
+    for k, i in enumerate(good):
+        found[i] = PlantFigures(
+            stable=True,
+            stability=grown[i],
+            S_peak=float(norm[k]),
+            S_peak_frequency=float(tops["S"][1][k]),
+            S_low=float(low["S"][k, 0]),
+            crossing=float(crossing[k]),
+            bandwidth=float(bandwidth[k]),
+            KS=float(tops["KS"][0][k]),
+            T=float(tops["T"][0][k]),
+            GS=float(tops["GS"][0][k]),
+            weighted_KS=float(weighted[0][k]),
+            weighted_T=float(weighted[1][k]),
+            # A channel with an integrator beside one without has a pole at 0 Hz: the limit there.
+            static_compliance=0.0 if integrator else float(rest["GS"][k, 0]),
+            low_compliance=float(low["GS"][k, 0]),
+            confirmed=bool(confirmed[k]),
+            channels=tuple(channels[k]),
+        )
+    return found
 
 
-def _row(
+def _rows(
     own: ChannelBounds,
-    S: StateSpace,
+    loops: Sequence[StateSpace],
     table: Responses,
     grid: Array,
     values: dict[str, Array],
-    tops: dict[str, tuple[float, float]],
+    tops: dict[str, tuple[Array, Array]],
     integrator: bool,
-) -> tuple[ChannelFigures, bool]:
-    """The figures of one channel's row, and whether its peak is confirmed."""
-    nan, curve = np.nan, f"S of {own.name}"
+) -> tuple[list[ChannelFigures], np.ndarray]:
+    """The figures of one channel's row on every plant, and whether its peak is confirmed."""
+    nan = np.nan
     if not own.given:
-        return ChannelFigures(own.name, nan, nan, nan, nan), True
-    u, (top, at) = np.array([own.output]), tops[curve]
-    norm = _norm(StateSpace(S.A, S.B, u @ S.C, u @ S.D), table.period)
-    _, bandwidth = crossing_and_bandwidth(
-        table, grid, values[curve], table.bounds, integrator, curve
-    )
-    weighted = tops.get(f"weighted KS of {own.name}", (nan, nan))[0]
-    figures = ChannelFigures(own.name, max(top, norm), at, bandwidth, weighted)
-    return figures, abs(norm / top - 1.0) <= CONFIRMED
+        return [ChannelFigures(own.name, nan, nan, nan, nan)] * len(grid), np.ones(len(grid), bool)
+    curve, u = f"S of {own.name}", np.array([own.output])
+    rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
+    norm, confirmed = norms(rows, table, *tops[curve], row=own.output)
+    _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
+    missing = np.full(len(grid), nan)
+    weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]
+    numbers = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1)
+    return [ChannelFigures(own.name, *figures) for figures in numbers.tolist()], confirmed
 
 
 def _rounding(A: Array) -> float:
@@ -280,16 +298,8 @@ def _tustin(K: StateSpace, period: float) -> StateSpace:
     return StateSpace(inverse @ (one + half * K.A), period * inverse @ K.B, C, K.D + half * C @ K.B)
 
 
-def _norm(S: StateSpace, period: float | None) -> float:
-    """‖S‖∞ by Hamiltonian matrices; of a sampled loop with z = (1 + w)/(1 - w)."""
-    if period is None:
-        return hinf_norm(S)[0]
-    inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
-    root = np.sqrt(2.0)
-    A = inverse @ (S.A - np.eye(len(S.A)))
-    return hinf_norm(
-        StateSpace(A, root * inverse @ S.B, root * S.C @ inverse, S.D - S.C @ inverse @ S.B)
-    )[0]
+def _balanced(system: StateSpace) -> StateSpace:
+    return StateSpace(*balanced(system.A, system.B, system.C), system.D)
 
 
 def _size(system: StateSpace) -> float:

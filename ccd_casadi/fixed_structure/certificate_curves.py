@@ -1,82 +1,26 @@
-"""σ_max of S, KS, T and GS on refined grids, as the judge reads them: their peaks and ω_b.
+"""Peaks of a set's curves on refined grids, and ω_b, as the judge finds them.
 
-Grids run through every pole and zero of plant, controller and closed loop; every value is a dense
-solve. Local maxima, the first -3 dB of S and every dip of the room below the shape are closed in
-on by ever finer grids: no derivative is taken, as the synthesis does.
+Grids run through every pole and zero of plant, controller and closed loop. Local maxima, the first
+-3 dB of S and every dip of the room below the shape are closed in on by ever finer grids, those of
+all plants at once: no derivative is taken, as the synthesis does.
 """
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.bounds import ShapeEnd
+from ccd_casadi.fixed_structure.certificate_responses import Responses
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PER_DECADE = 60
 FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
 APART = 1e-9  # relative: grid points that are closer count as one
+NEAR = 0.9  # of the height that counts: local maxima below it lie below it between points too
 ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 SECTIONS = 17  # of a bracket in ten: to rounding
-
-
-class Responses:
-    """σ_max of S, KS, T, SG and the weighted ones at frequencies in rad/s, by dense solves."""
-
-    def __init__(
-        self,
-        free: StateSpace,
-        G: StateSpace,
-        K: StateSpace,
-        sampling: Sampling | None,
-        bounds: Bounds,
-    ) -> None:
-        self.free, self.G, self.K = free, G, K
-        self.period = None if sampling is None else sampling.period
-        self.bounds = bounds
-
-    def at(self, omega: Array) -> dict[str, Array]:
-        s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
-        g, k = _response(self.G, s), _response(self.K, s)
-        S = np.linalg.inv(np.eye(g.shape[1]) + g @ k)
-        free = g if self.period is None else _response(self.free, 1j * omega)
-        found = {
-            "S": _gain(S),
-            "KS": _gain(k @ S),
-            "T": _gain(g @ k @ S),
-            "GS": _gain(S @ free),
-        }
-        weights = self.bounds.weights
-        if weights is not None:
-            _, W_KS, W_T = np.abs(weights.responses(omega))
-            found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
-        for own in self.bounds.channels:
-            if own.given:
-                found[f"S of {own.name}"] = _length(own.output, S)
-            if own.M_K is not None and weights is not None:
-                W = weights.M_K / own.M_K * W_KS
-                found[f"weighted KS of {own.name}"] = W * _length(own.force, k @ S)
-        return found
-
-
-def _response(system: StateSpace, s: np.ndarray) -> np.ndarray:
-    n = len(system.A)
-    solved = np.linalg.solve(s[:, None, None] * np.eye(n) - system.A, system.B + 0j)
-    return np.asarray(system.C @ solved + system.D)
-
-
-def _gain(M: np.ndarray) -> Array:
-    """σ_max of matrices (..., p, m)."""
-    if M.shape[-2:] == (1, 1):
-        return np.abs(M[..., 0, 0])
-    return np.asarray(np.linalg.svd(M, compute_uv=False)[..., 0])
-
-
-def _length(row: Sequence[float], M: np.ndarray) -> Array:
-    """‖rᵀM‖ of a row r and matrices (..., p, m)."""
-    return np.asarray(np.linalg.norm(np.array(row) @ M, axis=-1))
 
 
 def frequency_grid(
@@ -112,103 +56,145 @@ def frequency_grid(
     return grid[np.append(True, np.diff(grid) > APART * grid[1:])]
 
 
+def alike(grids: Sequence[Array]) -> Array:
+    """Grids (P, k) of one length: the shorter ones repeat their last frequency."""
+    most = max(len(grid) for grid in grids)
+    return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
+
+
 def peaks(
     table: Responses, grid: Array, values: dict[str, Array]
-) -> dict[str, tuple[float, float]]:
-    """Every curve's largest value and its frequency, local maxima within 10 % of it zoomed into.
+) -> dict[str, tuple[Array, Array]]:
+    """Every curve's largest value (P,) and its frequency, local maxima near it zoomed into.
 
-    The brackets of all curves are evaluated at once: one solve of a point serves every curve.
+    The brackets of all curves are evaluated at once: one response of a point serves every curve.
     """
-    best = {name: int(np.argmax(value)) for name, value in values.items()}
-    tops = {name: (float(values[name][i]), float(grid[i])) for name, i in best.items()}
-    of, at = [], []
-    for number, value in enumerate(values.values()):
-        inner = np.flatnonzero((value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
-        at.append(inner[value[inner] > 0.9 * value.max()])
-        of.append(np.full(len(at[-1]), number))
-    curve, inner = np.concatenate(of), np.concatenate(at)
-    if not len(inner):
-        return tops
-    rows = np.arange(len(inner))
+    plants, tops, parts = np.arange(len(grid)), {}, []
+    for number, (name, value) in enumerate(values.items()):
+        best = np.argmax(value, axis=1)
+        tops[name] = value[plants, best], grid[plants, best]
+        i, j = _maxima(grid, value, NEAR * tops[name][0])
+        parts.append((np.full(len(i), number), i, j))
+    curve, which, at = (np.concatenate(part) for part in zip(*parts, strict=True))
+    rows = np.arange(len(which))
 
     def own(points: Array) -> Array:
-        found = np.stack(list(table.at(points.ravel()).values()))
-        return found.reshape(len(found), *points.shape)[curve, rows]
+        return np.asarray(np.stack(list(table.at(which, points).values()))[curve, rows])
 
-    points, peak, i = _zoomed(own, grid[inner - 1], grid[inner + 1])
-    for number, name in enumerate(values):
+    where, peak = _zoomed(own, grid[which, at - 1], grid[which, at + 1])
+    for number, (value, frequency) in enumerate(tops.values()):
         mine = rows[curve == number]
-        if len(mine):
-            k = mine[np.argmax(peak[mine])]
-            tops[name] = max(tops[name], (float(peak[k]), float(points[k, i[k]])))
+        mine = mine[np.argsort(peak[mine])]  # of those of one plant the highest is written last
+        mine = mine[peak[mine] > value[which[mine]]]
+        value[which[mine]], frequency[which[mine]] = peak[mine], where[mine]
     return tops
 
 
-def _zoomed(
-    function: Callable[[Array], Array], low: Array, high: Array
-) -> tuple[Array, Array, np.ndarray]:
-    """The last points (N, 11) of N brackets that close in on a maximum, its value and its place."""
+def _maxima(grid: Array, value: Array, least: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Plant and place of every local maximum above `least` (P,) inside a grid."""
+    inner = value[:, 1:-1]
+    found = (inner >= value[:, :-2]) & (inner >= value[:, 2:]) & (inner > least[:, None])
+    i, j = np.nonzero(found & (grid[:, :-2] < grid[:, 2:]))
+    return i, j + 1
+
+
+def _zoomed(function: Callable[[Array], Array], low: Array, high: Array) -> tuple[Array, Array]:
+    """Where N brackets that close in on a maximum end, and its value; `function` of (N, 11)."""
+    if not len(low):
+        return low, low
     rows = np.arange(len(low))
     for _ in range(ZOOMS):
         points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
         found = function(points)
         i = np.argmax(found, axis=1)
         low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
-    return points, found[rows, i], i
+    return points[rows, i], found[rows, i]
 
 
 def crossing_and_bandwidth(
+    table: Responses, grid: Array, S: Array, integrator: bool, row: Sequence[float] | None = None
+) -> tuple[Array, Array]:
+    """The first ω with |S| = 1/√2 of every plant (NaN where there is none), and the largest ω_b
+    that keeps the shape below it (0 there).
+
+    S (P, k) on the grid, of the whole or of a channel's row.
+    """
+    # A peak between two points of the grid may pass -3 dB where both stay below.
+    i, j = _maxima(grid, S, np.full(len(S), NEAR * HALF_POWER))
+    i, j = i[S[i, j] <= HALF_POWER], j[S[i, j] <= HALF_POWER]
+    where, peak = _zoomed(lambda x: table.sensitivity(i, x, row), grid[i, j - 1], grid[i, j + 1])
+    most = int(np.bincount(i).max(initial=0))
+    more, heights = np.tile(grid[:, -1:], most), np.tile(S[:, -1:], most)
+    place = np.arange(len(i)) - np.searchsorted(i, i)
+    more[i, place], heights[i, place] = where, peak
+    grid, S = _sorted(np.concatenate([grid, more], 1), np.concatenate([S, heights], 1))
+    above = S > HALF_POWER
+    crossing, bandwidth = np.full(len(S), np.nan), np.zeros(len(S))
+    good = np.flatnonzero(above.any(axis=1) & ~above[:, 0])
+    if not len(good):
+        return crossing, bandwidth
+    first = np.argmax(above[good], axis=1)
+    low, high = grid[good, first - 1], grid[good, first]
+    each = np.arange(len(good))
+    for _ in range(SECTIONS):
+        points = np.linspace(low, high, 11, axis=1)
+        past = np.argmax(table.sensitivity(good, points, row)[:, 1:] > HALF_POWER, axis=1)
+        low, high = points[each, past], points[each, past + 1]
+    crossing[good], bandwidth[good] = low, low
+    if table.bounds.shape is not None:
+        bandwidth[good] = _within_shape(table, grid[good], S[good], good, low, integrator, row)
+    return crossing, bandwidth
+
+
+def _within_shape(
     table: Responses,
     grid: Array,
     S: Array,
-    bounds: Bounds,
+    which: np.ndarray,
+    crossing: Array,
     integrator: bool,
-    curve: str = "S",
-) -> tuple[float, float]:
-    """The first ω with |S| = 1/√2, and the largest ω_b that keeps the shape below it.
+    row: Sequence[float] | None,
+) -> Array:
+    """The largest ω_b of plants `which` (P,) that keeps the shape below |S|.
 
-    `curve` names what S is of the table's.
+    Every dip of the room h(ω) = shape ω/(√2|S|) is closed in on: ω_b <= h(ω) for all ω, or only
+    for all ω <= ω_b.
     """
-    # A peak between two points of the grid may pass -3 dB where both stay below.
-    inner = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
-    inner = inner[(S[inner] <= HALF_POWER) & (S[inner] > 0.9 * HALF_POWER)]
-    if len(inner):
-        points, peaks, i = _zoomed(lambda x: table.at(x.ravel())[curve].reshape(x.shape),
-                                   grid[inner - 1], grid[inner + 1])  # fmt: skip
-        grid = np.concatenate([grid, points[np.arange(len(i)), i]])
-        grid, order = np.unique(grid, return_index=True)
-        S = np.concatenate([S, peaks])[order]
-    above = np.flatnonzero(S > HALF_POWER)
-    if S[0] > HALF_POWER or not len(above):
-        return np.nan, 0.0
-    low, high = float(grid[above[0] - 1]), float(grid[above[0]])
-    for _ in range(SECTIONS):
-        points = np.linspace(low, high, 11)
-        first = int(np.argmax(table.at(points)[curve][1:] > HALF_POWER))
-        low, high = float(points[first]), float(points[first + 1])
-    if bounds.shape is None:
-        return low, low
-    # Every dip of the room h(ω) = shape ω/(√2|S|), closed in on: ω_b <= h(ω) for all ω, or only
-    # for all ω <= ω_b.
-    shape, short = bounds.shape, bounds.shape_ends is ShapeEnd.CROSSING
-    omega = np.unique(np.concatenate([grid, np.geomspace(low / 30.0, 3.0 * low, 1500)]))
-    omega = omega[omega <= (low if short else grid[-1])]
+    bounds = table.bounds
+    assert bounds.shape is not None
+    scale = bounds.shape * HALF_POWER
 
-    def room(x: Array) -> Array:
-        counted = x if integrator else np.maximum(x, bounds.omega_low)
-        return np.asarray(shape * counted * HALF_POWER / table.at(x)[curve])
+    def room(x: Array, S: Array) -> Array:
+        return np.asarray(scale * (x if integrator else np.maximum(x, bounds.omega_low)) / S)
 
-    value = room(omega)
-    inner = np.flatnonzero((value[1:-1] <= value[:-2]) & (value[1:-1] <= value[2:])) + 1
-    dips = [(float(value[i]), float(omega[i])) for i in (0, len(omega) - 1)]
-    if len(inner):
-        points, least, i = _zoomed(lambda x: -room(x.ravel()).reshape(x.shape),
-                                   omega[inner - 1], omega[inner + 1])  # fmt: skip
-        dips += zip((-least).tolist(), points[np.arange(len(i)), i].tolist(), strict=True)
+    short = bounds.shape_ends is ShapeEnd.CROSSING
+    ends = crossing if short else grid[:, -1]
+    finer = np.minimum(crossing[:, None] * np.geomspace(1.0 / 30.0, 3.0, 1500), ends[:, None])
+    known = np.where(grid <= ends[:, None], room(grid, S), np.inf)
+    value = np.concatenate([known, room(finer, table.sensitivity(which, finer, row))], axis=1)
+    omega, value = _sorted(np.concatenate([grid, finer], axis=1), value)
+    i, j = _maxima(omega, -value, -crossing / NEAR)
+    where, least = _zoomed(lambda x: -room(x, table.sensitivity(which[i], x, row)),
+                           omega[i, j - 1], np.minimum(omega[i, j + 1], ends[i]))  # fmt: skip
+    dips = np.concatenate([i, np.tile(np.arange(len(which)), 2)])
+    last = np.argmax(np.where(omega <= ends[:, None], omega, 0.0), axis=1)
+    rows = np.arange(len(which))
+    heights = np.concatenate([-least, value[:, 0], value[rows, last]])
+    at = np.concatenate([where, omega[:, 0], omega[rows, last]])
+    found = crossing.copy()
     if not short:
-        return low, min(low, min(height for height, _ in dips))
-    bandwidth = low
-    while broken := [dip for dip in dips if dip[1] <= bandwidth and dip[0] < bandwidth]:
-        height, at = min(broken)
-        bandwidth = height if height >= at else at * (1.0 - 1e-9)
-    return low, bandwidth
+        np.minimum.at(found, dips, heights)
+        return found
+    for k in rows:
+        own = dips == k
+        pairs = list(zip(heights[own].tolist(), at[own].tolist(), strict=True))
+        while broken := [(h, x) for h, x in pairs if x <= found[k] and h < found[k]]:
+            height, x = min(broken)
+            found[k] = height if height >= x else x * (1.0 - 1e-9)
+    return found
+
+
+def _sorted(omega: Array, value: Array) -> tuple[Array, Array]:
+    """Both by ascending ω."""
+    order = np.argsort(omega, axis=1, kind="stable")
+    return np.take_along_axis(omega, order, axis=1), np.take_along_axis(value, order, axis=1)

@@ -6,9 +6,9 @@ the pipe is pickled between this process and its own child, and never stored.
 
 import math
 import pickle
-import resource
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
@@ -87,6 +87,9 @@ class Runner:
 def _apply(task: tuple) -> object:
     """The call, and the end of this process should it go on when its parent is gone."""
     seconds, function, args, kwargs = task
-    spent = math.ceil(time.process_time() + seconds + GRACE)
-    resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+    with suppress(ImportError):  # Windows has no such limit: the parent alone ends the process
+        import resource
+
+        spent = math.ceil(time.process_time() + seconds + GRACE)
+        resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
     return function(*args, **kwargs)

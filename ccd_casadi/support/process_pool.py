@@ -7,12 +7,19 @@ import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from multiprocessing import connection, resource_tracker
+from multiprocessing import connection
 from reprlib import Repr
 from types import TracebackType
 from typing import Protocol, Self
 
-from ccd_casadi.support.worker_process import R, T, WorkerLost, WorkerProcess, interrupts_held
+from ccd_casadi.support.worker_process import (
+    R,
+    T,
+    WorkerLost,
+    WorkerProcess,
+    interrupts_held,
+    track_resources,
+)
 from surrogates.interrupts import raise_dropped
 
 PATIENCE = 2.0  # s of work that is not worth starting processes for
@@ -164,7 +171,7 @@ class Workers:
                 if worker.process.is_alive():
                     return worker
                 self._end([worker])  # died between two tasks: no task is to blame
-        resource_tracker.ensure_running()  # by itself it starts later, and unblocks SIGINT
+        track_resources()
         with interrupts_held():
             self._workers.append(WorkerProcess())
         return self._workers[-1]

@@ -34,7 +34,7 @@ class Ahead:
     """
 
     def __init__(self, ready: Callable[[], object]) -> None:
-        resource_tracker.ensure_running()
+        track_resources()
         with interrupts_held():
             self._worker = WorkerProcess()
         self._worker.send(pickle.dumps((called, ready)))
@@ -120,9 +120,21 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
+def track_resources() -> None:
+    """Start what multiprocessing starts by itself later, unblocking SIGINT; Windows has none."""
+    if os.name == "posix":
+        resource_tracker.ensure_running()
+
+
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Ctrl-C comes at the end of the block; processes started in it are born with it blocked."""
+    """Ctrl-C comes at the end of the block; processes started in it are born with it blocked.
+
+    Windows cannot hold it: there the block runs as it is.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -133,7 +145,8 @@ def interrupts_held() -> Iterator[None]:
 def _serve(pipe: connection.Connection) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with_parent()
     with suppress(EOFError, OSError):
         while True:

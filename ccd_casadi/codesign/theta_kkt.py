@@ -1,4 +1,4 @@
-"""First- and second-order optimality over θ of a co-design with a controller of fixed structure.
+"""First- and second-order optimality over θ, of a value that has envelope gradients and kinks.
 
     ∇J + Aᵀν = 0,  ν >= 0,   A: what binds of λ(θ) <= 0 and the box of θ,   J = w1 f + w2 ω_b*(θ)
 
@@ -43,7 +43,7 @@ EQUATION = 1e3  # weight of the controller's own conditions, which no θ may pay
 BESIDE = 10.0 * STEP  # of the box: differences of true values and gradients
 
 
-def sections_kkt(
+def theta_kkt(
     problem: CoDesignProblem,
     sample: BandwidthSample,
     truth: TrueBandwidth | None = None,

@@ -1,0 +1,97 @@
+"""The outer problem over θ alone: of any kind of controller whose value has a gradient at each θ.
+
+A formulation works on v(θ) with its envelope gradients. A kind adds what only it knows: how a value
+is held against a wider search, and how the design is judged.
+"""
+
+from abc import ABC
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.front_learners import NestedLearner
+from ccd_casadi.codesign.nested import Nested, solve_nested
+from ccd_casadi.codesign.outer import End, Outer, Place
+from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.stored import Surrogates
+from ccd_casadi.codesign.theta_direct import SETTLED, pieces_from, solve_direct_value
+from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
+from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+
+
+class ThetaOuter(Outer, ABC):
+    """See the module."""
+
+    look_is_cheap = False
+    learns_from_others = False
+
+    def formulated(
+        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        """Nested; what is lifted are the exact gradients, as x is θ."""
+        if isinstance(formulation, Direct):
+            with self.sampler.spent.on("search"):
+                return solve_direct_value(self.sampler, formulation.starts, seed=seed)
+        if isinstance(formulation, Nested):
+            return solve_nested(self.sampler, formulation, seed=seed, given=given)
+        options = Nested(
+            "sobol", formulation.points or 6 * len(self.problem.names), formulation.starts,
+            formulation.tolerance, formulation.max_refinements, formulation.kernel,
+        )  # fmt: skip
+        return solve_nested(self.sampler, options, seed=seed, given=given, gradients=True)
+
+    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
+        """None: what falls short at the nearest θ, in words."""
+        nearest = self.sampler.nearest
+        words = outcome.message if nearest is None else nearest.shortfall
+        return replace(outcome, message=words or outcome.message)
+
+    def ended(self, x: Array) -> End:
+        """Polished by the pieces of J; a kind without a wider search has nothing to set against."""
+        problem, truth = self.problem, TrueBandwidth(self.sampler, "polishing")
+        with self.sampler.spent.on("polish"):
+            best, _ = pieces_from(truth, truth.at(self.theta_of(x)), SETTLED)
+        kkt = theta_kkt(problem, best, truth)
+        return End(np.array(best.theta), best.value, objective_of(problem, best), kkt, 0.0)
+
+    def resumed(
+        self,
+        formulation: Formulation,
+        outcome: FormulationResult,
+        x: Array,
+        sampled: Sequence[tuple[float, ...]],
+        seed: int,
+    ) -> FormulationResult:
+        if isinstance(formulation, Direct):
+            return replace(outcome, x=x, agreed=True)
+        thetas = np.unique(np.array([*sampled, tuple(x)]), axis=0)
+        found = self.formulated(formulation, seed, Surrogates((), thetas, ()))
+        if found.x is None:
+            return replace(outcome, x=x)
+        return replace(found, iterates=(*outcome.iterates, *found.iterates))
+
+    def solved_from(
+        self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
+    ) -> Place | None:
+        problem = self.problem
+        truth = TrueBandwidth(self.sampler, "local solve")
+        best, _ = pieces_from(truth, sample, SETTLED if settled is None else settled)
+        J = objective_of(problem, best)
+        if not np.isfinite(J):
+            return None
+        stationary = theta_kkt(problem, best).stationarity <= SMOOTH
+        return Place(np.array(best.theta), J, stationary)
+
+    def learner(self, samples: int, seed: int) -> NestedLearner:
+        return NestedLearner(self.sampler, seed=seed)
+
+    def responses(self, x: Array) -> PostOptimal:
+        raise UserError("insight knows no responses of an optimum of this kind of controller")

@@ -1,0 +1,119 @@
+"""σ_max of S, KS, T and GS of many loops at many frequencies, as the judge reads them.
+
+With A = QTQᴴ, T upper triangular (Schur), C(s - A)⁻¹B is a back substitution, for all plants and
+all s at once. Of the search's own rows and kernels nothing is used.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import schur
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+
+AT_ONCE = 8192  # numbers of an array that stays in a processor's cache
+
+
+class Triangular:
+    """State spaces of one shape by their Schur forms; one alone stands for every plant's."""
+
+    def __init__(self, systems: Sequence[StateSpace]) -> None:
+        forms = [schur(x.A, output="complex") for x in systems]
+        self.T = np.array([T for T, _ in forms])
+        self.B = np.array([Q.conj().T @ x.B for (_, Q), x in zip(forms, systems, strict=True)])
+        self.C = np.array([x.C @ Q for (_, Q), x in zip(forms, systems, strict=True)])
+        self.D = np.array([x.D for x in systems])
+
+    def at(self, which: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """C(s - A)⁻¹B + D (N, k, p, m) of the systems `which` (N,) at points s (N, k)."""
+        own = which if len(self.T) > 1 else np.zeros_like(which)
+        p, m = self.D.shape[1:]
+        found = np.empty((*s.shape, p, m), complex)
+        step = max(1, AT_ONCE // (s.shape[1] * m))
+        for first in range(0, len(s), step):
+            part = slice(first, first + step)
+            found[part] = self._substituted(own[part], s[part])
+        return found
+
+    def _substituted(self, own: np.ndarray, s: np.ndarray) -> np.ndarray:
+        T, B, C = self.T[own, None], self.B[own, None], self.C[own, None]
+        total = self.D[own, None] + np.zeros((*s.shape, 1, 1), complex)
+        known: dict[int, np.ndarray] = {}
+        for i in reversed(range(T.shape[-1])):
+            right = B[..., i, :] + np.zeros((*s.shape, 1), complex)
+            for j, value in known.items():
+                right += T[..., i, j, None] * value
+            known[i] = right / (s - T[..., i, i])[..., None]
+            total += C[..., :, i, None] * known[i][..., None, :]
+        return total
+
+
+class Responses:
+    """The loops of a set of plants: `free` and `G` of the plants without and with hold and delay,
+    K of the controller.
+    """
+
+    def __init__(
+        self,
+        free: Sequence[StateSpace],
+        G: Sequence[StateSpace],
+        K: StateSpace,
+        sampling: Sampling | None,
+        bounds: Bounds,
+    ) -> None:
+        self.G, self.K = Triangular(G), Triangular([K])
+        self.free = self.G if sampling is None else Triangular(free)
+        self.period = None if sampling is None else sampling.period
+        self.bounds = bounds
+
+    def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
+        """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
+        S, g, k = self._loops(which, omega)
+        free = g if self.period is None else self.free.at(which, 1j * omega)
+        KS = _product(k, S)
+        found = {"S": _gain(S), "KS": _gain(KS)}
+        found |= {"T": _gain(_product(g, KS)), "GS": _gain(_product(S, free))}
+        weights = self.bounds.weights
+        if weights is not None:
+            _, W_KS, W_T = np.abs(weights.responses(omega.ravel())).reshape(3, *omega.shape)
+            found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
+        for own in self.bounds.channels:
+            if own.given:
+                found[f"S of {own.name}"] = _length(own.output, S)
+            if own.M_K is not None and weights is not None:
+                W = weights.M_K / own.M_K * W_KS
+                found[f"weighted KS of {own.name}"] = W * _length(own.force, KS)
+        return found
+
+    def sensitivity(
+        self, which: np.ndarray, omega: Array, row: Sequence[float] | None = None
+    ) -> Array:
+        """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
+        S = self._loops(which, omega)[0]
+        return _gain(S) if row is None else _length(row, S)
+
+    def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
+        g, k = self.G.at(which, s), self.K.at(which, s)
+        open_ = np.eye(g.shape[-2]) + _product(g, k)
+        return (1.0 / open_ if open_.shape[-1] == 1 else np.linalg.inv(open_)), g, k
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of matrices (..., p, q) and (..., q, m)."""
+    return np.asarray(a * b if a.shape[-1] == 1 else a @ b)
+
+
+def _gain(M: np.ndarray) -> Array:
+    """σ_max of matrices (..., p, m)."""
+    if M.shape[-2:] == (1, 1):
+        return np.abs(M[..., 0, 0])
+    return np.asarray(np.linalg.svd(M, compute_uv=False)[..., 0])
+
+
+def _length(row: Sequence[float], M: np.ndarray) -> Array:
+    """‖rᵀM‖ of a row r and matrices (..., p, m)."""
+    return np.asarray(np.linalg.norm(np.array(row) @ M, axis=-1))

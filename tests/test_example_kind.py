@@ -1,0 +1,216 @@
+"""How to add a kind of controller: a PID by a rule of thumb, co-designed as any other kind is.
+
+Four classes: what the problem states, what is known of it at any θ, the outer problem over θ, and
+the design that a run ends with; each with an entry in the table of its room. No other file changes.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import HZ, INNER, problem
+from scipy import signal
+
+from ccd_casadi.analysis.loop_view import Bounded
+from ccd_casadi.codesign import outer as outer_room
+from ccd_casadi.codesign.design_entries import controller_dict, figures_dict
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.nested import Nested
+from ccd_casadi.codesign.outer_theta import ThetaOuter
+from ccd_casadi.codesign.run import OUTERS, solve
+from ccd_casadi.codesign.verdict import Line, State, look_words
+from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.fixed_structure import Bounds
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.controller_problem import ControllerProblem
+from ccd_casadi.inner_problem.kinds import KINDS, InnerKind
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.sampling.units import UNITS, Unit
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
+from ccd_casadi.synthesis.weights import Weights
+
+STEP = 1e-5  # relative, of central differences
+
+
+# 1. What the problem states: plain values.
+@dataclass(frozen=True)
+class RuleOfThumb(ControllerProblem):
+    """A PID whose crossover is a share of the first flexible resonance."""
+
+    share: float = 0.05
+
+    def identity_with(self, weights: Weights, budget: object) -> dict[str, Any]:
+        return {"rule_of_thumb": self.share}
+
+
+def pid(plant: ScaledPlant, share: float) -> StateSpace:
+    """K(s) = k (s + ω_c/10)(s + ω_c/3) / (s (s/(3 ω_c) + 1)²), |K G| = 1 at ω_c."""
+    omega = share * float(plant.natural[plant.natural > 0.0].min())
+    zeros, poles = [-omega / 10.0, -omega / 3.0], [0.0, -3.0 * omega, -3.0 * omega]
+    G = plant.plant_si().response(np.array([omega]))[0]
+    K = np.abs(signal.freqs_zpk(zeros, poles, 1.0, [omega])[1][0])
+    return StateSpace(*signal.zpk2ss(zeros, poles, 1.0 / (K * abs(G[0, 0]))))
+
+
+# 2. What is known of it at any θ.
+class ByRule(InnerKind):
+    slack = 1e-6
+    as_designed = True
+
+    def at(self, theta: Sequence[float]) -> tuple[StateSpace, DesignFigures]:
+        """The controller and its figures on the model."""
+        made = self.problem.controller
+        assert isinstance(made, RuleOfThumb)
+        plant, inner = scaled_plant(self.problem, theta), self.problem.inner
+        K = pid(plant, made.share)
+        weights = self.problem.weights
+        return K, measure(plant, K, weights, gamma=UNBOUNDED, omega_low=inner.omega_low)
+
+    def value(self, theta: Sequence[float]) -> tuple[float, Array]:
+        figures = self.at(theta)[1]
+        if not (figures.certified and self.problem.inner.feasible(figures)):
+            return np.nan, np.full(len(theta), np.nan)
+        steps = STEP * np.diag(theta)
+        ends = [[self.at(np.add(theta, s * h))[1].bandwidth for s in (-1, 1)] for h in steps]
+        return figures.bandwidth, np.diff(ends).ravel() / (2.0 * np.diag(steps))
+
+    def described(self) -> tuple[str, str]:
+        return "PID", "by a rule of thumb"
+
+    def require_function(self) -> None:
+        """It is one function of θ."""
+
+    def plants(self, theta: Sequence[float]) -> list[ScaledPlant]:
+        return [scaled_plant(self.problem, theta)]
+
+    def bounds(self) -> Bounds:
+        inner = self.problem.inner
+        return Bounds(inner.S_max, inner.S_low, inner.omega_low)
+
+    def common_shifts(self) -> tuple[float, float]:
+        return 0.0, 0.0
+
+    def other_factors(self) -> tuple[Sequence[float], Sequence[float]]:
+        return (1.0,), (1.0,)
+
+    def bounded(self, weights: Weights, gamma: float, bandwidth_hz: float) -> Bounded:
+        raise AssertionError("no page is drawn here")
+
+
+def rule_unit(case: CoDesignProblem, problem_key: str, key: str, theta: tuple[float, ...]) -> Unit:
+    """One θ for the store."""
+    value, slope = KINDS[RuleOfThumb](case).value(theta)
+    feasible = bool(np.isfinite(value))
+    payload = {
+        "bandwidth": value if feasible else None, "gradient": slope.tolist() if feasible else None,
+        "kappa": [], "active": [], "shortfall": "" if feasible else "a bound is not kept",
+        "violation": None, "syntheses": 1,
+    }  # fmt: skip
+    return [], (key, theta, payload)
+
+
+# 3. The design that a run ends with.
+@dataclass(frozen=True, kw_only=True)
+class VerifiedRule(Verified):
+    made: StateSpace
+    measured: DesignFigures
+
+    kkt_level = 1e-3
+
+    @property
+    def controller(self) -> StateSpace:
+        return self.made
+
+    @property
+    def certified(self) -> bool:
+        return self.measured.certified
+
+    @property
+    def bandwidth(self) -> float:
+        return self.measured.bandwidth
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        return self.kkt.active
+
+    def figures(self) -> dict[str, Any]:
+        return figures_dict(self.measured)
+
+    def evidence(self, predicted: float) -> dict[str, Any]:
+        return {"surrogate_bandwidth_hz": predicted / HZ}
+
+    def checks(self) -> dict[str, bool]:
+        return {}
+
+    def controller_entry(self) -> dict[str, Any]:
+        return controller_dict(self.made)
+
+    def certified_line(self) -> Line:
+        state = State.PASSED if self.feasible else State.FAILED
+        return Line(state, "stable and within S_max and S_low on the model", {})
+
+    def survives_line(self) -> Line:
+        return Line(State.UNKNOWN, "not looked at", {})
+
+    def gap_words(self) -> str:
+        return ""
+
+    def searched(
+        self, outcome: FormulationResult, look: BoxLook | None
+    ) -> tuple[str, Mapping[str, Any]]:
+        return look_words(1, 1, look)
+
+
+# 4. The outer problem.
+class RuleOuter(ThetaOuter):
+    kkt_level = VerifiedRule.kkt_level
+
+    def verified(self, end: outer_room.End, rounds: int) -> VerifiedRule:
+        theta = tuple(map(float, self.theta_of(end.x)))
+        K, figures = ByRule(self.problem).at(theta)
+        feasible = self.problem.inner.feasible(figures) and not unmet(self.problem, theta)
+        return VerifiedRule(
+            problem=self.problem, theta=theta, value=end.value, objective=end.objective,
+            hardware_cost=hardware_cost(plant_of(self.problem), theta), kkt=end.kkt,
+            inner_gap=end.gap, feasible=feasible, survival=None, damping=None, made=K,
+            measured=figures,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def case() -> Iterator[CoDesignProblem]:
+    """The two masses with this kind, which only these tests know."""
+    tables: list[tuple[dict, Any]] = [(KINDS, ByRule), (UNITS, rule_unit), (OUTERS, RuleOuter)]
+    for table, entry in tables:
+        table[RuleOfThumb] = entry
+    yield problem(controller=RuleOfThumb(), inner=replace(INNER, S_max=2.5, S_low=0.3), w1=0.05)
+    for table, _ in tables:
+        del table[RuleOfThumb]
+
+
+@pytest.mark.parametrize("formulation", [Nested(points=6), Direct(starts=2)])
+def test_a_kind_of_ones_own_is_co_designed(case: CoDesignProblem, formulation: Any) -> None:
+    """J is w1 f + w2 ω_b of its own controller, and no θ of a grid has less."""
+    found = solve(case, formulation)
+    assert found.result["status"] == "verified", found.result["reason"]
+    assert found.verified is not None
+    J, theta = found.result["objective"], found.verified.theta
+
+    def objective(point: Sequence[float]) -> float:
+        value = ByRule(case).value(point)[0]
+        cost = case.w1 * hardware_cost(plant_of(case), point)
+        return cost + case.w2 * value if np.isfinite(value) else np.inf
+
+    assert pytest.approx(objective(theta), rel=1e-9) == J
+    axes = [np.linspace(low, high, 7) for low, high in zip(case.lower, case.upper, strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    assert min(map(objective, grid)) >= J - 1e-6 * abs(J)
+    assert sorted(found.result["theta"]) == ["m1", "m2"]
