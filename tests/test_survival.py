@@ -1,6 +1,8 @@
 """What a loop survives: ranges against dense evaluations of their own, whatever is drawn."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from ccd_casadi.codesign.loops_off_model import Controller, LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.reach import reach
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
-from ccd_casadi.codesign.survival import PEAK, REACH, Survival, survival
+from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, survival
 from ccd_casadi.codesign.verdict import State, survives
 from ccd_casadi.deployment.sampled import (
     sampled_figures,
@@ -24,6 +26,7 @@ from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.robust import perturbed
 
 SUSPENSION = Suspension(0.5, 0.7)
 CROSSOVER = 100.0  # rad/s
@@ -283,3 +286,27 @@ def test_a_walk_meets_every_bump_that_its_steps_resolve(
     if true > 0.0:
         assert end == pytest.approx(true, rel=2e-3, abs=1e-8)
         assert bump(end) <= 0.0
+
+
+@given(seed=st.integers(0, 10**6), held=st.booleans())
+@settings(max_examples=6, deadline=None)
+def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: bool) -> None:
+    """One search, whatever places are drawn, and for K(z) as for the K(s) it is made of."""
+    case = drawn(seed)
+    sampling = Sampling(40.0 * CROSSOVER / np.pi, 20.0) if held else None
+    loops, S_max = loops_and_bound(case, seed, sampling)
+    found = found_of(loops, S_max)
+    run = SimpleNamespace(
+        problem=replace(
+            problem(), inner=replace(problem().inner, S_max=S_max), suspension=SUSPENSION
+        ),
+        controller=loops.controller.state,
+        sampled=sampling,
+    )
+    good = perturbed.Judged((0.0,), True, 1.0, 1.0, -1.0)
+    with mock.patch.object(perturbed, "judge", return_value=good):
+        line = perturbed.shift_line(run, case.system(), REACH, 2)
+        damped = perturbed.damping_line(run, case.system(), *FACTORS, 2)
+    assert line.stable == pytest.approx(found.stable_shift, rel=1e-3, abs=1e-6)
+    assert line.within == pytest.approx(found.S_max_shift, rel=1e-3, abs=1e-6)
+    assert damped.stable == pytest.approx(found.stable_damping, rel=1e-3)

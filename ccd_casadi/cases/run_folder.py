@@ -49,6 +49,10 @@ class SampledController(Protocol):
     def period(self) -> float:
         """Of sampling, in s."""
 
+    @property
+    def delay(self) -> float:
+        """From reading y to the new u, in s."""
+
     def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
         """Stability, ω_b (rad/s), ‖S‖∞ and rate of growth (1/s) of the loop on a plant."""
 

@@ -25,11 +25,16 @@ WEAK = 1e-3  # gain at a resonance below which its mode does nothing to the loop
 
 
 class Controller:
-    """K in SI, e in and u out, and K(jω) by its eigenvectors where these are sound."""
+    """K in SI, e in and u out, and K(jω) by its eigenvectors where these are sound.
 
-    def __init__(self, continuous: StateSpace, sampling: Sampling | None = None) -> None:
-        self.continuous, self.sampling = continuous, sampling
-        self.state = continuous if sampling is None else tustin(continuous, sampling.period)
+    `given` is K(s), which runs by Tustin's rule where there is a `sampling`, or K(z) itself.
+    """
+
+    def __init__(self, given: StateSpace, sampling: Sampling | None = None) -> None:
+        self.given, self.sampling = given, sampling
+        self.state = given
+        if sampling is not None and not given.period:
+            self.state = tustin(given, sampling.period)
 
     def __call__(self, omega: Array) -> np.ndarray:
         """K(jω) (k, m, p) at frequencies in rad/s."""
@@ -38,12 +43,8 @@ class Controller:
     @cached_property
     def roots(self) -> np.ndarray:
         """Poles and finite zeros in 1/s, as the loop sees them; one of each conjugate pair."""
-        poles = self.continuous.poles
-        size = float(np.abs(poles).max(initial=0.0))
-        s = np.concatenate([poles, self.continuous.zeros(size)])
-        if self.sampling is not None:
-            half = 0.5 * self.sampling.period * s
-            s = np.log((1.0 + half) / (1.0 - half)) / self.sampling.period
+        size = float(np.abs(self.state.poles).max(initial=0.0))
+        s = np.concatenate([self.state.rates, self.state.rates_of(self.state.zeros(size))])
         return s[(s.imag >= 0.0) & np.isfinite(s)]
 
 

@@ -6,7 +6,7 @@ inner problem at θ has to say against it, and how the design that is left is ju
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.front_learners import Learner
+from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
@@ -124,6 +125,20 @@ class Outer(ABC):
 
         `sampled`: θ that the formulation had solved.
         """
+
+    def learnt(self, outcome: FormulationResult, end: End) -> FormulationResult:
+        """With surrogates that have an end among their samples, which they did not foresee."""
+        values, slopes = self.samples_of(end, outcome.surrogates[0].lower.size)
+        found = [
+            with_sample(process, end.x[: process.lower.size], value, slope)
+            for process, value, slope in zip(outcome.surrogates, values, slopes, strict=True)
+        ]
+        return replace(outcome, surrogates=tuple(found))
+
+    def samples_of(self, end: End, inputs: int) -> tuple[Array, Array]:
+        """Values (k,) and slopes (k, n) at an end of what surrogates of n = `inputs` fit."""
+        found = self.sampler.bandwidths(self.theta_of(end.x), "the end")[0]
+        return np.array([end.value]), np.array([found.gradient])
 
     @abstractmethod
     def solved_from(

@@ -8,14 +8,14 @@ knows which of the two a stage keeps.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from math import inf, log
+from math import inf
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.codesign.loops_off_model import LoopsOffModel
 from ccd_casadi.codesign.reach import highest
-from ccd_casadi.codesign.survival import PEAK, Survival, survival_of
+from ccd_casadi.codesign.survival import PEAK, Survival, excess_of, survival_of
 from ccd_casadi.fixed_structure import Certificate, certify
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -113,8 +113,7 @@ def check_robust(problem: CoDesignProblem, loops: LoopsOffModel) -> RobustCheck 
     for factor in factors:
 
         def excess(shift: float, factor: float = factor) -> float:
-            loop = loops.at(Perturbation(shift, factor))
-            return log(loop.peak / level) if loop.stable else 1.0
+            return excess_of(loops.at(Perturbation(shift, factor)), level)
 
         values = [excess(place) for place in places]
         for i in range(len(places) - 2):
@@ -156,7 +155,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
             modal = of.modal(place)
             modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
             plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
-        return certify(plants, of.controller.continuous, bounds, of.controller.sampling)
+        return certify(plants, of.controller.given, bounds, of.controller.sampling)
 
     kept = "matrix" if loops.given else "ratio"
     return OtherDamping(kept, judged(loops).worst, judged(loops.other).worst)

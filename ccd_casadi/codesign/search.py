@@ -66,8 +66,7 @@ def _looked(
         points = formulation.box_points
         look = look_over_box(outer, end, points, seed, outcome.surrogates)
     rounds = 0 if isinstance(formulation, Direct) else formulation.max_refinements
-    error = abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
-    missed = error > formulation.tolerance
+    missed = _missed(outcome, end) > formulation.tolerance
     if look.x is not None or (missed and len(outcome.iterates) <= rounds):
         x, again = end.x, formulation
         if look.x is not None:
@@ -86,7 +85,14 @@ def _looked(
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
         if isinstance(formulation, Direct):  # has no surrogate that could have promised another
             outcome = replace(outcome, x=end.x, design=None)
+    if outcome.surrogates and end.feasible and _missed(outcome, end) > formulation.tolerance:
+        outcome = outer.learnt(outcome, end)  # left out, it tells how they support the design
     return replace(found, outcome=outcome, end=end, look=look)
+
+
+def _missed(outcome: FormulationResult, end: End) -> float:
+    """The relative error of what was predicted of an end."""
+    return abs(predicted_value(outcome, end.x, end.value) / end.value - 1.0)
 
 
 def best_end(found: Sequence[End], level: float, tolerance: float) -> End:

@@ -10,6 +10,7 @@ should be without.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -65,6 +66,54 @@ def loops_of(
     return loops_off_model(system, problem.suspension, Controller(controller, problem.sampling))
 
 
+def growth_of(loop: Loop) -> float:
+    """Below 0 where the loop is stable."""
+    return loop.growth
+
+
+def excess_of(loop: Loop, level: float) -> float:
+    """ln of ‖S‖∞ over a level; 1 where the loop is unstable."""
+    return math.log(loop.peak / level) if loop.stable else 1.0
+
+
+def shift_range(
+    loops: LoopsOffModel,
+    f: Callable[[Loop], float],
+    limit: float = REACH,
+    marks: Sequence[float] = (),
+) -> tuple[float, float]:
+    """The common resonance shifts around the model, to both sides, up to which f <= 0."""
+
+    def end(sign: float) -> float:
+        return sign * reach(
+            lambda x: f(loops.at(Perturbation(shift=sign * x))),
+            lambda x: loops.step(sign * x),
+            limit,
+            marks,
+        )
+
+    return end(-1.0), end(1.0)
+
+
+def damping_range(
+    loops: LoopsOffModel,
+    f: Callable[[Loop], float],
+    limits: tuple[float, float] = FACTORS,
+) -> tuple[float, float]:
+    """The factors of damping around 1, within `limits`, up to which f <= 0."""
+
+    def end(limit: float) -> float:
+        size, sign = abs(math.log(limit)), math.copysign(1.0, math.log(limit))
+        found = reach(
+            lambda x: f(loops.at(Perturbation(damping=math.exp(sign * x)))),
+            lambda x: E_FOLD,
+            size,
+        )
+        return limit if found == size else math.exp(sign * found)
+
+    return end(limits[0]), end(limits[1])
+
+
 def survival_of(
     problem: CoDesignProblem,
     loops: LoopsOffModel,
@@ -98,40 +147,16 @@ def survival(
     `slack`: what S_max may be passed by, relative; `marks`: shifts that are asked on both sides.
     """
     nominal = loops.at(Perturbation())
-    level = math.log(max(S_max, nominal.peak) * (1.0 + slack))
-
-    def excess(loop: Loop) -> float:
-        return math.log(loop.peak) - level if loop.stable else 1.0
-
-    def shifts(f: Callable[[Loop], float]) -> tuple[float, float]:
-        def end(sign: float) -> float:
-            return sign * reach(
-                lambda x: f(loops.at(Perturbation(shift=sign * x))),
-                lambda x: loops.step(sign * x),
-                REACH,
-                marks,
-            )
-
-        return end(-1.0), end(1.0)
-
-    def factor(end: float) -> float:
-        size, sign = abs(math.log(end)), math.copysign(1.0, math.log(end))
-        found = reach(
-            lambda x: loops.at(Perturbation(damping=math.exp(sign * x))).growth,
-            lambda x: E_FOLD,
-            size,
-        )
-        return end if found == size else math.exp(sign * found)
-
+    excess = partial(excess_of, level=max(S_max, nominal.peak) * (1.0 + slack))
     margins = least_margins(nominal.responses, nominal.grid)
-    poles = np.linalg.eigvals(loops.controller.continuous.A)
+    poles = np.linalg.eigvals(loops.controller.given.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
     unstable = poles[(poles.real > np.maximum(1e-9 * sizes, INTEGRATOR * bandwidth))
                      & (poles.imag >= 0.0)]  # fmt: skip
     return Survival(
-        stable_shift=shifts(lambda loop: loop.growth),
-        S_max_shift=shifts(excess),
-        stable_damping=(factor(FACTORS[0]), factor(FACTORS[1])),
+        stable_shift=shift_range(loops, growth_of, marks=marks),
+        S_max_shift=shift_range(loops, excess, marks=marks),
+        stable_damping=damping_range(loops, growth_of),
         gain=(margins.gain_down, margins.gain_up),
         phase_deg=margins.phase_deg,
         delay=margins.delay,
@@ -139,7 +164,7 @@ def survival(
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
         statics=statics(
             scale_plant(loops.plant, M_K).plant_si(),
-            loops.controller.continuous,
+            loops.controller.given,
             bandwidth=bandwidth,
             omega_low=omega_low,
         ),

@@ -67,10 +67,13 @@ class StateSpace:
     @property
     def rates(self) -> np.ndarray:
         """Poles in 1/s: ln(z)/T of a system in discrete time, those of a delay left out."""
+        return self.rates_of(self.poles)
+
+    def rates_of(self, roots: np.ndarray) -> np.ndarray:
+        """Poles or zeros of this system in 1/s."""
         if not self.period:
-            return self.poles
-        z = self.poles.astype(complex)
-        return np.log(z[np.abs(z) > GONE]) / self.period
+            return roots
+        return np.log(roots[np.abs(roots) > GONE].astype(complex)) / self.period
 
     @property
     def stable(self) -> bool:

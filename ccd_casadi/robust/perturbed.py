@@ -2,12 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import minimize
 
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel, loops_off_model
+from ccd_casadi.codesign.survival import damping_range, excess_of, growth_of, shift_range
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import scale_plant
@@ -16,8 +21,9 @@ from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 
-BISECTIONS = 30
 SEARCH = 120  # measurements of a search for the worst plant
+Figure = Callable[[Loop], float]
+Ends = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -74,11 +80,12 @@ def shift_line(
     run: FinishedRun, system: Mechanics, reach: float, count: int = 41, quiet: bool = True
 ) -> Line:
     """All flexible frequencies times 1 + s, |s| <= reach."""
-    with Progress(_plants(count), "resonance shifts", quiet=quiet) as progress:
-        return _line(
-            run, lambda s: _modal(run, system, Perturbation(shift=s)),
-            -reach, reach, count, progress,
-        )  # fmt: skip
+    places = np.unique(np.append(np.linspace(-reach, reach, count), 0.0))
+    loops = _loops(run, system)
+    marks = [abs(end) for end in kind_of(run.problem).common_shifts()]
+    ends = _ends(run, loops, lambda f: shift_range(loops, f, reach, marks), 0.0)
+    with Progress(len(places), "resonance shifts", quiet=quiet) as progress:
+        return Line(_judged(run, system, [(s, 1.0) for s in places], 0, progress), *ends)
 
 
 def damping_line(
@@ -90,16 +97,42 @@ def damping_line(
     quiet: bool = True,
 ) -> Line:
     """Damping times d, low <= d <= high; evenly in its logarithm."""
-    with Progress(_plants(count), "damping", quiet=quiet) as progress:
-        return _line(
-            run, lambda x: _modal(run, system, Perturbation(damping=float(np.exp(x)))),
-            float(np.log(low)), float(np.log(high)), count, progress, np.exp,
-        )  # fmt: skip
+    places = np.exp(np.unique(np.append(np.linspace(np.log(low), np.log(high), count), 0.0)))
+    loops = _loops(run, system)
+    ends = _ends(run, loops, lambda f: damping_range(loops, f, (low, high)), 1.0)
+    with Progress(len(places), "damping", quiet=quiet) as progress:
+        return Line(_judged(run, system, [(0.0, d) for d in places], 1, progress), *ends)
 
 
-def _plants(count: int) -> int:
-    """At most so many plants on a line: its places, the middle, and bisections of four ends."""
-    return count + 1 + 4 * BISECTIONS
+def _loops(run: FinishedRun, system: Mechanics) -> LoopsOffModel:
+    """The loops of which the verdict of a solve reads its ranges."""
+    at = run.sampled
+    sampling = None if at is None else Sampling(1.0 / at.period, 1e6 * at.delay)
+    return loops_off_model(system, run.problem.suspension, Controller(run.controller, sampling))
+
+
+def _ends(
+    run: FinishedRun, loops: LoopsOffModel, search: Callable[[Figure], Ends], model: float
+) -> tuple[Ends, Ends]:
+    """Between what the loop is stable, and within S_max; the model's place where not even there."""
+    nominal, nothing = loops.at(Perturbation()), (model, model)
+    if not nominal.stable:
+        return nothing, nothing
+    level = run.problem.inner.S_max * (1.0 + kind_of(run.problem).slack)
+    excess = partial(excess_of, level=level)
+    return search(growth_of), search(excess) if excess(nominal) <= 0.0 else nothing
+
+
+def _judged(
+    run: FinishedRun, system: Mechanics, places: list[tuple[float, float]], shown: int,
+    progress: Progress,
+) -> tuple[Judged, ...]:  # fmt: skip
+    found = []
+    for place in places:
+        off = Perturbation(float(place[0]), float(place[1]))
+        found.append(judge(run, _modal(run, system, off), (float(place[shown]),)))
+        progress.advance()
+    return tuple(found)
 
 
 def single_modes(run: FinishedRun, system: Mechanics, reach: float) -> tuple[Judged, ...]:
@@ -140,48 +173,6 @@ def worst_in_box(
 
 def _modal(run: FinishedRun, system: Mechanics, perturbation: Perturbation) -> ModalPlant:
     return modal_plant(system, run.problem.suspension, perturbation)
-
-
-def _line(
-    run: FinishedRun,
-    modal_at: Callable[[float], ModalPlant],
-    low: float,
-    high: float,
-    count: int,
-    progress: Progress,
-    shown: Callable[[float], float] = float,
-) -> Line:
-    def at(x: float) -> Judged:
-        progress.advance()
-        return judge(run, modal_at(x), (float(shown(x)),))
-
-    S_max = run.problem.inner.S_max * (1.0 + 1e-6)
-    places = np.unique(np.append(np.linspace(low, high, count), 0.0))
-    judged = [at(float(x)) for x in places]
-
-    def end(good: Callable[[Judged], bool], sign: int) -> float:
-        """The last place from the model outwards that is good, to bisection."""
-        side = [(x, j) for x, j in zip(places, judged, strict=True) if sign * x >= 0.0]
-        side.sort(key=lambda item: abs(item[0]))
-        if not good(side[0][1]):
-            progress.advance(BISECTIONS)
-            return float(shown(0.0))
-        inside = side[0][0]
-        for x, item in side[1:]:
-            if not good(item):
-                a, b = inside, x
-                for _ in range(BISECTIONS):
-                    middle = 0.5 * (a + b)
-                    a, b = (middle, b) if good(at(middle)) else (a, middle)
-                return float(shown(a))
-            inside = x
-        progress.advance(BISECTIONS)  # there was no end to be found
-        return float(shown(inside))
-
-    def ends(good: Callable[[Judged], bool]) -> tuple[float, float]:
-        return end(good, -1), end(good, 1)
-
-    return Line(tuple(judged), ends(lambda j: j.stable), ends(lambda j: j.peak <= S_max))
 
 
 def search(
