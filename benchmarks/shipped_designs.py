@@ -54,7 +54,8 @@ def built() -> str:
     head = re.sub(r"^\[robust\].*?(?=^\[)", "", text, flags=re.MULTILINE | re.DOTALL)
     page = (ROOT / "docs" / "mixed_sensitivity.md").read_text()
     (tables,) = SECTIONS.findall(page)
-    return head.replace("[inner]\n", "[inner]\nshape = 1.1\ncompliance_max = 5e-6\n") + "\n" + tables
+    bounds = "[inner]\nshape = 1.1\ncompliance_max = 5e-6\n"
+    return head.replace("[inner]\n", bounds) + "\n" + tables
 
 
 def off_centre() -> str:
