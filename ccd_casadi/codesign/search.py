@@ -85,7 +85,8 @@ def _looked(
         end = best_end(ends, outer.kkt_level, formulation.tolerance)
         if isinstance(formulation, Direct):  # has no surrogate that could have promised another
             outcome = replace(outcome, x=end.x, design=None)
-    if outcome.surrogates and end.feasible and _missed(outcome, end) > formulation.tolerance:
+    may_learn = rounds > 0 and end.feasible and bool(outcome.surrogates)
+    if may_learn and _missed(outcome, end) > formulation.tolerance:
         outcome = outer.learnt(outcome, end)  # left out, it tells how they support the design
     return replace(found, outcome=outcome, end=end, look=look)
 
