@@ -31,6 +31,11 @@ class Knobs:
     rate_hz: float = RATE_HZ
     delay_us: float = 0.0
 
+    @property
+    def structured(self) -> bool:
+        """Whether the controller has a fixed structure, whose loop may be sampled."""
+        return self.structure == "sections"
+
 
 def knobs_of(case: Case) -> Knobs:
     """The sliders where a case puts them, θ at its start."""
@@ -57,7 +62,7 @@ def case_at(case: Case, knobs: Knobs) -> Case:
         case = with_structure(case, knobs.structure)
     parameters = zip(case.theta, knobs.theta, strict=True)
     loop = LoopSection()
-    if knobs.structure == "sections" and knobs.sampled:
+    if knobs.structured and knobs.sampled:
         loop = LoopSection(knobs.rate_hz, knobs.delay_us)
     return replace(
         case,
@@ -87,7 +92,7 @@ class Problems:
     def at(self, knobs: Knobs) -> CoDesignProblem:
         """Raises UserError where the plant does not fit the structure."""
         loop = (knobs.sampled, knobs.rate_hz, knobs.delay_us)
-        key = (knobs.structure, knobs.resonance_shift, *(loop if _sections(knobs) else ()))
+        key = (knobs.structure, knobs.resonance_shift, *(loop if knobs.structured else ()))
         if key not in self._made:
             self._made[key] = problem_of(case_at(self.case, knobs))
         found = self._made[key]
@@ -98,7 +103,3 @@ class Problems:
             weights=found.weights.at(S[0], T[0]),
             inner=replace(found.inner, S_max=knobs.S_max, omega_S=S, omega_T=T),
         )
-
-
-def _sections(knobs: Knobs) -> bool:
-    return knobs.structure == "sections"

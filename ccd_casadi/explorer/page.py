@@ -131,7 +131,7 @@ class Page:
     def _answer(self) -> None:
         self._scheduled, let_go, self._let_go = False, self._let_go, False
         knobs = self.controls.knobs()
-        sections = knobs.structure == "sections"
+        sections = knobs.structured
         self.design.disabled = not sections
         full = (let_go or bool(self.controls.always.active)) and not sections
         behind = full and self.session.known is not None
