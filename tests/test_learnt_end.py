@@ -32,20 +32,23 @@ def test_a_value_beyond_a_jump_is_learnt(place: float, jump: float, sloped: bool
         assert with_sample(before, x, place + jump, np.array([np.nan])) is before
 
 
-def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the budget of rounds is spent and no look over the box has moved the design."""
+@pytest.mark.parametrize("rounds", [1, 0])
+def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
+    """Where the budget of rounds is spent and no look over the box has moved the design; not
+    where the case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
     end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)
-    outcome = FormulationResult(end.x, None, (), (process,), None, False, "")
+    spent = (SimpleNamespace(),) * (rounds + 1)
+    outcome = FormulationResult(end.x, None, spent, (process,), None, False, "")  # type: ignore[arg-type]
     outer = SimpleNamespace(
         sampler=SimpleNamespace(spent=Spent()), kkt_level=1e-4,
         samples_of=lambda end, inputs: (np.array([end.value]), np.full((1, 1), np.nan)),
         learnt=lambda outcome, end: Outer.learnt(outer, outcome, end),
     )  # fmt: skip
     monkeypatch.setattr(search, "look_over_box", lambda *_: SimpleNamespace(x=None))
-    options = SimpleNamespace(box_points=0, max_refinements=-1, tolerance=1e-3)
+    options = SimpleNamespace(box_points=0, max_refinements=rounds, tolerance=1e-3)
     found = search._looked(search.Searched(outer, outcome, end, 1), options, (), 0)
     assert search._missed(outcome, end) > 0.1
-    assert search._missed(found.outcome, end) < 1e-3
+    assert (search._missed(found.outcome, end) < 1e-3) is (rounds > 0)
 
