@@ -8,11 +8,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.codesign.acquisition import NEAR, Observations, distances
+from ccd_casadi.codesign.retraining import Outcome, Settings, retrain
 from surrogates import GaussianProcess
-from surrogates.acquisition import NEAR, distances
 from surrogates.interface import Array
-from surrogates.retraining import Outcome, Settings, retrain
-from surrogates.truth import Observations
 
 
 class Camel:

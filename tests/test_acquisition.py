@@ -7,10 +7,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from surrogates import fit, sobol
-from surrogates.acquisition import (
+from ccd_casadi.codesign.acquisition import (
     AVOID,
     NEAR,
+    Observations,
     Posterior,
     choose,
     distances,
@@ -20,8 +20,8 @@ from surrogates.acquisition import (
     predicted_optimum,
     scaled_deviation,
 )
+from surrogates import fit, sobol
 from surrogates.interface import Array
-from surrogates.truth import Observations
 
 LOWER, UPPER = np.array([-1.0, 10.0]), np.array([3.0, 12.0])
 

@@ -26,8 +26,8 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
+from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.progress import Progress
-from surrogates.options import usable_cores
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate", "rows", "curvature")

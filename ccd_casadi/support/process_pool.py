@@ -12,6 +12,7 @@ from reprlib import Repr
 from types import TracebackType
 from typing import Protocol, Self
 
+from ccd_casadi.support.interrupts import raise_dropped
 from ccd_casadi.support.worker_process import (
     R,
     T,
@@ -20,7 +21,6 @@ from ccd_casadi.support.worker_process import (
     interrupts_held,
     track_resources,
 )
-from surrogates.interrupts import raise_dropped
 
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 _SHORT = Repr()
