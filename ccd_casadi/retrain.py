@@ -76,9 +76,14 @@ def opener_of(folder: Path) -> Callable[..., AbstractContextManager[Any]]:
 def open_run(folder: Path, **options: Any) -> AbstractContextManager[Any]:
     """The truth of one of our run folders, which draws its report."""
     from ccd_casadi.codesign import retrained_run
-    from ccd_casadi.reporting.solve_page import write_report
 
-    return retrained_run.open_run(folder, write_page=write_report, **options)
+    return retrained_run.open_run(folder, write_page=_write_page, **options)
+
+
+def _write_page(*work: Any) -> None:
+    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+
+    write_report(*work)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

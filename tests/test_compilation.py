@@ -125,11 +125,3 @@ def test_two_programs_do_not_compile_the_same(
     first.join(30.0)
     second.join(30.0)
     assert len(asked) == 1
-
-
-def test_costs_follow_what_a_kernel_calls() -> None:
-    """The bar counts a kernel by itself and by what is compiled into it."""
-    kernels = compilation._kernels()
-    cost = {name.rpartition(".")[2]: compilation._cost(kernel) for name, kernel in kernels.items()}
-    assert cost["assess"] > cost["peak"] > cost["axis_frequencies"] > cost["eigenvalues"]
-    assert cost["_synthesise"] > cost["optimal_gamma"] > cost["riccati_level"]

@@ -70,11 +70,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """The surrogates, the version that keeps them, and how far their optimum is from the truth.
-
-    near: the predicted optimum if there is one, then the best sample. x: the design to verify if
-    the job ends here (None: there is none).
-    """
+    """A fit: near has the predicted optimum, if any, and the best sample; x is what to verify."""
 
     posterior: Posterior
     version: str
