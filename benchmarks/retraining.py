@@ -21,12 +21,12 @@ from threadpoolctl import threadpool_limits
 
 from ccd_casadi.codesign.acquisition import (
     Posterior,
-    Truth,
     objective_and_violation,
     predicted_optimum,
 )
 from ccd_casadi.codesign.retrained_run import CoDesignTruth
 from ccd_casadi.codesign.retraining import STARTS, Settings, retrain, thinned
+from ccd_casadi.codesign.truth import Truth
 from ccd_casadi.codesign.versions import load_version, version_names
 from ccd_casadi.retrain import open_run
 from surrogates import GaussianProcess, fit_outputs, sobol

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from camel import Camel, true_cost
 
-from ccd_casadi.codesign.acquisition import NEAR, Observations
+from ccd_casadi.codesign.acquisition import NEAR
 from ccd_casadi.codesign.retraining import Outcome, Settings, retrain, thinned
+from ccd_casadi.codesign.truth import Observations
 from ccd_casadi.codesign.versions import FOLDER, LOCK, load_version, only_job, version_names
 from ccd_casadi.support.errors import UserError
 from surrogates import SurrogateFileError, load, sobol

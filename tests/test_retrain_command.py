@@ -13,8 +13,8 @@ import pytest
 from camel import Camel
 
 import ccd_casadi.retrain as retrain_module
-from ccd_casadi.codesign.acquisition import Observations
 from ccd_casadi.codesign.retrained_run import open_run
+from ccd_casadi.codesign.truth import Observations
 from ccd_casadi.codesign.versions import LOCK, only_job
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.worker_process import WorkerLost

@@ -22,7 +22,6 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.acquisition import Observations
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
@@ -32,6 +31,7 @@ from ccd_casadi.codesign.run_files import write_run
 from ccd_casadi.codesign.search import concluded_at
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import stored_designs, stored_thetas
+from ccd_casadi.codesign.truth import Observations
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.sampling.cluster import pool
@@ -78,7 +78,7 @@ def open_run(
 
 
 class CoDesignTruth:
-    """One run's problem behind its store; see `acquisition.Truth`."""
+    """One run's problem behind its store; see `truth.Truth`."""
 
     def __init__(
         self,
@@ -97,7 +97,6 @@ class CoDesignTruth:
         self.formulation = formulation
         beside = () if formulation == "nested" else outer.beside_theta
         self.over_theta = not beside  # x = θ
-        self.names = (*problem.names, *beside)
         more = () if self.over_theta else OUTPUTS[1 : 1 + len(problem.inner.bounds)]
         self.outputs = (problem.figure.key, *more)
         self.lower, self.upper = box(problem) if self.over_theta else outer.bounds

@@ -14,15 +14,14 @@ import numpy as np
 
 from ccd_casadi.codesign.acquisition import (
     NEAR,
-    Observations,
     Posterior,
-    Truth,
     choose,
     distances,
     maximiser,
     objective_and_violation,
     predicted_optimum,
 )
+from ccd_casadi.codesign.truth import Observations, Truth
 from ccd_casadi.codesign.versions import (
     keep_version,
     load_version,
