@@ -125,3 +125,21 @@ def test_two_programs_do_not_compile_the_same(
     first.join(30.0)
     second.join(30.0)
     assert len(asked) == 1
+
+
+def test_a_source_that_changes_meanwhile_is_compiled_again(
+    empty: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stamp named the sources as they were at the end: what was compiled were others."""
+    state, asked = ["before"], []
+
+    def edited(kernels: object, count: int) -> bool:
+        asked.append(count)
+        state[0] = "after"
+        return True
+
+    monkeypatch.setattr(compilation, "_state", lambda: state[0])
+    monkeypatch.setattr(compilation, "_compile", edited)
+    for _ in range(3):
+        compilation.ensure_compiled()
+    assert len(asked) == 2
