@@ -1,4 +1,4 @@
-"""For mkdocstrings: examples with >>> in docstrings as code, which Markdown takes for quotations."""
+"""For mkdocstrings: examples with >>> in docstrings as code, not as quotations."""
 
 import re
 from typing import Any

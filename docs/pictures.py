@@ -1,13 +1,15 @@
-"""Pictures of the site from finished runs: python docs/pictures.py STAGE_RUN, the run of the tutorial's stage.
+"""Pictures of the site: python docs/pictures.py STAGE_RUN, the run of the tutorial's stage.
 
 STAGE_RUN needs what `solve`, `robustness` and `deploy` write.
 """
 
+import shutil
 import sys
 from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 HERE = Path(__file__).parent
 PAGES = {
     "report_tutorial": ("report.html", 0),
@@ -18,7 +20,8 @@ PAGES = {
 
 def main(run: Path) -> None:
     with sync_playwright() as tool:
-        browser = tool.chromium.launch()
+        place = next(filter(None, map(shutil.which, BROWSERS)), None)
+        browser = tool.chromium.launch(executable_path=place, args=["--no-sandbox"])
         view = browser.new_page(viewport={"width": 1280, "height": 1000}, color_scheme="light")
         for name, (file, top) in PAGES.items():
             view.goto((run / file).resolve().as_uri())

@@ -1,4 +1,4 @@
-"""The documentation: size, links from outside of the site, every public name, messages as the code has them."""
+"""The documentation: its size, links to it, every public name, messages as in the code."""
 
 import ast
 import re
