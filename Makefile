@@ -38,7 +38,7 @@ bench: setup-test
 	$(BIN)/python benchmarks/commands.py $(LONG)
 	$(BIN)/python benchmarks/synthesis.py
 
-# What runs offline beside other people's tools and designs; see docs/peers.md.
+# What runs offline beside other people's tools and designs; see docs/development/peers.md.
 peers: setup-test
 	$(BIN)/python benchmarks/synthesis.py
 	$(BIN)/python benchmarks/back_ends.py 10 10

@@ -1,7 +1,8 @@
 """Calibrate what case study 1 leaves unpublished: S_max, S_low, ω_low and the (ω_S, ω_T) box.
 
 Bounds are proved on tables of certified designs; settings are polished on the true inner problem.
-Run: python benchmarks/calibration.py [--out FILE]; the method and result are docs/calibration.md.
+Run: python benchmarks/calibration.py [--out FILE]; method and result:
+docs/development/calibration.md.
 """
 
 import argparse

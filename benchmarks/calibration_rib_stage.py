@@ -6,7 +6,8 @@ Two published bandwidths, on the two stages that have the published masses and f
     ω_b*(a; S_max, ω_S upper) = 55.7 Hz,    ω_b*(b; S_max, ω_S upper) = 71.6 Hz
 
 The lower end of ω_T, S_low and ω_low stay those of case study 1, 25 Hz, 0.03 and 1 Hz.
-Run: python benchmarks/calibration_rib_stage.py [--mesh coarse] [--out FILE]; docs/calibration.md.
+Run: python benchmarks/calibration_rib_stage.py [--mesh coarse] [--out FILE];
+docs/development/calibration.md.
 """
 
 import argparse

@@ -103,7 +103,7 @@ def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> str:
     )
     table = Table(("figure", "here", "paper", "difference"), tuple(rows))
     body = figure_html(svg, caption, *(table_gains(loop) for loop in loops.values()))
-    note = "How far S_max and the box can bring these to the paper's: see docs/calibration.md."
+    note = "How far S_max and the box bring these to the paper's: docs/development/calibration.md."
     return f"{body}\n{table_html(table)}\n{paragraph(note)}"
 
 

@@ -11,6 +11,6 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     from latex2mathml.converter import convert  # of the site alone
 
     def block(found: re.Match[str]) -> str:
-        return f'<div style="margin: 1em 0">{convert(found[1].strip(), display="block")}</div>'
+        return f'<div class="formula">{convert(found[1].strip(), display="block")}</div>'
 
     return BLOCK.sub(block, markdown)

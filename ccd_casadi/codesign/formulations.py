@@ -6,7 +6,7 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 
 Formulation = Nested | Lifted | Direct
-MANY = 12  # parameters up to which surrogates are worth their fit: docs/method.md has the figures
+MANY = 12  # parameters up to which surrogates pay for their fit: docs/development/method.md
 SAMPLES = 1000  # inner problems of a plan over θ, some minutes
 
 

@@ -4,7 +4,7 @@ Dask runs a task again where its worker dies. The rest is done here: after a sch
 tasks are submitted again, a straggler gets a second copy, and the first answer of a task counts.
 
 Messages are pickled, as Dask's own are: scheduler and workers can run what they like here, so the
-address must be one's own, and docs/cluster.md says how to hold it by TLS. None is stored.
+address must be one's own; docs/development/cluster.md shows TLS for it. None is stored.
 """
 
 import asyncio
