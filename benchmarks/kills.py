@@ -121,7 +121,7 @@ def solving(folder: Path, number: int) -> list[str]:
 
 
 def retraining(folder: Path, number: int) -> list[str]:
-    """Retraining from sixteen samples."""
+    """Retraining from nothing."""
     words = ["-m", "surrogates.retrain", str(folder), "--quiet", "--workers", "1"]
     return [sys.executable, *words]
 
@@ -137,12 +137,7 @@ def begun(kind: str, folder: Path) -> None:
     (folder.parent / "sampling.py").write_text(SAMPLING)
     (folder.parent / "quick.toml").write_text(CASE.read_text() + QUICK)
     if kind == "retraining":
-        from ccd_casadi.reporting.retrained_run import open_run
-        from surrogates import design
-
         shutil.copy(folder.parent / "quick.toml", folder / "case.toml")
-        with open_run(folder, tolerance=None, workers=1, seed=0, quiet=True) as sampler:
-            sampler.evaluate(design("sobol", sampler.lower, sampler.upper, 16, 0))
 
 
 def started(words: list[str]) -> subprocess.Popen[str]:

@@ -1,10 +1,8 @@
 """Retraining against a fixed design: syntheses until the surrogates' optimum is the true one.
 
-Both start from the same 16 Sobol designs of (θ, ω_S, ω_T) and fit the same surrogates. The fixed
-design is doubled; retraining adds a batch at a time. Counted are the designs sampled when
-the predicted J and the true J at the predicted optimum are first within 0.1 % of the verified
-optimum's, with S_max and S_low met to 0.1 %; for retraining also when it stopped by itself, which
-it does without knowing the optimum, and what the verification added.
+Retraining starts from nothing. The fixed design is a Sobol set of (θ, ω_S, ω_T), doubled from 16
+until the optimum of the surrogates fitted to it is right: predicted and true J there within 0.1 %
+of the verified optimum's.
 
     python benchmarks/retraining.py [--seeds N] [--out benchmarks/retraining.json]
 """
@@ -16,20 +14,15 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.codesign.acquisition import (
-    Posterior,
-    objective_and_violation,
-    predicted_optimum,
-)
-from ccd_casadi.codesign.retrained_run import CoDesignTruth
-from ccd_casadi.codesign.retraining import STARTS, Settings, retrain, thinned
-from ccd_casadi.codesign.truth import Truth
-from ccd_casadi.codesign.versions import load_version, version_names
-from ccd_casadi.retrain import open_run
-from surrogates import GaussianProcess, fit_outputs, sobol
+import ccd_casadi as ccd
+from ccd_casadi.codesign.lifted import solve_lifted
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+from surrogates import load
+from surrogates.retrain import main as retrain
 
 ROOT = Path(__file__).parent.parent
 CASES = ("two_mass", "two_mass_paper")
@@ -37,70 +30,34 @@ CLOSE = 1e-3
 FIRST, LARGEST = 16, 256
 
 
-def reached(truth: CoDesignTruth, x: np.ndarray, predicted: float, optimum: float) -> bool:
-    """Whether a predicted optimum is the true one; one synthesis that is not counted."""
-    found = truth.evaluate(x[None, :])
-    J, violation = objective_and_violation(truth, found.X, found.Y)
-    errors = np.abs(np.array([predicted, J[0]]) / optimum - 1.0)
-    return bool(errors.max() <= CLOSE and violation[0] <= CLOSE)
-
-
-def opened(folder: Path, case: str):
+def retrained(folder: Path, case: Path, seed: int) -> dict[str, float | str]:
     folder.mkdir(parents=True)
-    shutil.copy(ROOT / "runs" / f"{case}.toml", folder / "case.toml")
-    return open_run(folder, tolerance=None, workers=1, seed=0, quiet=True)
-
-
-def retrained(folder: Path, case: str, seed: int) -> dict[str, float | str | None]:
-    with opened(folder, case) as truth:
-        truth.evaluate(sobol(truth.lower, truth.upper, FIRST, seed))
-        began = perf_counter()
-        outcome = retrain(folder, truth, Settings(seed=seed))
-        seconds = perf_counter() - began
+    shutil.copy(case, folder / "case.toml")
+    began = perf_counter()
+    code = retrain([str(folder), "--workers", "1", "--quiet", "--seed", str(seed)])
     result = json.loads((folder / "result.json").read_text())
-    counts = [len(load_version(folder, name)[0].X) for name in version_names(folder)]
+    fitted = len(load(folder / "surrogate.json")[0][0].X)
     return {
-        "status": outcome.status,
-        "reason": outcome.reason,
-        "objective": result["objective"],
-        "fitted": counts,
-        "syntheses": FIRST + outcome.spent,
-        "rounds": outcome.rounds,
-        "seconds": seconds,
-    }
+        "code": code, "status": result["status"], "reason": result["retraining"]["reason"],
+        "objective": result["objective"], "fitted": fitted, "syntheses": result["syntheses"],
+        "seconds": perf_counter() - began,
+    }  # fmt: skip
 
 
-def predicts(truth: Truth, surrogates: tuple[GaussianProcess, ...], optimum: float) -> bool:
-    """Whether the optimum of surrogates of a truth is the true one."""
-    width = truth.upper - truth.lower
-    samples = truth.evaluate(truth.lower + width * surrogates[0].X)
-    posterior = Posterior(truth, surrogates, samples, np.empty((0, len(width))))
-    best = samples.X[posterior.incumbent() or 0]
-    starts = np.vstack([best, sobol(truth.lower, truth.upper, STARTS, 0)])
-    found = predicted_optimum(posterior, starts)
-    return found is not None and reached(truth, *found, optimum)
-
-
-def count_until(folder: Path, copy: Path, case: str, optimum: float) -> int | None:
-    """Designs that the first version was fitted to whose predicted optimum is the true one."""
-    with opened(copy, case) as truth:
-        for name in version_names(folder):
-            surrogates = load_version(folder, name)
-            if predicts(truth, surrogates, optimum):
-                return len(surrogates[0].X)
-    return None
-
-
-def fixed(folder: Path, case: str, seed: int, optimum: float) -> int | None:
-    n = FIRST
+def fixed(case: Path, seed: int, optimum: float) -> int | None:
+    """Designs of a Sobol set whose surrogates' optimum is the true one."""
+    problem, n = ccd.problem_of(ccd.load_case(case)), FIRST
     while n <= LARGEST:
-        with opened(folder / str(n), case) as truth:
-            truth.evaluate(sobol(truth.lower, truth.upper, n, seed))
-            observed, _ = thinned(truth, truth.samples())
-            surrogates = fit_outputs(
-                observed.X, observed.Y, observed.dY, lower=truth.lower, upper=truth.upper, starts=2
-            )
-            if predicts(truth, surrogates, optimum):
+        with (
+            tempfile.TemporaryDirectory() as place,
+            Workers(1) as pool,
+            SampleStore(Path(place) / "samples.sqlite") as store,
+        ):
+            options = ccd.Lifted(points=n, max_refinements=0)
+            found = solve_lifted(Sampler(problem, store, pool, quiet=True), options, seed=seed)
+        for round_ in found.iterates:
+            J = (round_.predicted_objective, round_.objective)
+            if max(abs(value / optimum - 1.0) for value in J) <= CLOSE:
                 return n
         n *= 2
     return None
@@ -114,17 +71,14 @@ def main() -> None:
     table = []
     with tempfile.TemporaryDirectory() as name, threadpool_limits(limits=1):
         for case in CASES:
-            runs = []
-            for seed in range(options.seeds):
-                runs.append(retrained(Path(name) / case / f"r{seed}", case, seed))
-            optimum = min(run["objective"] for run in runs)
+            path = ROOT / "runs" / f"{case}.toml"
+            runs = [retrained(Path(name) / case / str(seed), path, seed)
+                    for seed in range(options.seeds)]  # fmt: skip
+            optimum = min(float(run["objective"]) for run in runs)
             for seed, run in enumerate(runs):
-                place = Path(name) / case
                 row = {"case": case, "seed": seed, **run, "optimum": optimum}
-                row["loss"] = run["objective"] / optimum - 1.0
-                known = place / f"r{seed}"
-                row["retrained_until"] = count_until(known, place / f"c{seed}", case, optimum)
-                row["fixed_until"] = fixed(place / f"f{seed}", case, seed, optimum)
+                row["loss"] = float(run["objective"]) / optimum - 1.0
+                row["fixed_until"] = fixed(path, seed, optimum)
                 table.append(row)
                 print(json.dumps(row), flush=True)
     options.out.write_text(json.dumps(table, indent=1) + "\n")

@@ -1,89 +1,85 @@
 """`ccd retrain RUN_DIR`: true samples where they help the optimum most, then a new fit."""
 
 import argparse
-import json
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
-from importlib.metadata import entry_points
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
+from ccd_casadi.cases.run_folder import read_json
+from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, whole
+from ccd_casadi.support.process_pool import PATIENCE
+from surrogates.files import copy_run
 
-GROUP = "surrogates.truth"  # of the entry points by which a package offers a truth of its own
+if TYPE_CHECKING:  # what computes is imported once the options are known to be right
+    from ccd_casadi.codesign.solution import Solution
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.codesign.retraining import Settings, retrain
-    from surrogates.files import copy_run
-    from surrogates.interface import SurrogateFitError
-    from surrogates.serialise import SurrogateFileError
+    from ccd_casadi.cases.case import load_case
+    from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.codesign.retraining import Job
+    from ccd_casadi.codesign.run import outer_of, require_solvable
+    from ccd_casadi.codesign.run_files import write_run
+    from ccd_casadi.codesign.versions import only_job, publish
+    from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.sampling.sampler import Sampler
+    from ccd_casadi.sampling.store import SampleStore
 
     folder = options.run if options.out is None else options.out
-    opener = opener_of(options.run)
+    formulation = formulation_in(options.run)
     if folder != options.run:
         copy_run(options.run, folder)
-    settings = Settings(options.budget, options.batch, options.explore, options.seed)
-    try:
-        with opener(
-            folder, tolerance=options.tolerance, workers=options.workers,
-            scheduler=options.scheduler, seed=options.seed, quiet=options.quiet,
-            user_code=not options.no_user_code,
-        ) as truth:  # fmt: skip
-            outcome = retrain(folder, truth, settings, options.quiet)
-    except (SurrogateFileError, SurrogateFitError) as error:
-        raise UserError(str(error)) from error
+    case = load_case(folder / "case.toml")
+    problem = problem_of(case)
+    require_solvable(problem)
+    with (
+        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        SampleStore(folder / "samples.sqlite") as store,
+    ):
+        outer = outer_of(Sampler(problem, store, workers, quiet=options.quiet))
+        outer = outer.continued(folder, options.seed)
+        sampler = outer.sampler
+
+        def write(solution: "Solution") -> None:
+            from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
+
+            write_run(folder, case, solution)
+            publish(folder)
+            write_report(folder, case, sampler.problem, solution)
+
+        with only_job(folder, sampler.store.count(sampler.hash)) as base:
+            job = Job(folder, case, outer, formulation, base, options.budget, options.tolerance,
+                      options.seed)  # fmt: skip
+            outcome = job.run(write)
     if not options.quiet:
         print(f"{outcome.status} ({outcome.reason}): {outcome.rounds} rounds, {outcome.spent} "
-              f"evaluations, surrogate {outcome.version} in {folder}")  # fmt: skip
+              f"syntheses, surrogate {outcome.version} in {folder}")  # fmt: skip
     elif outcome.status != "verified":
         print(f"{folder}: {outcome.status} ({outcome.reason})", file=sys.stderr)
     return ExitCode.of(outcome.status)
 
 
-def opener_of(folder: Path) -> Callable[..., AbstractContextManager[Any]]:
-    """What opens the truth that a run folder's truth.json names: ours, or an installed package's.
+def formulation_in(folder: Path) -> str:
+    """The formulation that a run folder's truth.json names, lifted where there is no such file.
 
-    A folder may come from anybody, so it never names a file or an import path. Raises UserError.
+    Raises UserError.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such run folder; make one with a solve")
-    path, name = folder / "truth.json", "ccd_casadi"
-    try:
-        name = json.loads(path.read_bytes())["truth"]
-    except FileNotFoundError:
-        pass
-    except (KeyError, TypeError):
-        raise UserError(f'{path}: truth: is missing; write {{"truth": NAME}}') from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is no readable JSON ({error}); solve again") from None
-    if name == "ccd_casadi":
-        return open_run
-    installed = {point.name: point for point in entry_points(group=GROUP)}
-    if not isinstance(name, str) or name not in installed:
-        raise UserError(
-            f"{path}: truth: {name!a:.60} is not installed (known: ccd_casadi and the entry points "
-            f"of the group {GROUP}); install the package that has it"
-        )
-    opener: Callable[..., AbstractContextManager[Any]] = installed[name].load()
-    return opener
-
-
-def open_run(folder: Path, **options: Any) -> AbstractContextManager[Any]:
-    """The truth of one of our run folders, which draws its report."""
-    from ccd_casadi.codesign import retrained_run
-
-    return retrained_run.open_run(folder, write_page=_write_page, **options)
-
-
-def _write_page(*work: Any) -> None:
-    from ccd_casadi.reporting.solve_page import write_report  # matplotlib is slow to import
-
-    write_report(*work)
+    path = folder / "truth.json"
+    found = read_json(path) if path.exists() else {"truth": "ccd_casadi"}
+    if found.get("truth") != "ccd_casadi":
+        raise UserError(f'{path}: truth: is {found.get("truth")!a:.60}; only "ccd_casadi" is known')
+    formulation = found.get("formulation", "lifted")
+    if formulation not in FORMULATIONS:
+        words = f"{formulation!r:.60} is unknown; give {', '.join(FORMULATIONS)}"
+        raise UserError(f"{path}: formulation: {words}")
+    return str(formulation)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -94,14 +90,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     add = arguments.add_argument
     add("--budget", metavar="N", type=whole(1), default=500,
-        help="evaluations that retraining may add in all (default: 500)")  # fmt: skip
+        help="syntheses that retraining may add in all (default: 500)")  # fmt: skip
     add("--tolerance", metavar="X", type=number(1e-12, 0.5),
         help="relative agreement of prediction and truth (default: the case's)")  # fmt: skip
-    add("--batch", metavar="Q", type=whole(1), default=4, help="points a round (default: 4)")
-    add("--explore", metavar="SHARE", type=number(0.0, 1.0), default=0.25,
-        help="share of a batch at the largest deviation (default: 0.25)")  # fmt: skip
     add_scheduler(arguments)
-    return run(command, arguments, argv, needs=["ccd_casadi.codesign.retrained_run"])
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])
 
 
 if __name__ == "__main__":

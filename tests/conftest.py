@@ -44,20 +44,6 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session")
-def camel_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Any]:
-    """A retraining job that ran to its end; its folder is not to be changed."""
-    from camel import finished  # NumPy is imported when the environment above is set
-
-    return finished(tmp_path_factory.mktemp("camel"))
-
-
-@pytest.fixture
-def camel_copy(camel_run: tuple[Path, Any, Any], tmp_path: Path) -> Path:
-    """That job's folder, to be changed."""
-    return Path(shutil.copytree(camel_run[0], tmp_path / "run"))
-
-
-@pytest.fixture(scope="session")
 def solved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The run folder of case study 1 in a formulation; it is not to be changed.
 

@@ -31,7 +31,7 @@ from ccd_casadi.codesign.stored import stored_designs
 from ccd_casadi.codesign.versions import keep_version, load_version, only_job
 from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
-from ccd_casadi.retrain import opener_of
+from ccd_casadi.retrain import formulation_in
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import UserError
@@ -228,7 +228,7 @@ def read(argv: list[str]) -> int:
         (lambda: load(folder / "surrogate.json"), (SurrogateFileError, OSError)),
         (lambda: load_version(folder, "0001"), (SurrogateFileError, OSError)),
         (store, (UserError,)),
-        (lambda: opener_of(folder), (UserError,)),
+        (lambda: formulation_in(folder), (UserError,)),
     ]
     for reader, worded in readers:
         try:

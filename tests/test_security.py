@@ -18,7 +18,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
 from ccd_casadi.inner_problem.plant_source import _own_plant
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.retrain import opener_of
+from ccd_casadi.retrain import formulation_in
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import permit_user_code, time_limit
@@ -144,8 +144,8 @@ def test_truth_json_names_installed_packages_only(two_mass_run: Path, tmp_path: 
     folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
     for name in ("trap", "os:system", "trap.py:f", "../trap", str(tmp_path / "trap.py"), ""):
         (folder / "truth.json").write_text(json.dumps({"truth": name, "formulation": "lifted"}))
-        with pytest.raises(UserError, match="is not installed"):
-            opener_of(folder)
+        with pytest.raises(UserError, match="is known"):
+            formulation_in(folder)
 
 
 # ---- time ----------------------------------------------------------------------------------------

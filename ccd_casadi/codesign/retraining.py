@@ -1,64 +1,51 @@
-"""The loop of a retraining job: fit, predict the optimum, sample the truth where it helps most.
+"""Retraining of a run folder: true samples where they help the optimum most, then a new fit.
 
-What to do next follows from the samples alone: a job that was killed goes on from what is known,
-and one that has nothing left to do does nothing.
+A job fits all that the folder's store knows and goes on with the rounds of the folder's own
+formulation: predict the optimum, ask the truth there, fit again, until prediction and truth agree.
+What is left to do follows from the samples alone, so that a killed job goes on from what is known
+and a repeated one computes nothing. The surrogate that a job ends with is kept as a new version.
 """
 
-import math
-import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
-from ccd_casadi.codesign.acquisition import (
-    NEAR,
-    Posterior,
-    choose,
-    distances,
-    maximiser,
-    objective_and_violation,
-    predicted_optimum,
-)
-from ccd_casadi.codesign.truth import Observations, Truth
-from ccd_casadi.codesign.versions import (
-    keep_version,
-    load_version,
-    only_job,
-    publish,
-    version_names,
-)
+from ccd_casadi.cases.run_folder import read_json
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.lifted import OUTPUTS
+from ccd_casadi.codesign.outer import Outer
+from ccd_casadi.codesign.outer_problem import unmet_constraint
+from ccd_casadi.codesign.search import concluded_at
+from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.stored import Surrogates, stored_designs, stored_thetas
+from ccd_casadi.codesign.versions import keep_version
+from ccd_casadi.inner_problem.problem import box
+from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
+from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
-from surrogates import GaussianProcess, fit_outputs, sobol
-from surrogates.gaussian_process import loo_errors
+from surrogates import sobol
 
 PER_INPUT = 3  # samples an input that a first fit is worth
 DOUBLINGS = 4  # of the first design, where the truth has no value at most points
-PASSES = 4  # fits after a verification, which itself yields samples
-STARTS = 16  # of IPOPT, besides the best sample
-SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
-SAME = 1e-9  # of the box: samples that a version was fitted to
-CONVERGED = "converged"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """budget: evaluations that retraining may add to the run folder, over all its jobs.
-
-    batch: points a round; explore: the share of them at the largest deviation.
-    """
-
-    budget: int = 500
-    batch: int = 4
-    explore: float = 0.25
-    seed: int = 0
+NEAR = 1e-4  # of the box: of samples nearer than that the first counts
+ROUNDS = 24  # of one job at most
+NOTHING_NEW = "nothing new"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a job ended; spent: evaluations since the first job on this run folder began."""
+    """How a job ended; spent: syntheses since the first job on this run folder began."""
 
     status: str
     reason: str
@@ -67,173 +54,177 @@ class Outcome:
     version: str | None
 
 
-@dataclass(frozen=True, eq=False)
-class Iteration:
-    """A fit: near has the predicted optimum, if any, and the best sample; x is what to verify."""
+@dataclass(frozen=True)
+class Job:
+    """One job on a run folder that was solved by `formulation`, or is to be.
 
-    posterior: Posterior
-    version: str
-    near: list[Array]
-    x: Array | None
-    converged: bool
-    words: str
-
-
-def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) -> Outcome:
-    """Run a job to its end: converged, out of budget, or without a feasible design.
-
-    Raises UserError, and what the truth raises; the same call resumes.
+    `budget`: syntheses that retraining may add to the folder, over all its jobs; `base`: those
+    before the first. `tolerance` (relative): of prediction and truth, by default the case's.
     """
-    with only_job(folder, truth.spent) as base:
-        rounds = passes = 0
-        while True:
-            before = truth.spent
-            iteration, batch, reason = decide(folder, truth, settings, base)
-            if not reason:
-                truth.evaluate(batch)
-                rounds += 1
-                if not quiet:
-                    first = f"first design, {len(batch)} points"
-                    words = first if iteration is None else iteration.words
-                    print(f"round {rounds}: {words}", file=sys.stderr, flush=True)
-                continue
-            if iteration is None:
-                status, name = truth.finish(None, (), None), None
-            else:
-                name = iteration.version
-                status = truth.finish(iteration.x, iteration.posterior.surrogates, name)
-                publish(folder)
-            passes += 1
-            # a verification that found samples: those are fitted too
-            if truth.spent == before or passes == PASSES or reason != CONVERGED:
-                return Outcome(status, reason, rounds, truth.spent - base, name)
 
+    folder: Path
+    case: Case
+    outer: Outer
+    formulation: str
+    base: int
+    budget: int = 500
+    tolerance: float | None = None
+    seed: int = 0
 
-def decide(
-    folder: Path, truth: Truth, settings: Settings, base: int
-) -> tuple[Iteration | None, Array, str]:
-    """What the samples leave to be done: a batch (q, d) to evaluate, or the reason to end.
+    @property
+    def spent(self) -> int:
+        """Syntheses in the store, of whatever job."""
+        sampler = self.outer.sampler
+        return sampler.store.count(sampler.hash)
 
-    `base`: evaluations before the first job. Raises UserError where the budget is too small
-    for a first fit.
-    """
-    seen = truth.samples()
-    observed, failed = thinned(truth, seen)
-    cost = truth.spent / max(len(seen.X), 1) or 1.0
-    left = settings.budget - (truth.spent - base)
-    room = min(settings.batch, max(math.ceil(left / cost), 0))
-    missing = first_design(truth, seen, observed, settings.seed)
-    if len(missing) and not room:
-        raise UserError(
-            f"--budget {settings.budget} leaves {len(observed.X)} samples, too few for a "
-            "first fit; give a larger one"
+    @property
+    def left(self) -> int:
+        """Of the budget."""
+        return self.budget - (self.spent - self.base)
+
+    @property
+    def over_theta(self) -> bool:
+        """Whether x = θ: what is sampled is a whole inner problem."""
+        return self.formulation == "nested" or not self.outer.beside_theta
+
+    def run(self, write: Callable[[Solution], object]) -> Outcome:
+        """To its end; `write` puts a solution into the folder.
+
+        Raises UserError where the budget is too small for a first fit.
+        """
+        mark: dict[str, Any] = {
+            "case": problem_hash({"text": case_to_toml(self.case)}),
+            "tolerance": self.case.outer.tolerance if self.tolerance is None else self.tolerance,
+        }
+        known = self._ended_before(mark)
+        if known is not None:
+            return known
+        began, outer, sampler = perf_counter(), self.outer, self.outer.sampler
+        words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
+        outcome = FormulationResult(None, None, (), (), None, False, words)
+        if not words:
+            outcome = self._trained(mark["tolerance"])
+            if outcome.x is None:
+                outcome = outer.rescued(outcome, self.seed)
+        solution = concluded_at(
+            outer, outcome, self.formulation, mark["tolerance"], self.seed, began
         )
-    if len(missing):
-        return None, missing[:room], ""
-    if len(observed.X) < len(truth.lower) + 2:
-        return None, missing, "too few points where the truth has a value"
-    iteration = iterate(folder, truth, observed, failed, settings.seed)
-    if iteration.converged or not room:
-        return iteration, missing, CONVERGED if iteration.converged else "budget"
-    explore, seed = round(settings.explore * room), settings.seed + len(observed.X)
-    batch = choose(iteration.posterior, iteration.near, room, explore, seed)
-    return iteration, batch, "" if len(batch) else "nothing is left to sample"
+        version = self._kept(outcome)
+        reason = "converged" if outcome.agreed else "budget" if self.left <= 0 else "rounds"
+        retraining = mark | {"version": version, "samples": self.spent, "reason": reason}
+        solution.result.update(spent_entry({"store": self.spent}), retraining=retraining)
+        write(solution)
+        status, rounds = str(solution.result["status"]), len(outcome.iterates)
+        return Outcome(status, reason, rounds, self.spent - self.base, version)
 
+    def _ended_before(self, mark: dict[str, Any]) -> Outcome | None:
+        """What an earlier job ended with, where there is nothing left to do."""
+        path = self.folder / "result.json"
+        if not path.exists() or not (self.folder / "report.html").exists():
+            return None
+        found = read_json(path)
+        before = found.get("retraining")
+        if not isinstance(before, dict) or before.get("samples") != self.spent:
+            return None
+        same = all(before.get(name) == value for name, value in mark.items())
+        if not same or (before.get("reason") != "converged" and self.left > 0):
+            return None
+        return Outcome(str(found.get("status")), NOTHING_NEW, 0, self.spent - self.base,
+                       before.get("version"))  # fmt: skip
 
-def thinned(truth: Truth, seen: Observations) -> tuple[Observations, Array]:
-    """What to fit, in an order of its own, and the points (f, d) without a value.
+    def _trained(self, tolerance: float) -> FormulationResult:
+        """Rounds of the formulation from what is known, as many as the budget allows."""
+        name = "nested" if self.formulation == "nested" else "lifted"  # direct has no surrogates
+        given = self._known()
+        if given is None:
+            words = "too few points where the truth has a value"
+            return FormulationResult(None, None, (), (), None, False, words)
+        sampled = 2 * len(self.outer.problem.names) + 2 if self.over_theta else 1
+        rounds = min(int(self.left / (self._cost(len(given.thetas)) * sampled)), ROUNDS)
+        options = formulation_of(self.case, name)
+        assert not isinstance(options, Direct)
+        options = replace(options, tolerance=tolerance, max_refinements=max(rounds - 1, 0))
+        return self.outer.formulated(options, self.seed, given)
 
-    Of samples nearer than NEAR the first counts: more would only spoil the conditioning.
-    """
-    known = seen.rows(seen.known)
-    kept: list[int] = []
-    for row in range(len(known.X)):
-        if distances(truth, known.X[row : row + 1], known.X[kept])[0] > NEAR:
-            kept.append(row)
-    rows = np.array(kept, dtype=int)
-    order = np.lexsort(known.X[rows].T[::-1]) if kept else rows
-    return known.rows(rows[order]), seen.X[~seen.known]
+    def _cost(self, samples: int) -> float:
+        """Syntheses a sample, as far as is known of whole inner problems."""
+        return max(self.spent, 1) / max(samples, 1) if self.over_theta else 1.0
 
+    def _known(self) -> Surrogates | None:
+        """What the store holds within the bounds, a first design added where that is too little.
 
-def first_design(truth: Truth, seen: Observations, observed: Observations, seed: int) -> Array:
-    """Points (m, d) that a first fit still misses: of a Sobol set, doubled while most fail."""
-    least = PER_INPUT * len(truth.lower)
-    for doubling in range(DOUBLINGS if len(observed.X) < least else 0):
-        points = sobol(truth.lower, truth.upper, least << doubling, seed)
-        missing = points[distances(truth, points, seen.X) > NEAR]
-        if len(missing):
-            return missing
-    return np.empty((0, len(truth.lower)))
+        None where the truth has no value at most of its points. Raises UserError where the budget
+        is too small for it.
+        """
+        lower, upper = box(self.outer.problem) if self.over_theta else self.outer.bounds
+        least, seen = PER_INPUT * len(lower), self._stored()
+        for doubling in range(DOUBLINGS):
+            if len(_usable(seen)) >= least:
+                break
+            X = sobol(lower, upper, least << doubling, self.seed)
+            new = X[_distances(X, seen, upper - lower) > NEAR]
+            room = max(int(np.ceil(self.left / self._cost(len(seen)))), 0)
+            seen += self._sampled(new[:room])
+        kept: list[Seen] = []
+        for sample in _usable(seen):
+            if _distances(np.array([sample.x]), kept, upper - lower)[0] > NEAR:
+                kept.append(sample)
+        if len(kept) < len(lower) + 2:
+            if len(seen) >= least:
+                return None
+            words = f"leaves {len(kept)} samples, too few for a first fit; give a larger one"
+            raise UserError(f"--budget {self.budget} {words}")
+        thetas = np.array([sample.x for sample in kept])[:, : len(self.outer.problem.names)]
+        quantities = [sample for sample in kept if isinstance(sample, QuantitySample)]
+        return Surrogates((), thetas, tuple(quantities))
 
+    def _stored(self) -> "list[Seen]":
+        """Samples of the store within the bounds, oldest first, failures among them."""
+        store, problem = self.outer.sampler.store, self.outer.problem
+        if self.over_theta:
+            return self._sampled(stored_thetas(store, problem))
+        designs = stored_designs(store, problem)
+        return [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
 
-def iterate(
-    folder: Path, truth: Truth, observed: Observations, failed: Array, seed: int
-) -> Iteration:
-    """Fit all that is observed (the newest version where it was fitted to that), and optimise.
+    def _sampled(self, X: Array) -> "list[Seen]":
+        """The truth at X (m, d), what is known already from the store."""
+        if not len(X):
+            return []
+        if self.over_theta:
+            return [*self.outer.sampler.bandwidths(X, "retraining")]
+        return [*self.outer.sampler.quantities(X, "retraining")]
 
-    Converged: prediction and truth agree at an optimum that nothing promises to better.
-    """
-    lower, upper, tolerance = truth.lower, truth.upper, truth.tolerance
-    name, surrogates = _fitted(folder, truth, observed, seed)
-    posterior = Posterior(truth, surrogates, observed, failed)
-    J, violation = posterior.values()
-    best = posterior.incumbent()
-    first = observed.X[int(np.argmin(violation)) if best is None else best]
-    optimum = predicted_optimum(posterior, np.vstack([first, sobol(lower, upper, STARTS, seed)]))
-    settled, at, x = False, best, None if best is None else first
-    if optimum is not None:
-        away = np.abs((observed.X - optimum[0]) / (upper - lower)).max(axis=1)
-        settled = bool(away.min() <= NEAR)
-        if settled or best is None:
-            at, x = int(np.argmin(away)), optimum[0]
-        if best is not None:
-            settled = settled or bool(abs(optimum[1] / J[best] - 1.0) <= SETTLED * tolerance)
-    true, error = (np.nan, np.inf) if at is None else (float(J[at]), _error_at(posterior, at))
-    near = [first] if optimum is None else [optimum[0], first]
-    gain = maximiser(posterior, False, near, seed)[1]
-    predicted = None if optimum is None else optimum[1]
-    if name is None:
-        name = keep_version(
-            folder,
-            surrogates,
-            truth.describe,
-            samples=len(observed.X),
-            errors={n: asdict(p.loo) for n, p in zip(truth.outputs, surrogates, strict=True)},
-            at_optimum=error if np.isfinite(error) else None,
-            objective=predicted,
+    def _kept(self, outcome: FormulationResult) -> str | None:
+        """The name of the version that the job's surrogate is kept as."""
+        if not outcome.surrogates:
+            return None
+        outputs = (self.outer.problem.figure.key, *OUTPUTS[1:])[: len(outcome.surrogates)]
+        pairs = zip(outputs, outcome.surrogates, strict=True)
+        last = outcome.iterates[-1] if outcome.iterates else None
+        return keep_version(
+            self.folder,
+            outcome.surrogates,
+            {"formulation": "nested" if self.formulation == "nested" else "lifted",
+             "outputs": list(outputs)},
+            samples=len(outcome.surrogates[0].X),
+            errors={name: asdict(process.loo) for name, process in pairs},
+            at_optimum=last.error if last and np.isfinite(last.error) else None,
+            objective=last.predicted_objective if last else None,
             created=datetime.now(UTC).isoformat(timespec="seconds"),
-        )
-    words = (
-        f"{len(observed.X)} samples, predicted J "
-        f"{'none' if predicted is None else f'{predicted:.6g}'}, "
-        f"best true {true:.6g}, error {error:.1e}, improvement {gain:.1e}"
-    )
-    converged = settled and error <= tolerance and gain <= SETTLED * tolerance * abs(true)
-    return Iteration(posterior, name, near, x, bool(converged), words)
+        )  # fmt: skip
 
 
-def _fitted(
-    folder: Path, truth: Truth, observed: Observations, seed: int
-) -> tuple[str | None, tuple[GaussianProcess, ...]]:
-    """The newest version where these samples are its own, else a new fit without a name."""
-    lower, upper = truth.lower, truth.upper
-    name = next(reversed(version_names(folder)), None)
-    if name is not None:
-        surrogates = load_version(folder, name)
-        unit, X = (observed.X - lower) / (upper - lower), surrogates[0].X
-        if X.shape == unit.shape and np.abs(X - unit).max() <= SAME:
-            return name, surrogates
-    return None, fit_outputs(
-        observed.X, observed.Y, observed.dY, lower=lower, upper=upper, seed=seed, starts=2
-    )
+Seen = BandwidthSample | QuantitySample
 
 
-def _error_at(posterior: Posterior, row: int) -> float:
-    """The larger of |ΔJ| / |J| and |Δg| between an observation and its prediction without it."""
-    seen = posterior.observed.rows(np.array([row]))
-    residuals = [loo_errors(process)[0][row] for process in posterior.surrogates]
-    left_out = replace(seen, Y=seen.Y - np.array(residuals))
-    J, g = objective_and_violation(posterior.truth, seen.X, seen.Y)
-    J_out, g_out = objective_and_violation(posterior.truth, seen.X, left_out.Y)
-    off = float(abs(J_out[0] - J[0]) / max(abs(J[0]), 1e-300))
-    return max(off, float(abs(g_out[0] - g[0])) if np.isfinite(g[0]) else 0.0)
+def _usable(samples: list[Seen]) -> list[Seen]:
+    """Those with a value."""
+    return [s for s in samples if (s.feasible if isinstance(s, BandwidthSample) else s.certified)]
+
+
+def _distances(X: Array, others: list[Seen], width: Array) -> Array:
+    """Of X (m, d) to the nearest of the samples, the largest component in shares of the box."""
+    if not others:
+        return np.full(len(X), np.inf)
+    known = np.array([sample.x for sample in others])
+    return np.array([np.abs((known - x) / width).max(axis=1).min() for x in X])

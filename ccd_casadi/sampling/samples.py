@@ -32,6 +32,11 @@ class BandwidthSample:
     error: float | None = None
 
     @property
+    def x(self) -> tuple[float, ...]:
+        """What a surrogate of it is over: θ."""
+        return self.theta
+
+    @property
     def value(self) -> float:
         """What J counts: the error where the inner problem is of that, else ω_b*."""
         return self.bandwidth if self.error is None else self.error
