@@ -11,13 +11,16 @@ from scipy.io import savemat
 
 from ccd_casadi.fixed_structure import Sampling, Structure, certify, synthesise_sections
 from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.fixed_structure.local_search import LoopModel
 from ccd_casadi.fixed_structure.measured import (
     MeasuredResponse,
     from_control,
-    judge,
     read_frequency_response,
 )
-from ccd_casadi.fixed_structure.measured_design import _OnLines, design_on_data
+from ccd_casadi.fixed_structure.measured_design import design_on_data
+from ccd_casadi.fixed_structure.measured_loop import judge
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
@@ -72,10 +75,12 @@ def test_the_design_on_lines_is_that_on_the_model() -> None:
 
 def test_rows_on_lines_have_their_derivatives() -> None:
     structure = Structure(biquads=1)
-    problem, kappa = loop(3, structure)
-    kappa = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
-    model = _OnLines(measured(None, 60), structure, BOUNDS, None, 0, None)
-    tau = float(np.log(2.0 * HZ * 1.013))
+    modelled, kappa = loop(3, structure)
+    kappa = structure.in_units(kappa, modelled.plants.omega_0, modelled.plants.force)
+    problem = line_problem([measured(None, 60)], structure, BOUNDS)
+    kappa = in_problem_units(problem, kappa)
+    model = LoopModel(problem)
+    tau = float(np.log(2.0 * HZ * 1.013 / problem.plants.omega_0))
     x = np.append(kappa, tau)
     point = model.at(x)
     assert point is not None
@@ -85,7 +90,7 @@ def test_rows_on_lines_have_their_derivatives() -> None:
     ends = [model.at(x + s * h * way) for s in (1.0, -1.0)]
     assert ends[0] is not None
     assert ends[1] is not None
-    values = [end.data.value for end in ends if end is not None]
+    values = [end.data.peaks.value for end in ends if end is not None and end.data.peaks is not None]
     assert len(values[0]) == len(values[1]) == len(rows.value)
     difference = (values[0] - values[1]) / (2.0 * h)
     slope = rows.slopes @ way
@@ -103,7 +108,7 @@ def test_what_the_data_do_not_show_is_said() -> None:
     high = MeasuredResponse(whole.hz[whole.hz > 40.0], whole.G[whole.hz > 40.0])
     assert not judge(high, K, BOUNDS).sure
     # An unstable pole that is told moves the count by as many.
-    assert judge(whole, K, BOUNDS, unstable_poles=2).right_half_plane == 2
+    assert judge(replace(whole, unstable_poles=2), K, BOUNDS).right_half_plane == 2
 
 
 def test_files_of_every_kind_hold_the_same_response(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from test_measured import measured
 
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
-from ccd_casadi.fixed_structure.measured import controller_response, judge
+from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
 from ccd_casadi.inner import main as inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.page import escape
@@ -66,7 +66,7 @@ def test_inner_designs_on_the_lines(
     assert ("sampled at 10000 Hz" in shown) == sampled
     data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){7})</tr>", shown)
     cells = np.array([[float(v) for v in re.findall(r">([^<]+)</td>", row)] for row in data])
-    k = controller_response(K, case.response.hz, case.period)
+    k = controller_response(K, case.response.hz, case.period)[:, 0, 0]
     S = np.abs(1.0 / (1.0 + case.response.G * k))
     at = [int(np.abs(case.response.hz - hz).argmin()) for hz in cells[:, 0]]
     np.testing.assert_allclose(cells[:, 2], S[at], rtol=1e-3)

@@ -7,7 +7,7 @@ from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.inner_answer import InnerAnswer
-from ccd_casadi.fixed_structure.measured import controller_response
+from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.support.units import HZ
@@ -19,8 +19,7 @@ def measured_answer(
     """The structure of the case on its measured lines, and the design behind the answer."""
     hz = case.response.hz
     made = design_on_data(
-        case.response, case.structure, case.bounds, period=case.period,
-        unstable_poles=case.unstable_poles, poles_at_zero=case.poles_at_zero, starts=case.starts,
+        case.response, case.structure, case.bounds, period=case.period, starts=case.starts,
         seed=seed, progress=progress,
     )  # fmt: skip
     plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
@@ -60,5 +59,5 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
     if made.controller is None or made.figures is None or not made.figures.stable:
         return {}
     hz = case.response.hz
-    L = case.response.G * controller_response(made.controller, hz, case.period)
+    L = case.response.G * controller_response(made.controller, hz, case.period)[:, 0, 0]
     return measured_entry(HZ * hz, L, made.controller, made.bandwidth, made.figures.S_peak)

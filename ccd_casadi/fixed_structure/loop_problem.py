@@ -114,6 +114,19 @@ class LoopProblem:
         return np.concatenate(found)
 
     @cached_property
+    def resonances(self) -> Array:
+        """|p| of the flexible modes of the first plant that the loop sees, the strongest first."""
+        p, r = self.plants.poles[0], self.plants.residues[0, :, 0, 0]
+        light = (p.imag > 0.0) & (-p.real < 0.2 * np.abs(p))
+        strength = np.abs(r) / np.maximum(-p.real, 1e-300)
+        order = np.argsort(-strength[light])
+        return np.asarray(np.abs(p[light])[order])
+
+    def response(self, v: Array) -> np.ndarray:
+        """The first entry of the first plant's G (k,) at jv."""
+        return self.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
+
+    @cached_property
     def leads(self) -> Array:
         """ln ω_i/ω_b by number."""
         return np.append(np.zeros(self.first), [one.lead for one in self.bounds.channels])
@@ -199,7 +212,7 @@ class Constraints:
 
 def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
     """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
-    return row % len(problem.plants.plants)
+    return row % problem.plants.count
 
 
 @dataclass(frozen=True)

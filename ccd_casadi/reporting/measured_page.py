@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.fixed_structure.measured import clearances, controller_response
+from ccd_casadi.fixed_structure.measured_loop import between, controller_response
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.lines import Curve, Level, figure_lines
@@ -59,17 +59,15 @@ def write_measured(
 def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> str:
     """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight."""
     hz, G, bounds = case.response.hz, case.response.G, case.bounds
-    K = controller_response(controller, hz, case.period)
+    K = controller_response(controller, hz, case.period)[:, 0, 0]
     L = G * K
     S, ends = 1.0 / (1.0 + L), (float(hz[0]), float(hz[-1]))
     size = np.abs(S)
-    room = clearances(hz, L)
-    between = np.full(len(room), np.nan)  # what |S| may reach between two lines, at their middle
-    between[room > 0.0] = 1.0 / room[room > 0.0]
+    reach = between(hz, L[:, None, None])  # of |S| between two lines, drawn at their middle
     top = 2.5 * max(bounds.S_max, float(size.max()))
     at = bandwidth_level(answer["bandwidth_hz"])
     locus = np.where(np.abs(L) <= FAR, L, np.nan)
-    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), between, "at most between lines", GREY, width=0.9)
+    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), np.where(reach < np.inf, reach, np.nan), "at most between lines", GREY, width=0.9)
     rows = [
         [sensitivity_panel(
             (allowed, Curve(hz, size, "at the lines")), ends, bounds.S_max, (at,), "|S| (–)",

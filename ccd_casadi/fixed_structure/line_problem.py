@@ -1,0 +1,225 @@
+"""The problem of a controller on measured lines: the same constraints as on models, without one.
+
+Each line is a plant of its own: one mode whose response at that line is the one that was measured.
+The rows, their slopes and their curvature are so those of every other set (`kernels.loop_rows`), at
+frequencies that do not move. ω_b lies between two lines,
+where ln σ(S) is a straight line over ln v. Stability is the winding of det(I + GK).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop import PlantSet
+from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.fixed_structure.measured_loop import controller_response, winding
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.kernels import modes
+from ccd_casadi.kernels.loop_curvature import second
+from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+REACH = 0.3  # ω₀ over the last line
+SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
+PEAK = 1.0  # ln: by so much a resonance stands out of |G|
+RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
+POLE = -1.0 + 1.0j  # of a line's mode, over its frequency
+SLOWEST = 0.01  # |p| T of it at least: below, digits of z - e^{pT} are lost
+
+
+@dataclass(frozen=True)
+class LinePlants(PlantSet):
+    """The lines as plants, each of one pole and its conjugate; `omega` (N,) over ω₀.
+
+    A sampled loop sees what was measured, and a disturbing force is taken to see the same: with
+    z = α + βs at a line and its conjugate, f = β/(z - α - βp) is 1/(s - p) there.
+    """
+
+    omega: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def modes(self) -> modes.Plants:
+        """As the kernels have them."""
+        p, r = self.poles, self.residues
+        residues = np.stack([r.real, r.imag], axis=2)
+        if self.period is None:
+            return modes.Plants(np.stack([p] * 4, axis=-1), residues, 0.0, 0.0)
+        turn = (self.omega * self.period)[:, None]
+        slope = np.sin(turn) / self.omega[:, None]
+        grown = np.cos(turn) + slope * p
+        terms = np.stack([p, slope.astype(complex), np.zeros_like(p), grown], axis=-1)
+        return modes.Plants(terms, residues, self.period, 0.0)
+
+
+@dataclass(frozen=True)
+class LineProblem(LoopProblem):
+    """`responses` as they were measured; `starts`: index of the first line of each, and the end.
+
+    The last plants of the set are the responses at ω_low, one each.
+    """
+
+    responses: tuple[MeasuredResponse, ...] = ()
+    v: Array = field(default_factory=lambda: np.zeros(0))
+    starts: tuple[int, ...] = ()
+
+    @cached_property
+    def base(self) -> Array:
+        """The lines of the first response."""
+        return self.v[: self.starts[1]]
+
+    def stable(self, kappa: Array) -> bool:
+        """Whether the winding on every response is that of a stable loop."""
+        plants = self.plants
+        period = None if plants.period is None else plants.period / plants.omega_0
+        si = self.structure.in_units(kappa, plants.omega_0, plants.force)
+        K = controller_of(self.structure, si)
+        integrators = int(self.structure.integrator)
+        for one in self.responses:
+            whole = one.followed
+            L = whole.G @ controller_response(K, whole.hz, period)
+            if winding(one, L, integrators)[0] != 0:
+                return False
+        return True
+
+    @cached_property
+    def resonances(self) -> Array:
+        """v at the peaks of the first response, the strongest first."""
+        size = np.log(np.linalg.norm(self.responses[0].matrix, axis=(1, 2)))
+        at, found = find_peaks(size, prominence=PEAK)
+        return self.base[at[np.argsort(-found["prominences"])]]
+
+    def response(self, v: Array) -> np.ndarray:
+        """G (k,) of the first response's first entry, at the lines next to v."""
+        at = np.clip(np.searchsorted(self.base, v), 0, len(self.base) - 1)
+        return self.plants.responses(at, self.base[at])[0][:, 0, 0]
+
+
+def line_problem(
+    responses: Sequence[MeasuredResponse],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    period: float | None = None,
+    margin: float = 0.0,
+) -> LineProblem:
+    """The problem on all lines; `period` (s) as in `measured_loop.judge`."""
+    hz = [one.hz for one in responses]
+    low = bounds.omega_low / HZ
+    every = np.concatenate([*hz, np.full(len(hz), low)])
+    G = np.concatenate([one.matrix for one in responses] + [one.at(low)[None] for one in responses])
+    size = np.linalg.norm(G, axis=(1, 2))
+    omega_0 = HZ * max(REACH * min(one[-1] for one in hz), SHORT * max(one[0] for one in hz))
+    force = 1.0 / float(np.exp(np.log(size).mean()))
+    plants = _plants(HZ * every / omega_0, force * G, structure, omega_0, force, period)
+    fastest = 3.0 * HZ * max(one[-1] for one in hz) / omega_0
+    if plants.period is not None:
+        fastest = min(fastest, 2.0 / plants.period)
+    slowest = 0.1 * HZ * min(one[0] for one in hz) / omega_0
+    gains = (1e-3 / (force * float(size.max())), 1e3 / (force * float(size.min())))
+    box = structure.bounds((slowest, fastest), gains)
+    v = plants.variable(HZ * every / omega_0)
+    starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
+    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts)
+
+
+def _plants(
+    omega: Array,
+    G: np.ndarray,
+    structure: Structure | ChannelStructure,
+    omega_0: float,
+    force: float,
+    period: float | None,
+) -> LinePlants:
+    """A plant for each line with G (N, p, m) there: Re r and Im r solve G = r f + r̄ f̃."""
+    count, p, m = G.shape
+    least = 0.0 if period is None else SLOWEST / (period * omega_0)
+    pole = POLE * np.maximum(omega, least)
+    f, other = 1.0 / (1j * omega - pole), 1.0 / (1j * omega - pole.conj())
+    both, apart = f + other, 1j * (f - other)
+    basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
+    parts = np.linalg.solve(basis, np.stack([G.real, G.imag], axis=1).reshape(count, 2, p * m))
+    residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
+    out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
+    into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
+    A, B, C, D = (np.zeros((1, *shape)) for shape in ((0, 0), (0, m), (p, 0), (p, m)))
+    T = None if period is None else period * omega_0
+    directions = (np.ascontiguousarray(M, float) for M in (out, into))
+    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, (), A, B, C, D,
+                      *directions, omega)  # fmt: skip
+
+
+@assess.register
+def _(
+    problem: LineProblem,
+    kappa: Array,
+    tau: float,
+    *,
+    within: float | None = None,
+    depth: float | None = None,
+    each: bool = False,
+) -> Assessment:
+    """Every line within a factor e of its bound, the two next to ω_b, and |S| at ω_low."""
+    plants, starts, P = problem.plants, problem.starts, problem.plants.count
+    v, lines = problem.v, problem.starts[-1]
+    crossing = plants.variable(np.exp(tau + problem.leads))
+    inside = all(v[a] < crossing.min() and crossing.max() < v[b - 1]
+                 for a, b in zip(starts, starts[1:], strict=False))  # fmt: skip
+    if not inside or not problem.stable(kappa):
+        return Assessment(False, np.zeros(0), None, None)
+    loop = problem.loop(kappa, tau)
+    codes = np.array(problem.curves, np.int64)
+    every = np.arange(lines)
+    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
+    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
+    value = np.where(short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    i, c, k = np.nonzero(value > RELEVANT)
+    at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
+    low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
+    curve = np.concatenate([codes[c], np.full(len(low), Curve.S_LOW)])
+    row = np.concatenate([i + k * P, low])
+    found, _, to_kappa, *_ = rows(curve, row // P, row % P, v[row % P], loop)
+    to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
+    ends = _ends(problem, loop, crossing)
+    parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
+    curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
+    peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
+    return Assessment(True, np.zeros(0), peaks, peaks.only(np.zeros(0, np.int64)))
+
+
+def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:
+    """ln|S(jω_b)| + ½ ln 2 of every response and number: curve, row, v, value and slopes."""
+    P, v, rows_of = problem.plants.count, problem.v, []
+    numbers = np.flatnonzero(np.isfinite(problem.limits[Curve.CROSSING]))
+    for number in numbers:
+        place = crossing[number]
+        for a, b in zip(problem.starts, problem.starts[1:], strict=False):
+            i = a + int(np.clip(np.searchsorted(v[a:b], place), 1, b - a - 1))
+            which, at = np.array([i - 1, i]), v[[i - 1, i]]
+            code = np.full(2, Curve.CROSSING)
+            value, _, to_kappa, *_ = rows(code, np.full(2, number), which, at, loop)
+            width = np.log(at[1] / at[0])
+            share = np.log(place / at[0]) / width
+            mean = np.array([1.0 - share, share])
+            slope = (value[1] - value[0]) / width / problem.plants.chain(np.array(place))
+            rows_of.append((number * P + i, at[1], mean @ value, mean @ to_kappa, slope))
+    row, at, value, to_kappa, to_tau = zip(*rows_of, strict=True)
+    code = np.full(len(row), Curve.CROSSING)
+    return (code, *(np.array(part) for part in (row, at, value, to_kappa, to_tau)))
+
+
+@hessians.register
+def _(problem: LineProblem, kappa: Array, tau: float, found: Constraints) -> Array:
+    """At fixed lines."""
+    n, P = len(kappa), problem.plants.count
+    out = np.zeros((len(found.v), n + 1, n + 1))
+    loop = problem.loop(kappa, tau)
+    out[:, :n, :n] = second(found.curve, found.plant // P, found.plant % P, found.v, loop)
+    return out
