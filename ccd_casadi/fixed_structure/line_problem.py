@@ -14,14 +14,14 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from ccd_casadi.fixed_structure.bounds import Bounds
-from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Curve, LoopProblem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
-from ccd_casadi.fixed_structure.measured_loop import controller_response, winding
-from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.measured_loop import winding
+from ccd_casadi.fixed_structure.structure import Structure, response
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_rows import levels, rows
@@ -78,15 +78,15 @@ class LineProblem(LoopProblem):
 
     def stable(self, kappa: Array) -> bool:
         """Whether the winding on every response is that of a stable loop."""
-        plants = self.plants
-        period = None if plants.period is None else plants.period / plants.omega_0
-        si = self.structure.in_units(kappa, plants.omega_0, plants.force)
-        K = controller_of(self.structure, si)
-        integrators = int(self.structure.integrator)
-        for one in self.responses:
-            whole = one.followed
-            L = whole.G @ controller_response(K, whole.hz, period)
-            if winding(one, L, integrators)[0] != 0:
+        plants, structure = self.plants, self.structure
+        alone = isinstance(structure, Structure)
+        parts = [(structure, kappa)] if alone else list(structure.split(kappa))
+        for measured in self.responses:
+            whole = measured.followed
+            s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
+            k = np.stack([response(own, part, s) for own, part in parts], axis=-1)
+            L = plants.force * whole.G @ (plants.into * k[:, None, :]) @ plants.out
+            if winding(measured, L, int(structure.integrator))[0] != 0:
                 return False
         return True
 
@@ -97,7 +97,7 @@ class LineProblem(LoopProblem):
         at, found = find_peaks(size, prominence=PEAK)
         return self.base[at[np.argsort(-found["prominences"])]]
 
-    def response(self, v: Array) -> np.ndarray:
+    def first_response(self, v: Array) -> np.ndarray:
         """G (k,) of the first response's first entry, at the lines next to v."""
         at = np.clip(np.searchsorted(self.base, v), 0, len(self.base) - 1)
         return self.plants.responses(at, self.base[at])[0][:, 0, 0]

@@ -122,7 +122,7 @@ class LoopProblem:
         order = np.argsort(-strength[light])
         return np.asarray(np.abs(p[light])[order])
 
-    def response(self, v: Array) -> np.ndarray:
+    def first_response(self, v: Array) -> np.ndarray:
         """The first entry of the first plant's G (k,) at jv."""
         return self.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
 

@@ -106,9 +106,12 @@ def design_on_data(
 
 
 def static_decoupling(measured: MeasuredResponse) -> Decoupling:
-    """Directions in which a response of several channels moves at its first lines, by falling
-    gain: the singular vectors of R in G ~ R (f₁/jf)^n."""
-    U, _, Vt = np.linalg.svd(measured.static)
+    """Directions in which a response of several channels moves in its first decade, by falling
+    gain: the singular vectors of R in G ~ R (f₁/jf)^n, the mean over the lines."""
+    hz = measured.hz
+    first = hz <= 10.0 * hz[0]
+    turned = measured.matrix[first] * ((1j * hz[first] / hz[0]) ** measured.slope)[:, None, None]
+    U, _, Vt = np.linalg.svd(turned.real.mean(axis=0))
     if U.shape != Vt.shape:
         raise UserError("the response has not as many inputs as outputs; leave some out")
     names = tuple(str(i + 1) for i in range(len(U)))

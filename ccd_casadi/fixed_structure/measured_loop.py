@@ -6,7 +6,7 @@ Bounds are held on every line. Between two lines L = GK is taken to lie within r
 
 twice the error of linear interpolation, where L bends between two lines as around them. A
 resonance that fits between two lines is not seen. With it σ_max(S) <= 1/(least σ_min(I + L) on the
-chord less r).
+chord less r); where L is large the same of L⁻¹ = (GK)⁻¹, which is nearly straight there.
 
 Stability is the winding of F = det(I + GK). Over all ω > 0 its angle grows by
 
@@ -89,6 +89,10 @@ def judge(
     k = controller_response(K, whole.hz, period)
     joint = whole.G @ k
     Z, doubts = winding(measured, joint, int(integrator))
+    first = len(whole.hz) - len(hz)
+    reach = between(hz, joint[first:])
+    if not np.isfinite(reach).all():
+        doubts.append(f"between {np.isinf(reach).sum()} pairs of lines GK may pass -1")
     head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
     of = "1 + GK" if len(G[0]) == 1 else "det(I + GK)"
     assumed = (
@@ -98,7 +102,6 @@ def judge(
     words, sure = "; ".join([assumed, *doubts]), not doubts
     if Z != 0:
         return MeasuredFigures(False, sure, Z, words)
-    first = len(whole.hz) - len(hz)
     L, k, eye = joint[first:], k[first:], np.eye(joint.shape[1])
     S, omega = np.linalg.inv(eye + L), HZ * hz
     KS, T = gain(k @ S), gain(L @ S)
@@ -117,7 +120,7 @@ def judge(
         words=words,
         S_peak=float(size.max()),
         S_peak_frequency=float(omega[np.argmax(size)]),
-        S_between=float(between(hz, L).max()),
+        S_between=float(reach.max()),
         S_low=float(gain(S_low)),
         bandwidth=_bandwidth(omega, np.log(size), bounds, integrator),
         KS=float(KS.max()),
@@ -157,14 +160,6 @@ def gain(M: np.ndarray) -> Array:
     return np.asarray(np.linalg.norm(M, 2, axis=(-2, -1)))
 
 
-def clearances(hz: Array, F: np.ndarray) -> Array:
-    """Least distance of 0 to F (k,) between neighbouring lines (k - 1,): to the chord, less r."""
-    start, step = F[:-1], np.diff(F)
-    size = np.abs(step) ** 2
-    share = np.clip(-(start * step.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
-    return np.asarray(np.abs(start + share * step) - interpolation_errors(hz, F[:, None, None]))
-
-
 def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
     """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f."""
     x = np.log(hz)
@@ -179,16 +174,31 @@ def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
 def between(hz: Array, L: np.ndarray) -> Array:
     """What σ_max(S) may reach between neighbouring lines (k - 1,): infinite where nothing is sure.
 
-    On a chord σ_min(I + L) is at least that at a place near by, less the step to there.
+    By L, or where it is large and its inverse the smoother by 1 + σ_max(T), T = (I + L⁻¹)⁻¹.
     """
+    direct, inverse = _clearances(hz, L), _clearances(hz, np.linalg.inv(L))
+    with np.errstate(divide="ignore"):
+        by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
+        by_inverse = np.where(inverse > 0.0, 1.0 + 1.0 / np.maximum(inverse, 0.0), np.inf)
+    return np.minimum(by_L, by_inverse)
+
+
+def _clearances(hz: Array, L: np.ndarray) -> Array:
+    """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r.
+
+    Of several channels that at a place near by, less half the step to the next.
+    """
+    step = np.diff(L, axis=0)
     if L.shape[1] == 1:
-        room = clearances(hz, 1.0 + L[:, 0, 0])
+        start, along = 1.0 + L[:-1, 0, 0], step[:, 0, 0]
+        size = np.abs(along) ** 2
+        share = np.clip(-(start * along.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
+        least = np.abs(start + share * along)
     else:
-        step = np.diff(L, axis=0)
         places = np.eye(L.shape[1]) + L[:-1] + BETWEEN[:, None, None, None] * step
         least = np.linalg.svd(places, compute_uv=False)[..., -1].min(axis=0)
-        room = least - 0.5 * BETWEEN[1] * gain(step) - interpolation_errors(hz, L)
-    return np.where(room > 0.0, 1.0 / np.where(room > 0.0, room, 1.0), np.inf)
+        least = least - 0.5 * BETWEEN[1] * gain(step)
+    return np.asarray(least - interpolation_errors(hz, L))
 
 
 def winding(
@@ -206,7 +216,6 @@ def winding(
     Z = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
     hz = measured.hz
     own = L[len(L) - len(hz) :]
-    near = int((clearances(hz, F[len(L) - len(hz) :]) <= 0.0).sum())
     doubts = []
     if measured.gap > GAP:
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
@@ -214,8 +223,6 @@ def winding(
         doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large")
     if np.linalg.norm(own[-1], 2) > SMALL:
         doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
-    if near:
-        doubts.append(f"between {near} pairs of lines GK may pass -1")
     return Z, doubts
 
 

@@ -134,7 +134,7 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     v = problem.plants.variable(np.asarray(crossovers, float))
     kappa[:, kinds] = 0.0
     K = response(problem.structure, kappa.T, 1j * v)
-    kappa[:, kinds] = -np.log(np.abs(problem.response(v) * K))[:, None]
+    kappa[:, kinds] = -np.log(np.abs(problem.first_response(v) * K))[:, None]
     return np.clip(kappa, *problem.box)
 
 
