@@ -19,13 +19,17 @@ from time import perf_counter
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ccd_casadi.codesign.retraining import CoDesignTruth
-from ccd_casadi.reporting.retrained_run import open_run
+from ccd_casadi.codesign.acquisition import (
+    Posterior,
+    objective_and_violation,
+    predicted_optimum,
+)
+from ccd_casadi.codesign.retrained_run import CoDesignTruth
+from ccd_casadi.codesign.retraining import STARTS, Settings, retrain, thinned
+from ccd_casadi.codesign.truth import Truth
+from ccd_casadi.codesign.versions import load_version, version_names
+from ccd_casadi.retrain import open_run
 from surrogates import GaussianProcess, fit_outputs, sobol
-from surrogates.acquisition import Posterior, objective_and_violation, predicted_optimum
-from surrogates.retraining import STARTS, Settings, retrain, thinned
-from surrogates.truth import Truth
-from surrogates.versions import load_version, version_names
 
 ROOT = Path(__file__).parent.parent
 CASES = ("two_mass", "two_mass_paper")

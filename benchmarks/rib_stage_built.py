@@ -30,7 +30,7 @@ from ccd_casadi.deployment.sampled import (
     sampled_plant,
     sensitivity_loop,
 )
-from ccd_casadi.deployment.simulation import measure_sensitivity
+from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
@@ -123,7 +123,7 @@ def main() -> None:
         if top < peak < np.inf:
             held = sampled_plant(plant, 1.0 / RATE, DELAY)
             bandwidth = HZ * min(row["bandwidth_hz"] for row in more)
-            top, measured = peak, measure_sensitivity(held, K, bandwidth, options.seed)
+            top, measured = peak, measure_set([held], K, bandwidth, options.seed)[0]
         print(f"{len(rows)} plants: {summary(rows)}", flush=True)
         if options.write:
             kept = {

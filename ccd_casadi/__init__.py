@@ -8,10 +8,16 @@
 Names are imported when they are first used: this module alone loads neither numba nor CasADi.
 """
 
-from surrogates.lazy_names import from_stub as _from_stub  # first: it takes care of Ctrl-C
+import sys as _sys
 
-# isort: split
+from ccd_casadi.support import interrupts as _interrupts
 from ccd_casadi.support.notebook import Shown
+from surrogates.lazy_names import from_stub as _from_stub
+
+if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
+    _interrupts.starting()
+
+del _interrupts
 
 __all__ = [*_from_stub(__name__), "__version__"]
 

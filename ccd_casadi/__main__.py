@@ -8,9 +8,9 @@ from pathlib import Path
 from types import ModuleType
 
 from ccd_casadi.support.command_line import ExitCode
+from ccd_casadi.support.interrupts import begun
+from ccd_casadi.support.options import one_line
 from ccd_casadi.support.package_text import package_text
-from surrogates.interrupts import begun
-from surrogates.options import one_line
 
 # word -> the module of its `main`, and what it does
 COMMANDS = {
@@ -18,7 +18,7 @@ COMMANDS = {
     "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
     "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
-    "retrain": ("surrogates.retrain", "adds true samples to a run where they help most"),
+    "retrain": ("ccd_casadi.retrain", "adds true samples to a run where they help most"),
     "insight": ("ccd_casadi.insight", "weight against bandwidth; what the optimum answers to"),
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),

@@ -10,9 +10,9 @@ from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
-from surrogates.options import number, one_line, positive
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun

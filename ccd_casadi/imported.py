@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, run, run_parser
 from ccd_casadi.support.errors import PlantError, UserError
-from surrogates.options import whole
+from ccd_casadi.support.options import whole
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.plants.imported.modal_table import ModalTable

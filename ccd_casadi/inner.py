@@ -9,8 +9,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.options import positive
 from ccd_casadi.support.units import HZ
-from surrogates.options import positive
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.measured_case import MeasuredCase

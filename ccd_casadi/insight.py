@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
+from ccd_casadi.support.options import whole
 from ccd_casadi.support.process_pool import PATIENCE
-from surrogates.options import whole
 
 
 def command(options: argparse.Namespace) -> ExitCode:

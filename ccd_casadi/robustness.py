@@ -8,9 +8,9 @@ from time import perf_counter
 from ccd_casadi.robust.demands import Demands, add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import number, positive, whole
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.progress import Progress
-from surrogates.options import number, positive, whole
 
 LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 

@@ -15,14 +15,6 @@ The package knows nothing of what the function means. Names are imported when th
 used: this module alone loads nothing, and scikit-learn comes when something is fitted.
 """
 
-import sys as _sys
-
-from surrogates import interrupts as _interrupts
 from surrogates.lazy_names import from_stub as _from_stub
-
-if _sys.argv[:1] == ["-m"]:  # a command is starting, not a library
-    _interrupts.starting()
-
-del _interrupts
 
 __all__ = _from_stub(__name__)

@@ -8,11 +8,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.codesign.acquisition import NEAR, distances
+from ccd_casadi.codesign.retraining import Outcome, Settings, retrain
+from ccd_casadi.codesign.truth import Observations
 from surrogates import GaussianProcess
-from surrogates.acquisition import NEAR, distances
 from surrogates.interface import Array
-from surrogates.retraining import Outcome, Settings, retrain
-from surrogates.truth import Observations
 
 
 class Camel:
@@ -21,7 +21,7 @@ class Camel:
     y_0 is least on the border that y_1 draws.
     """
 
-    names, outputs, tolerance = ("a", "b"), ("cost", "limit"), 1e-3
+    outputs, tolerance = ("cost", "limit"), 1e-3
     lower, upper = np.array([0.0, -2.0]), np.array([1.0, 2.0])
     x, y = ca.MX.sym("x", 2), ca.MX.sym("y", 2)
     objective = ca.Function("J", [x, y], [y[0]])

@@ -28,15 +28,15 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.codesign.stored import stored_designs
+from ccd_casadi.codesign.versions import keep_version, load_version, only_job
 from ccd_casadi.inner import main as inner
 from ccd_casadi.insight import main as insight
+from ccd_casadi.retrain import opener_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import UserError
 from surrogates import SurrogateFileError, load
 from surrogates.retrain import main as retrain
-from surrogates.truth import TruthError, opener_of
-from surrogates.versions import keep_version, load_version, only_job
 
 COMMANDS = {"solve": solve, "inner": inner, "retrain": retrain, "insight": insight}
 
@@ -228,7 +228,7 @@ def read(argv: list[str]) -> int:
         (lambda: load(folder / "surrogate.json"), (SurrogateFileError, OSError)),
         (lambda: load_version(folder, "0001"), (SurrogateFileError, OSError)),
         (store, (UserError,)),
-        (lambda: opener_of(folder), (TruthError,)),
+        (lambda: opener_of(folder), (UserError,)),
     ]
     for reader, worded in readers:
         try:

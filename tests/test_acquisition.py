@@ -7,8 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from surrogates import fit, sobol
-from surrogates.acquisition import (
+from ccd_casadi.codesign.acquisition import (
     AVOID,
     NEAR,
     Posterior,
@@ -20,8 +19,9 @@ from surrogates.acquisition import (
     predicted_optimum,
     scaled_deviation,
 )
+from ccd_casadi.codesign.truth import Observations
+from surrogates import fit, sobol
 from surrogates.interface import Array
-from surrogates.truth import Observations
 
 LOWER, UPPER = np.array([-1.0, 10.0]), np.array([3.0, 12.0])
 
@@ -29,7 +29,7 @@ LOWER, UPPER = np.array([-1.0, 10.0]), np.array([3.0, 12.0])
 class Valley:
     """min y_0 + 0.1 x_1 s.t. y_1 <= 0, with y_0 a bowl and y_1 a plane's sine."""
 
-    names, outputs, tolerance, describe = ("a", "b"), ("bowl", "wave"), 1e-3, {}
+    outputs, tolerance, describe = ("bowl", "wave"), 1e-3, {}
     lower, upper = LOWER, UPPER
     x, y = ca.MX.sym("x", 2), ca.MX.sym("y", 2)
     objective = ca.Function("J", [x, y], [y[0] + 0.1 * x[1]])

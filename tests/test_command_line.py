@@ -11,7 +11,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.errors import UserError
-from surrogates.options import usable_cores
+from ccd_casadi.support.options import usable_cores
 
 COMMAND = """
 import sys

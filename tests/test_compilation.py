@@ -127,9 +127,19 @@ def test_two_programs_do_not_compile_the_same(
     assert len(asked) == 1
 
 
-def test_costs_follow_what_a_kernel_calls() -> None:
-    """The bar counts a kernel by itself and by what is compiled into it."""
-    kernels = compilation._kernels()
-    cost = {name.rpartition(".")[2]: compilation._cost(kernel) for name, kernel in kernels.items()}
-    assert cost["assess"] > cost["peak"] > cost["axis_frequencies"] > cost["eigenvalues"]
-    assert cost["_synthesise"] > cost["optimal_gamma"] > cost["riccati_level"]
+def test_a_source_that_changes_meanwhile_is_compiled_again(
+    empty: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stamp named the sources as they were at the end: what was compiled were others."""
+    state, asked = ["before"], []
+
+    def edited(kernels: object, count: int) -> bool:
+        asked.append(count)
+        state[0] = "after"
+        return True
+
+    monkeypatch.setattr(compilation, "_state", lambda: state[0])
+    monkeypatch.setattr(compilation, "_compile", edited)
+    for _ in range(3):
+        compilation.ensure_compiled()
+    assert len(asked) == 2

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from surrogates.interrupts import ctrl_c_noticed, interrupts_kept, raise_dropped, was_ctrl_c
+from ccd_casadi.support.interrupts import ctrl_c_noticed, interrupts_kept, raise_dropped, was_ctrl_c
 
 ROOT = Path(__file__).parent.parent
 # Imported by every command after our own package, and long before `main`.

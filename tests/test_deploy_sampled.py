@@ -17,7 +17,7 @@ from ccd_casadi.deployment.sampled import (
     sensitivity_loop,
     together,
 )
-from ccd_casadi.deployment.simulation import measure_sensitivity, simulate
+from ccd_casadi.deployment.simulation import measure_set, simulate
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.state_space import StateSpace
 
@@ -111,7 +111,7 @@ def test_a_simulation_measures_the_same_sensitivity(channels: int) -> None:
     K = discretise(lead(channels), conversion, period, delay)
     S = sensitivity_loop(G, K)
     exact = sampled_figures(S)
-    found = measure_sensitivity(G, K, exact.bandwidth, seed=3)
+    found = measure_set([G], K, exact.bandwidth, seed=3)[0]
     assert found.leftover < 1e-6
     np.testing.assert_allclose(found.gain, np.linalg.norm(S.response(found.omega), 2, axis=(1, 2)),
                                rtol=1e-5)  # fmt: skip

@@ -14,11 +14,11 @@ from ccd_casadi.fixed_structure import (
     SectionsOutcome,
     ShapeEnd,
     Structure,
-    bandwidth_and_gradient,
     certificate,
     certify,
     synthesise_sections,
 )
+from ccd_casadi.fixed_structure.bandwidth_gradient import bandwidth_envelope
 from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import assess
@@ -82,8 +82,8 @@ def test_no_small_change_of_the_parameters_is_better(design) -> None:
 
 
 def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
-    value, slope = bandwidth_and_gradient([plant()], EASY, design)
-    assert value == design.bandwidth
+    envelope = bandwidth_envelope([plant()], EASY, design)
+    assert envelope is not None
     h = 0.02
     for i in range(2):
         ends = []
@@ -96,7 +96,7 @@ def test_the_envelope_gradient_is_that_of_the_optimum(design) -> None:
             )  # fmt: skip
             assert made.certified
             ends.append(made.bandwidth)
-        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slope[i], rel=2e-3)
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(envelope.gradient[i], rel=2e-3)
 
 
 def rigid(mass: float) -> ScaledPlant:
@@ -154,8 +154,7 @@ def test_a_rigid_body_is_looked_at_far_above_its_suspension() -> None:
 
 def test_a_gradient_is_not_made_up_away_from_an_optimum(design) -> None:
     moved = replace(design, kappa=design.kappa + 0.01)
-    _, slope = bandwidth_and_gradient([plant()], EASY, moved)
-    assert np.isnan(slope).all()
+    assert bandwidth_envelope([plant()], EASY, moved) is None
 
 
 def test_the_judge_refutes_what_is_unstable_or_passes_a_bound(design) -> None:

@@ -17,6 +17,7 @@ from test_sections_error import CABLES
 
 from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
+from ccd_casadi.codesign import outer_mixed, outer_sections
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.measured_answer import measured_answer
@@ -38,6 +39,9 @@ SYNTHESISE = [  # every way to a controller
     (synthesis, "design"), (synthesis, "_sweep"), (derivatives, "design_with_gradients"),
     (sections_bandwidth, "synthesise"), (sections_bandwidth, "least_error"),
 ]  # fmt: skip
+AT_THE_END = {  # what is asked of a polished design
+    "mixed": (outer_mixed, "kkt_certificate"), "sections": (outer_sections, "worst_members"),
+}  # fmt: skip
 EVERY = {  # beside the schema's
     "compliance_max", "compliance_words", "cost_unit", "force_step_max", "globality", "iterates",
     "loop_warnings", "low_compliance", "notes", "outcome", "static_compliance",
@@ -187,9 +191,34 @@ def test_a_resumed_run_is_the_same(run: Run) -> None:
     assert not any(again[name] for _, name in UNITS), again
 
 
-@pytest.mark.xfail(strict=True, reason="what polishes and verifies is made anew: issue 35, 1.4.9")
 def test_a_resumed_run_makes_no_new_synthesis(run: Run) -> None:
     assert not run.made[1]
+
+
+@pytest.mark.parametrize("kind", list(AT_THE_END))
+def test_an_interrupted_run_makes_no_synthesis_twice(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C once the polish is done, before the design is judged."""
+    case, made, options = KINDS[kind], Counter[str](), Direct(starts=1, box_points=2)
+    for where, what in SYNTHESISE:
+        monkeypatch.setattr(where, what, counted(made, what, getattr(where, what)))
+    whole = solve(case, options, store=tmp_path / "whole.sqlite").result
+    once = made.copy()
+    made.clear()
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(*AT_THE_END[kind], stop)
+        with pytest.raises(KeyboardInterrupt):
+            solve(case, options, store=tmp_path / "samples.sqlite")
+    assert 0 < sum(made.values()) < sum(once.values())
+    resumed = solve(case, options, store=tmp_path / "samples.sqlite").result
+    assert made == once
+    for key in ("theta", "objective", "syntheses", "spent"):
+        assert resumed[key] == whole[key], key
 
 
 def test_the_value_on_measured_lines(tmp_path: Path) -> None:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from camel import Camel, true_cost
 
+from ccd_casadi.codesign.acquisition import NEAR
+from ccd_casadi.codesign.retraining import Outcome, Settings, retrain, thinned
+from ccd_casadi.codesign.truth import Observations
+from ccd_casadi.codesign.versions import FOLDER, LOCK, load_version, only_job, version_names
+from ccd_casadi.support.errors import UserError
 from surrogates import SurrogateFileError, load, sobol
-from surrogates.acquisition import NEAR
-from surrogates.retraining import Outcome, Settings, retrain, thinned
-from surrogates.truth import Observations, TruthError
-from surrogates.versions import FOLDER, LOCK, load_version, only_job, version_names
 
 ROOT = Path(__file__).parent.parent
 
@@ -70,7 +71,7 @@ def test_a_budget_is_kept_and_is_the_folders(tmp_path: Path) -> None:
 
 
 def test_a_budget_too_small_for_anything_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TruthError, match="--budget 3 leaves 3 samples"):
+    with pytest.raises(UserError, match="--budget 3 leaves 3 samples"):
         retrain(tmp_path, Camel(tmp_path), Settings(budget=3))
 
 
@@ -138,7 +139,7 @@ def test_every_surrogate_is_kept_with_its_error_and_parent(
 JOB = """
 import sys
 from pathlib import Path
-from surrogates.versions import only_job
+from ccd_casadi.codesign.versions import only_job
 with only_job(Path(sys.argv[1]), 7):
     print("held", flush=True)
     sys.stdin.read()
@@ -152,12 +153,12 @@ def test_a_second_job_is_refused_until_the_first_one_dies(tmp_path: Path) -> Non
     )  # fmt: skip
     assert other.stdout is not None
     assert other.stdout.readline() == "held\n"
-    with pytest.raises(TruthError, match="wait for the job"):
+    with pytest.raises(UserError, match="wait for the job"):
         retrain(tmp_path, Camel(tmp_path), Settings(budget=9))
     other.kill()
     other.communicate()
     with only_job(tmp_path, 9) as base:
         assert base == 7, "what the first job found"
     (tmp_path / LOCK).write_text("no database " * 100)
-    with pytest.raises(TruthError, match="not a database"):
+    with pytest.raises(UserError, match="not a database"):
         retrain(tmp_path, Camel(tmp_path), Settings(budget=9))

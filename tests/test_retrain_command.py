@@ -12,33 +12,28 @@ import numpy as np
 import pytest
 from camel import Camel
 
-import surrogates.retrain as retrain_module
-import surrogates.truth as truth_module
-from ccd_casadi.codesign.retraining import open_run
+import ccd_casadi.retrain as retrain_module
+from ccd_casadi.codesign.retrained_run import open_run
+from ccd_casadi.codesign.truth import Observations
+from ccd_casadi.codesign.versions import LOCK, only_job
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.worker_process import WorkerLost
 from surrogates.interface import Array
 from surrogates.retrain import main
-from surrogates.truth import Observations, TruthError, TruthInterrupted
-from surrogates.versions import LOCK, only_job
 
 ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
-    """Install a truth as the only one, under the name "camel"."""
+    """Install a truth under the name "camel", which every folder gets."""
 
     def install(make: Any) -> None:
         @contextmanager
         def opened(folder: Path, **_: Any) -> Iterator[Any]:
             yield make(folder)
 
-        class Point:
-            name = "camel"
-
-            def load(self) -> Any:
-                return opened
-
-        monkeypatch.setattr(truth_module, "entry_points", lambda group: [Point()])
+        monkeypatch.setattr(retrain_module, "opener_of", lambda folder: opened)
 
     return install
 
@@ -61,7 +56,7 @@ def test_exit_codes(
 
     class Killed(Camel):
         def evaluate(self, X: Array) -> Observations:
-            raise TruthInterrupted("a worker died twice")
+            raise WorkerLost("a worker died twice")
 
     class Doubtful(Camel):
         def finish(self, *_: Any) -> str:
@@ -94,11 +89,10 @@ def test_a_second_job_is_told_in_one_line(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, "is missing, and there is not one truth installed but: camel, other"),
         ("{", "is no readable JSON"),
         ("[]", "truth: is missing"),
-        ('{"truth": 3}', "truth: is missing"),
-        ('{"truth": "os:system"}', "truth: 'os:system' is not installed (known: camel, other)"),
+        ('{"truth": 3}', "truth: 3 is not installed"),
+        ('{"truth": "os:system"}', "truth: 'os:system' is not installed (known: ccd_casadi and"),
         ('{"truth": "../evil.py"}', "is not installed"),
         ('{"truth": "a\\u001b[2J"}', "'a\\x1b[2J' is not installed"),
     ],
@@ -111,7 +105,7 @@ def test_a_folder_that_names_no_known_truth_is_refused(
     words: str,
 ) -> None:
     points = [type("Point", (), {"name": name})() for name in ("other", "camel")]
-    monkeypatch.setattr(truth_module, "entry_points", lambda group: points)
+    monkeypatch.setattr(retrain_module, "entry_points", lambda group: points)
     if text is not None:
         (tmp_path / "truth.json").write_text(text)
     assert main([str(tmp_path)]) == 2
@@ -120,6 +114,20 @@ def test_a_folder_that_names_no_known_truth_is_refused(
     assert len(errors.splitlines()) == 1
     assert errors.startswith(f"{tmp_path / 'truth.json'}: ")
     assert words in errors
+
+
+def test_an_installed_package_offers_a_truth(
+    camel_copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @contextmanager
+    def opened(folder: Path, **_: Any) -> Iterator[Any]:
+        yield Camel(folder)
+
+    point = type("Point", (), {"name": "camel", "load": lambda self: opened})()
+    monkeypatch.setattr(retrain_module, "entry_points", lambda group: [point])
+    (camel_copy / "truth.json").write_text('{"truth": "camel"}')
+    assert main([str(camel_copy), "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -175,7 +183,7 @@ def test_a_scheduler_is_the_truths_own_business(
     def opened(folder: Path, *, scheduler: str | None, **_: Any) -> Iterator[Any]:
         given.append(scheduler)
         if scheduler is not None:
-            raise TruthError(f"--scheduler {scheduler}: this truth knows no clusters")
+            raise UserError(f"--scheduler {scheduler}: this truth knows no clusters")
         yield Camel(folder)
 
     monkeypatch.setattr(retrain_module, "opener_of", lambda folder: opened)

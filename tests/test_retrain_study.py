@@ -17,14 +17,13 @@ from typing import Any
 import pytest
 from busy import HANGS
 
-import surrogates.truth as truth_module
-from ccd_casadi.reporting.retrained_run import open_run
+from ccd_casadi.codesign.retraining import Settings, retrain
+from ccd_casadi.codesign.versions import FOLDER, version_names
+from ccd_casadi.retrain import open_run
 from ccd_casadi.sampling import sampler as sampling
 from ccd_casadi.solve import main as solve
 from surrogates import load, sobol
 from surrogates.retrain import main
-from surrogates.retraining import Settings, retrain
-from surrogates.versions import FOLDER, version_names
 
 pytestmark = pytest.mark.slow  # a study of half a minute; its parts are tested apart
 ROOT = Path(__file__).parent.parent
@@ -152,8 +151,6 @@ def test_a_damaged_case_is_told_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "truth.json").write_text('{"truth": "ccd_casadi"}')
-    if "ccd_casadi" not in {p.name for p in truth_module.entry_points(group=truth_module.GROUP)}:
-        pytest.skip("the package was installed before it had the entry point: run make setup")
     assert main([str(tmp_path)]) == 2
     assert f"{tmp_path / 'case.toml'}: there is no such file" in capsys.readouterr().err
     (tmp_path / "case.toml").write_text("[plant]\n")
@@ -172,27 +169,10 @@ def test_a_damaged_case_is_told_in_one_line(
 # ---- real processes ------------------------------------------------------------------------------
 
 
-JOB = """
-import sys
-from pathlib import Path
-from ccd_casadi.reporting.retrained_run import open_run
-import surrogates.truth as module
-
-class Point:
-    name = "ccd_casadi"
-    def load(self):
-        return open_run
-
-module.entry_points = lambda group: [Point()]
-import surrogates.retrain
-raise SystemExit(surrogates.retrain.main(sys.argv[1:]))
-"""
-
-
 def launched(folder: Path, *more: str) -> subprocess.Popen[str]:
-    """The command, with its entry point whether or not the package is installed anew."""
+    """The command in a process of its own."""
     return subprocess.Popen(
-        [sys.executable, "-c", JOB, str(folder), "--quiet", "--workers", "1", *more],
+        [sys.executable, "-m", "surrogates.retrain", str(folder), "--quiet", "--workers=1", *more],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 

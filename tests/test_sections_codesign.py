@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers import problem
 
+from ccd_casadi.codesign import sections_races
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
@@ -16,6 +18,7 @@ from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, with_sections
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.inner_problem.sections_robustness import (
     judged_corners,
@@ -162,3 +165,21 @@ def test_a_search_that_ended_early_goes_on_until_there_is_a_gradient(
     assert np.isfinite(value.gradient).all()
     assert value.design.kkt_residual < 1e-3
     assert (len(initial), value.syntheses) == (2, 2)
+
+
+def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With another S_max in the same folder the anchors and words of the first were taken."""
+
+    def raced(case: CoDesignProblem, *_: object) -> tuple[CoDesignProblem, SimpleNamespace]:
+        design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
+        return with_sections(case, anchors=((case.inner.S_max,),)), design
+
+    monkeypatch.setattr(sections_races, "prepared", raced)
+    case = quick(PID)
+    with SampleStore(tmp_path / "samples.sqlite") as store:
+        for bound in (1.2, 2.0, 1.2):
+            asked = replace(case, inner=replace(case.inner, S_max=bound))
+            found, words = sections_races.seeded_and_prepared(store, asked, 0, True)
+            assert (sections_of_problem(found).anchors, words) == (
+                ((bound,),), f"none within {bound}",
+            )  # fmt: skip

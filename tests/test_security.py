@@ -18,11 +18,11 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner import main as inner
 from ccd_casadi.inner_problem.plant_source import _own_plant
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.retrain import opener_of
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.user_code import permit_user_code, time_limit
 from surrogates import SurrogateFileError, load
-from surrogates.truth import TruthError, opener_of
 
 ROOT = Path(__file__).parent.parent
 TRAP = """
@@ -59,7 +59,7 @@ def trapped_run(two_mass_run: Path, trap: Path) -> Path:
 
 
 OF_A_RUN = {"ccd_casadi.insight", "ccd_casadi.deploy", "ccd_casadi.robustness",
-            "surrogates.retrain"}  # fmt: skip
+            "ccd_casadi.retrain"}  # fmt: skip
 COMMANDS = sorted(
     {
         ".".join(p.relative_to(ROOT).with_suffix("").parts)
@@ -67,7 +67,6 @@ COMMANDS = sorted(
         if "return run(command, " in p.read_text()
     }
     - {"ccd_casadi.imported"}  # takes a folder of matrices or results, no case
-    | {"surrogates.retrain"}
 )
 
 
@@ -145,7 +144,7 @@ def test_truth_json_names_installed_packages_only(two_mass_run: Path, tmp_path: 
     folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
     for name in ("trap", "os:system", "trap.py:f", "../trap", str(tmp_path / "trap.py"), ""):
         (folder / "truth.json").write_text(json.dumps({"truth": name, "formulation": "lifted"}))
-        with pytest.raises(TruthError, match="is not installed"):
+        with pytest.raises(UserError, match="is not installed"):
             opener_of(folder)
 
 

@@ -52,9 +52,14 @@ def test_jacobian_matches_differences_of_the_function() -> None:
         np.testing.assert_allclose(jacobian[:, k], found, rtol=1e-5, atol=1e-7)
 
 
-def test_repeated_points_cost_nothing_and_every_synthesis_is_recorded() -> None:
+def test_repeated_points_cost_nothing_and_every_synthesis_can_be_kept() -> None:
     seen: list[np.ndarray] = []
-    quantities = TrueQuantities(problem(), record=lambda x, design: seen.append(x))
+
+    def kept(x, make):
+        seen.append(x)
+        return make()
+
+    quantities = TrueQuantities(problem(), kept)
     for x in (POINTS[0], POINTS[1], POINTS[0]):
         quantities.values(x)
         quantities.jacobian_at(x)

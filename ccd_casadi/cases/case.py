@@ -16,7 +16,7 @@ from ccd_casadi.cases.kinds import check_kind, read_options
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.sections import SECTIONS, Case
 from ccd_casadi.support.errors import UserError
-from surrogates.options import one_line
+from ccd_casadi.support.options import one_line
 
 TWO_MASS = Path(__file__).parents[1] / "templates" / "two_mass.toml"  # ships with the package
 DEFAULT_CASE = "runs/two_mass.toml"  # what commands read where no case is named

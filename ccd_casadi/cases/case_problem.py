@@ -17,8 +17,8 @@ from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
+from ccd_casadi.support.options import one_line
 from ccd_casadi.support.units import HZ
-from surrogates.options import one_line
 
 
 def problem_of(case: Case) -> CoDesignProblem:

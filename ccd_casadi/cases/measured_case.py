@@ -28,8 +28,8 @@ from ccd_casadi.cases.sections import (
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.measured import MeasuredResponse, read_frequency_response
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.options import one_line
 from ccd_casadi.support.units import HZ
-from surrogates.options import one_line
 
 MODEL = "measured"
 _TABLES = ("weights", "inner", "controller", "loop")

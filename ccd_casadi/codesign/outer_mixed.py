@@ -6,6 +6,7 @@ x, and the whole inner problem over (ω_S, ω_T) at a θ is held against what th
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -216,7 +217,8 @@ class MixedOuter(Outer):
         end = cast(MixedEnd, end)
         problem, sampler, x = self.problem, self.sampler, end.x
         theta = tuple(float(v) for v in self.theta_of(x))
-        final = _final(problem, theta, end.design.figures)
+        make = partial(_final, problem, theta, end.design.figures)
+        final = sampler.kept("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
         unsuspended = measure(
             scaled_plant(free, theta), final.controller, final.weights, gamma=UNBOUNDED,
@@ -264,9 +266,7 @@ class MixedOuter(Outer):
         return (*bounds, *active_constraints(problem.inner, figures), *extra)
 
 
-def _final(
-    problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures
-) -> Design:
+def _final(problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures) -> Design:
     """The synthesis that is handed out, in SI and certified again there."""
     plant = scaled_plant(problem, theta)
     made = synthesise(

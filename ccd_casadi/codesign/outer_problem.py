@@ -16,10 +16,10 @@ import numpy as np
 from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
+from ccd_casadi.optim.ipopt import end_points
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from surrogates import design
-from surrogates.ipopt import end_points
 
 
 @dataclass(frozen=True)

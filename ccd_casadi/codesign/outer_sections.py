@@ -6,6 +6,7 @@ what they find joins, and the outer problem is solved again.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -13,25 +14,23 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.full_order import full_order_beside
+from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_polish import polish_sections
-from ccd_casadi.codesign.sections_races import Raced, raced_at, seeded_and_prepared, teller
+from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
-from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, joined
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
@@ -46,14 +45,13 @@ BETTER = 1e-3  # relative: what a race at the end has to gain to be worth anothe
 
 @dataclass(frozen=True)
 class SectionsEnd(End):
-    """With the sampler of the problem that has it, its design and that one's gradients, a race
-    there, the worst plant, and those to add."""
+    """With the sampler of the problem that has it, its value and that one's design and gradients,
+    a race there, the worst plant, and those to add."""
 
     asked: Sampler
     best: BandwidthSample
-    design: SectionsDesign
-    envelope: Envelope | None
-    raced: Raced
+    found: SectionsValue
+    raced: SectionsValue
     worst: Excess
     members: tuple[Member, ...]
 
@@ -97,15 +95,15 @@ class SectionsOuter(ThetaOuter):
         with self.sampler.spent.on("polish"):
             asked, best = polish_sections(self.sampler, self.theta_of(x))
         problem, theta = asked.problem, best.theta
-        found = sections_value(problem, theta)
+        found = value_at(asked, theta)
         raced = raced_at(asked, theta)
         tell = teller("at the end", asked.quiet)
         worst, members = worst_members(problem, theta, found.design, 0, tell)
-        gap = problem.figure.gain(raced.value, best.value) if raced.certified else 0.0
+        gap = problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
         return SectionsEnd(
             np.array(theta), best.value, objective_of(problem, best),
-            theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found.design,
-            found.envelope, raced, worst, members,
+            theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found, raced,
+            worst, members,
         )  # fmt: skip
 
     def joined(self, end: End) -> "SectionsOuter | None":
@@ -113,7 +111,7 @@ class SectionsOuter(ThetaOuter):
         better = end.gap > BETTER
         if not (better or end.members):
             return None
-        kappa = np.array(end.raced.kappa) if better else end.design.kappa
+        kappa = (end.raced if better else end.found).design.kappa
         trace = self.sampler.trace
         if end.members:  # what was found for fewer plants is worth nothing on these
             trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
@@ -121,14 +119,15 @@ class SectionsOuter(ThetaOuter):
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
-        asked, best, made, worst = end.asked, end.best, end.design, end.worst
+        asked, best, made, worst = end.asked, end.best, end.found.design, end.worst
         problem = asked.problem
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
-        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.envelope)
+        kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
-            beside = full_order_beside(problem, best.theta, made)
+            make = partial(full_order_beside, problem, best.theta, made)
+            beside = asked.kept("full order", best.theta, Beside, make)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -153,4 +152,4 @@ class SectionsOuter(ThetaOuter):
 
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]
-        return sections_responses(self.problem, sample, sections_value(self.problem, sample.theta))
+        return sections_responses(self.problem, sample, value_at(self.sampler, sample.theta))

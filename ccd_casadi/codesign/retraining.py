@@ -1,231 +1,239 @@
-"""The truth of a run folder as `surrogates.retrain` asks for it (entry point "ccd_casadi").
+"""The loop of a retraining job: fit, predict the optimum, sample the truth where it helps most.
 
-Lifted (and direct): x = (θ, ln ω_S, ln ω_T), y = (ω_b, ln‖S‖∞, ln σ_max(S(jω_low))) with gradients.
-Nested: x = θ, y = v(θ), what J counts. A controller of fixed structure: the same, with gradients
-where lifted, and by the anchors and the plant set that the run ended with.
+What to do next follows from the samples alone: a job that was killed goes on from what is known,
+and one that has nothing left to do does nothing.
 """
 
-import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+import math
+import sys
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from time import perf_counter
-from typing import Any
 
-import casadi as ca
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from ccd_casadi.cases.case import load_case
-from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.cases.sections import Case
-from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.lifted import OUTPUTS
-from ccd_casadi.codesign.outer import Outer
-from ccd_casadi.codesign.outer_problem import unmet_constraint
-from ccd_casadi.codesign.run import outer_of, require_solvable
-from ccd_casadi.codesign.run_files import write_run
-from ccd_casadi.codesign.search import concluded_at
-from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.stored import stored_designs, stored_thetas
-from ccd_casadi.inner_problem.constraints import constraint_sizes
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.sampling.cluster import pool
-from ccd_casadi.sampling.keys import problem_hash
-from ccd_casadi.sampling.sampler import Sampler
-from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
-from ccd_casadi.sampling.spent import spent_entry
-from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.codesign.acquisition import (
+    NEAR,
+    Posterior,
+    choose,
+    distances,
+    maximiser,
+    objective_and_violation,
+    predicted_optimum,
+)
+from ccd_casadi.codesign.truth import Observations, Truth
+from ccd_casadi.codesign.versions import (
+    keep_version,
+    load_version,
+    only_job,
+    publish,
+    version_names,
+)
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError, UserError
-from ccd_casadi.support.process_pool import PATIENCE
-from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import WorkerLost
-from surrogates import GaussianProcess
-from surrogates.truth import NAMES, Observations, TruthError, TruthInterrupted
+from ccd_casadi.support.errors import UserError
+from surrogates import GaussianProcess, fit_outputs, sobol
+from surrogates.gaussian_process import loo_errors
 
-PageWriter = Callable[[Path, Case, CoDesignProblem, Solution], object]
-CLOSE = 1e-2  # of the box: a verified design so near is where the next verification starts
-
-
-@contextmanager
-def open_run(
-    folder: Path,
-    *,
-    tolerance: float | None,
-    workers: int,
-    seed: int,
-    quiet: bool,
-    user_code: bool = True,
-    scheduler: str | None = None,
-    write_page: PageWriter,
-) -> Iterator["CoDesignTruth"]:
-    """The truth of a run folder; `write_page` draws its report. Raises TruthError."""
-    with _worded(), threadpool_limits(limits=1), permit_user_code(user_code):
-        case = load_case(folder / "case.toml")
-        problem = problem_of(case)
-        require_solvable(problem)
-        formulation = _formulation(folder)
-        with (
-            pool(scheduler, workers, PATIENCE) as evaluators,
-            SampleStore(folder / "samples.sqlite") as store,
-        ):
-            outer = outer_of(Sampler(problem, store, evaluators, quiet=quiet))
-            outer = outer.continued(folder, seed)
-            yield CoDesignTruth(folder, case, outer, formulation, write_page, tolerance, seed)
+PER_INPUT = 3  # samples an input that a first fit is worth
+DOUBLINGS = 4  # of the first design, where the truth has no value at most points
+PASSES = 4  # fits after a verification, which itself yields samples
+STARTS = 16  # of IPOPT, besides the best sample
+SETTLED = 0.1  # share of the tolerance below which a change of J counts as none
+SAME = 1e-9  # of the box: samples that a version was fitted to
+CONVERGED = "converged"
 
 
-class CoDesignTruth:
-    """One run's problem behind its store; see `surrogates.truth.Truth`."""
+@dataclass(frozen=True)
+class Settings:
+    """budget: evaluations that retraining may add to the run folder, over all its jobs.
 
-    def __init__(
-        self,
-        folder: Path,
-        case: Case,
-        outer: Outer,
-        formulation: str,
-        write_page: PageWriter,
-        tolerance: float | None = None,
-        seed: int = 0,
-    ) -> None:
-        problem = outer.problem
-        self.folder, self.case, self.outer, self.seed = folder, case, outer, seed
-        self.sampler = outer.sampler
-        self.write_page = write_page
-        self.formulation = formulation
-        beside = () if formulation == "nested" else outer.beside_theta
-        self.over_theta = not beside  # x = θ
-        self.names = (*problem.names, *beside)
-        more = () if self.over_theta else OUTPUTS[1 : 1 + len(problem.inner.bounds)]
-        self.outputs = (problem.figure.key, *more)
-        self.lower, self.upper = box(problem) if self.over_theta else outer.bounds
-        self.tolerance = case.outer.tolerance if tolerance is None else tolerance
-        self.objective, self.constraints = _functions(problem, len(self.lower), len(self.outputs))
-        form = "nested" if formulation == "nested" else "lifted"  # direct has no surrogates
-        self.describe = {"formulation": form, "outputs": list(self.outputs)}
+    batch: points a round; explore: the share of them at the largest deviation.
+    """
 
-    @property
-    def spent(self) -> int:
-        """Syntheses in the store, of whatever job."""
-        return self.sampler.store.count(self.sampler.hash)
+    budget: int = 500
+    batch: int = 4
+    explore: float = 0.25
+    seed: int = 0
 
-    def samples(self) -> Observations:
-        """What the store holds inside the box, oldest first."""
-        problem = self.sampler.problem
-        if self.over_theta:
-            known = stored_thetas(self.sampler.store, problem)
-            return self._values(self.sampler.bandwidths(known) if len(known) else [])
-        designs = stored_designs(self.sampler.store, problem)
-        rows = [quantity_sample(tuple(x), row, problem.inner) for x, row in designs]
-        return self._quantities(rows)
 
-    def evaluate(self, X: Array) -> Observations:
-        """New syntheses, through the store."""
-        if self.over_theta:
-            return self._values(self.sampler.bandwidths(X, "retraining"))
-        return self._quantities(self.sampler.quantities(X, "retraining"))
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended; spent: evaluations since the first job on this run folder began."""
 
-    def finish(
-        self, x: Array | None, surrogates: Sequence[GaussianProcess], version: str | None
-    ) -> str:
-        """Verify as `solve` does and rewrite the run folder, unless this was done already."""
-        began = perf_counter()
-        mark = {"case": problem_hash({"text": case_to_toml(self.case)}), "version": version,
-                "tolerance": self.tolerance}  # fmt: skip
-        before = self._before(mark)
-        if before is not None and before["retraining"] == mark | {"x": before["retraining"]["x"]}:
-            return str(before["status"])
-        start = None if x is None else self._start(x, before)
-        processes, outer = tuple(surrogates), self.outer
-        outcome = FormulationResult(start, None, (), processes, None, True, "")
-        if start is None:
-            words = unmet_constraint(self.sampler.problem, self.case.outer.starts, self.seed)
-            outcome = replace(outcome, message=words)
-            if not words:
-                outcome = outer.rescued(outcome, self.seed)
-        solution = concluded_at(
-            outer, outcome, self.formulation, self.tolerance, self.seed, began
+    status: str
+    reason: str
+    rounds: int
+    spent: int
+    version: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class Iteration:
+    """A fit: near has the predicted optimum, if any, and the best sample; x is what to verify."""
+
+    posterior: Posterior
+    version: str
+    near: list[Array]
+    x: Array | None
+    converged: bool
+    words: str
+
+
+def retrain(folder: Path, truth: Truth, settings: Settings, quiet: bool = True) -> Outcome:
+    """Run a job to its end: converged, out of budget, or without a feasible design.
+
+    Raises UserError, and what the truth raises; the same call resumes.
+    """
+    with only_job(folder, truth.spent) as base:
+        rounds = passes = 0
+        while True:
+            before = truth.spent
+            iteration, batch, reason = decide(folder, truth, settings, base)
+            if not reason:
+                truth.evaluate(batch)
+                rounds += 1
+                if not quiet:
+                    first = f"first design, {len(batch)} points"
+                    words = first if iteration is None else iteration.words
+                    print(f"round {rounds}: {words}", file=sys.stderr, flush=True)
+                continue
+            if iteration is None:
+                status, name = truth.finish(None, (), None), None
+            else:
+                name = iteration.version
+                status = truth.finish(iteration.x, iteration.posterior.surrogates, name)
+                publish(folder)
+            passes += 1
+            # a verification that found samples: those are fitted too
+            if truth.spent == before or passes == PASSES or reason != CONVERGED:
+                return Outcome(status, reason, rounds, truth.spent - base, name)
+
+
+def decide(
+    folder: Path, truth: Truth, settings: Settings, base: int
+) -> tuple[Iteration | None, Array, str]:
+    """What the samples leave to be done: a batch (q, d) to evaluate, or the reason to end.
+
+    `base`: evaluations before the first job. Raises UserError where the budget is too small
+    for a first fit.
+    """
+    seen = truth.samples()
+    observed, failed = thinned(truth, seen)
+    cost = truth.spent / max(len(seen.X), 1) or 1.0
+    left = settings.budget - (truth.spent - base)
+    room = min(settings.batch, max(math.ceil(left / cost), 0))
+    missing = first_design(truth, seen, observed, settings.seed)
+    if len(missing) and not room:
+        raise UserError(
+            f"--budget {settings.budget} leaves {len(observed.X)} samples, too few for a "
+            "first fit; give a larger one"
         )
-        result = solution.result
-        result |= spent_entry({"store": self.spent})
-        end = None if solution.verified is None else solution.verified.point
-        result["retraining"] = mark | {"x": None if end is None else end.tolist()}
-        write_run(self.folder, self.case, solution)
-        self.write_page(self.folder, self.case, self.sampler.problem, solution)
-        return str(result["status"])
-
-    def _before(self, mark: dict[str, Any]) -> dict[str, Any] | None:
-        """The result of an earlier verification of the same case."""
-        try:
-            found = json.loads((self.folder / "result.json").read_text())
-            known = found["retraining"]["case"] == mark["case"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return None
-        return found if known and (self.folder / "report.html").exists() else None
-
-    def _start(self, x: Array, before: dict[str, Any] | None) -> Array:
-        """Where to verify: a point of the outer problem, or the verified design that is by it."""
-        x = self.outer.point_at(x) if self.over_theta else x
-        if before is not None and before["retraining"]["x"] is not None:
-            old = np.array(before["retraining"]["x"])
-            lower, upper = self.outer.bounds
-            if np.abs((old - x) / (upper - lower)).max() <= CLOSE:
-                return old
-        return x
-
-    def _quantities(self, samples: list[QuantitySample]) -> Observations:
-        d, k = len(self.lower), len(self.outputs)
-        X = np.array([s.x for s in samples]).reshape(-1, d)
-        Y = np.array([s.values[:-1] for s in samples]).reshape(-1, k)
-        dY = np.array([s.gradients[:-1] for s in samples]).reshape(-1, k, d)
-        Y[[not s.certified for s in samples]] = np.nan
-        return Observations(X, Y, dY)
-
-    def _values(self, samples: list[BandwidthSample]) -> Observations:
-        d = len(self.lower)
-        X = np.array([s.theta for s in samples]).reshape(-1, d)
-        Y = np.array([[s.value] for s in samples]).reshape(-1, 1)
-        if self.formulation == "nested":
-            return Observations(X, Y)
-        dY = np.array([s.gradient for s in samples]).reshape(-1, 1, d)
-        return Observations(X, Y, dY)
+    if len(missing):
+        return None, missing[:room], ""
+    if len(observed.X) < len(truth.lower) + 2:
+        return None, missing, "too few points where the truth has a value"
+    iteration = iterate(folder, truth, observed, failed, settings.seed)
+    if iteration.converged or not room:
+        return iteration, missing, CONVERGED if iteration.converged else "budget"
+    explore, seed = round(settings.explore * room), settings.seed + len(observed.X)
+    batch = choose(iteration.posterior, iteration.near, room, explore, seed)
+    return iteration, batch, "" if len(batch) else "nothing is left to sample"
 
 
-def _functions(problem: CoDesignProblem, d: int, k: int) -> tuple[ca.Function, ca.Function]:
-    """J(x, y) = w1 f(θ) + w2 v, and g(x, y): ln of the bounds where lifted, and λ(θ)."""
-    x, y = ca.MX.sym("x", d), ca.MX.sym("y", k)
-    f, lam = plant_of(problem).hardware(x[: len(problem.names)])
-    g = lam / ca.DM(constraint_sizes(problem)) if lam.numel() else ca.MX(0, 1)
-    if k > 1:
-        g = ca.vertcat(y[1:] - problem.inner.levels, g)
-    J = ca.Function("objective", [x, y], [problem.w1 * f + problem.w2 * y[0]])
-    return J, ca.Function("constraints", [x, y], [g])
+def thinned(truth: Truth, seen: Observations) -> tuple[Observations, Array]:
+    """What to fit, in an order of its own, and the points (f, d) without a value.
+
+    Of samples nearer than NEAR the first counts: more would only spoil the conditioning.
+    """
+    known = seen.rows(seen.known)
+    kept: list[int] = []
+    for row in range(len(known.X)):
+        if distances(truth, known.X[row : row + 1], known.X[kept])[0] > NEAR:
+            kept.append(row)
+    rows = np.array(kept, dtype=int)
+    order = np.lexsort(known.X[rows].T[::-1]) if kept else rows
+    return known.rows(rows[order]), seen.X[~seen.known]
 
 
-def _formulation(folder: Path) -> str:
-    """As truth.json says, else lifted."""
-    try:
-        found = json.loads((folder / NAMES).read_text())
-    except FileNotFoundError:
-        return "lifted"
-    formulation = found.get("formulation", "lifted")
-    if formulation not in ("nested", "lifted", "direct"):
-        raise TruthError(
-            f"{folder / NAMES}: formulation: {formulation!r:.60} is unknown; give nested or lifted"
+def first_design(truth: Truth, seen: Observations, observed: Observations, seed: int) -> Array:
+    """Points (m, d) that a first fit still misses: of a Sobol set, doubled while most fail."""
+    least = PER_INPUT * len(truth.lower)
+    for doubling in range(DOUBLINGS if len(observed.X) < least else 0):
+        points = sobol(truth.lower, truth.upper, least << doubling, seed)
+        missing = points[distances(truth, points, seen.X) > NEAR]
+        if len(missing):
+            return missing
+    return np.empty((0, len(truth.lower)))
+
+
+def iterate(
+    folder: Path, truth: Truth, observed: Observations, failed: Array, seed: int
+) -> Iteration:
+    """Fit all that is observed (the newest version where it was fitted to that), and optimise.
+
+    Converged: prediction and truth agree at an optimum that nothing promises to better.
+    """
+    lower, upper, tolerance = truth.lower, truth.upper, truth.tolerance
+    name, surrogates = _fitted(folder, truth, observed, seed)
+    posterior = Posterior(truth, surrogates, observed, failed)
+    J, violation = posterior.values()
+    best = posterior.incumbent()
+    first = observed.X[int(np.argmin(violation)) if best is None else best]
+    optimum = predicted_optimum(posterior, np.vstack([first, sobol(lower, upper, STARTS, seed)]))
+    settled, at, x = False, best, None if best is None else first
+    if optimum is not None:
+        away = np.abs((observed.X - optimum[0]) / (upper - lower)).max(axis=1)
+        settled = bool(away.min() <= NEAR)
+        if settled or best is None:
+            at, x = int(np.argmin(away)), optimum[0]
+        if best is not None:
+            settled = settled or bool(abs(optimum[1] / J[best] - 1.0) <= SETTLED * tolerance)
+    true, error = (np.nan, np.inf) if at is None else (float(J[at]), _error_at(posterior, at))
+    near = [first] if optimum is None else [optimum[0], first]
+    gain = maximiser(posterior, False, near, seed)[1]
+    predicted = None if optimum is None else optimum[1]
+    if name is None:
+        name = keep_version(
+            folder,
+            surrogates,
+            truth.describe,
+            samples=len(observed.X),
+            errors={n: asdict(p.loo) for n, p in zip(truth.outputs, surrogates, strict=True)},
+            at_optimum=error if np.isfinite(error) else None,
+            objective=predicted,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
         )
-    return str(formulation)
+    words = (
+        f"{len(observed.X)} samples, predicted J "
+        f"{'none' if predicted is None else f'{predicted:.6g}'}, "
+        f"best true {true:.6g}, error {error:.1e}, improvement {gain:.1e}"
+    )
+    converged = settled and error <= tolerance and gain <= SETTLED * tolerance * abs(true)
+    return Iteration(posterior, name, near, x, bool(converged), words)
 
 
-@contextmanager
-def _worded() -> Iterator[None]:
-    """Our errors as those that a retraining job knows."""
-    try:
-        yield
-    except PlantError as error:
-        raise TruthError(f"case.toml: plant: {error}") from error
-    except UserError as error:
-        raise TruthError(str(error)) from error
-    except WorkerLost as error:
-        raise TruthInterrupted(str(error)) from error
+def _fitted(
+    folder: Path, truth: Truth, observed: Observations, seed: int
+) -> tuple[str | None, tuple[GaussianProcess, ...]]:
+    """The newest version where these samples are its own, else a new fit without a name."""
+    lower, upper = truth.lower, truth.upper
+    name = next(reversed(version_names(folder)), None)
+    if name is not None:
+        surrogates = load_version(folder, name)
+        unit, X = (observed.X - lower) / (upper - lower), surrogates[0].X
+        if X.shape == unit.shape and np.abs(X - unit).max() <= SAME:
+            return name, surrogates
+    return None, fit_outputs(
+        observed.X, observed.Y, observed.dY, lower=lower, upper=upper, seed=seed, starts=2
+    )
+
+
+def _error_at(posterior: Posterior, row: int) -> float:
+    """The larger of |ΔJ| / |J| and |Δg| between an observation and its prediction without it."""
+    seen = posterior.observed.rows(np.array([row]))
+    residuals = [loo_errors(process)[0][row] for process in posterior.surrogates]
+    left_out = replace(seen, Y=seen.Y - np.array(residuals))
+    J, g = objective_and_violation(posterior.truth, seen.X, seen.Y)
+    J_out, g_out = objective_and_violation(posterior.truth, seen.X, left_out.Y)
+    off = float(abs(J_out[0] - J[0]) / max(abs(J[0]), 1e-300))
+    return max(off, float(abs(g_out[0] - g[0])) if np.isfinite(g[0]) else 0.0)

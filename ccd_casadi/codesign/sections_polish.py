@@ -5,12 +5,13 @@ from contextlib import suppress
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
+from ccd_casadi.codesign.sections_races import value_at
 from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.problem import box
+from ccd_casadi.inner_problem.sections_bandwidth import joined
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -37,7 +38,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     if theta_kkt(problem, best).stationarity > STATIONARY:
         truth, best = by_pieces(truth, best)
     sampler, problem = truth.sampler, truth.sampler.problem
-    if theta_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(problem, best):
+    if theta_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(sampler, best):
         return sampler, best
     program = nested_program(problem, truth)
     program = type(program)(**{**vars(program), "exact_hessian": False})
@@ -46,10 +47,10 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))
 
 
-def _on_a_kink(problem: CoDesignProblem, best: BandwidthSample) -> bool:
+def _on_a_kink(sampler: Sampler, best: BandwidthSample) -> bool:
     """Whether a sample is optimal to first order by the gradients of several sides of it."""
-    envelope = sections_value(problem, best.theta).envelope
-    found = theta_kkt(problem, best, envelope=envelope)
+    envelope = value_at(sampler, best.theta).envelope
+    found = theta_kkt(sampler.problem, best, envelope=envelope)
     return found.kink is not None and found.stationarity <= SMOOTH
 
 

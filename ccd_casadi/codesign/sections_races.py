@@ -9,12 +9,20 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import isfinite
+from functools import partial
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, race, valued, with_range
+from ccd_casadi.inner_problem.sections_bandwidth import (
+    SectionsValue,
+    prepared,
+    race,
+    sections_value,
+    valued,
+    with_range,
+)
 from ccd_casadi.inner_problem.sections_error import least_from
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
+from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -22,18 +30,13 @@ from ccd_casadi.support.process_pool import Pool
 
 
 @dataclass(frozen=True)
-class Raced:
-    """What a full race at the final θ found; κ in SI, rad/s; optima as (rad/s, count).
+class Seeds:
+    """Anchors (κ in SI, rad/s) and members that a race at the start found; `words` why none."""
 
-    `value` is what J counts: that bandwidth, or the least RMS error (m) from there, and κ that of
-    its controller.
-    """
-
-    certified: bool
-    bandwidth: float
-    kappa: tuple[float, ...]
-    optima: tuple[tuple[float, int], ...]
-    value: float
+    anchors: tuple[tuple[float, ...], ...]
+    members: tuple[Member, ...]
+    error_anchors: tuple[tuple[float, ...], ...]
+    words: str
 
 
 def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
@@ -52,61 +55,42 @@ def seeded_and_prepared(
     Second, in words, why there are no anchors; empty where there are.
     """
     problem = _seeded(problem, seed)
-    key = sample_key(problem_hash(problem.identity()), problem.start, 0.0, 0.0)
-    stored = store.get_result(key)
-    if stored is None:
+    owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
+
+    def found() -> Seeds:
         tell = teller("race at the start", quiet)
-        found, made = prepared(problem, tell, workers)
-        found, made = least_from(found, problem.start, made, tell)
-        sections = sections_of_problem(found)
-        stored = {
-            "anchors": [list(a) for a in sections.anchors],
-            "members": [[option, list(point)] for option, point in sections.members],
-            "words": "" if made.certified else made.words,
-            "error_anchors": [list(a) for a in sections.error_anchors],
-        }
-        owner = problem_hash({"race": problem_hash(problem.identity())})
-        store.put_unit([], (key, owner, problem.start, stored), None)
-    try:
-        anchors = tuple(tuple(map(float, a)) for a in stored["anchors"])
-        members = tuple((int(o), tuple(map(float, p))) for o, p in stored["members"])
-        words = str(stored["words"])
-        slower = tuple(tuple(map(float, a)) for a in stored.get("error_anchors", ()))
-    except (KeyError, TypeError, ValueError) as error:
-        raise store.damaged() from error
+        anchored, made = prepared(problem, tell, workers)
+        anchored, made = least_from(anchored, problem.start, made, tell)
+        own = sections_of_problem(anchored)
+        words = "" if made.certified else made.words
+        return Seeds(own.anchors, own.members, own.error_anchors, words)
+
+    key = sample_key(owner, problem.start, 0.0, 0.0)
+    seeds = store.kept(key, owner, problem.start, Seeds, found)
     sections = replace(
-        sections_of_problem(problem), anchors=anchors, members=members, error_anchors=slower
-    )
-    return replace(problem, controller=sections), words
+        sections_of_problem(problem), anchors=seeds.anchors, members=seeds.members,
+        error_anchors=seeds.error_anchors,
+    )  # fmt: skip
+    return replace(problem, controller=sections), seeds.words
 
 
-def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> Raced:
-    """A full race at θ, from the store where it was run before; counted."""
-    problem, store = sampler.problem, sampler.store
-    owner = problem_hash({"race": sampler.hash})
-    key = sample_key(owner, theta, 0.0, 0.0)
-    sampler.raced(key)
-    stored = store.get_result(key)
-    if stored is None:
+def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
+    """A full race at θ with all its optima, from the store where it was run before; counted."""
+    problem = sampler.problem
+
+    def raced() -> SectionsValue:
         made = race(problem, theta, teller("race at the end", sampler.quiet), sampler.workers)
         found = valued(problem, theta, plants_of(problem, theta), made, 1)
-        made = replace(found.design, local_optima=made.local_optima)
-        stored = {
-            "error": found.error if isfinite(found.error) else None,
-            "certified": made.certified,
-            "bandwidth": float(made.bandwidth) if made.certified else 0.0,
-            "kappa": [float(v) for v in made.kappa] if made.certified else [],
-            "optima": [[item.bandwidth, item.count] for item in made.local_optima],
-        }
-        store.put_unit([], (key, owner, theta, stored), None)
-    try:
-        optima = tuple((float(value), int(count)) for value, count in stored["optima"])
-        kappa = tuple(map(float, stored["kappa"]))
-        certified, bandwidth = bool(stored["certified"]), float(stored["bandwidth"])
-        value = bandwidth if stored.get("error") is None else float(stored["error"])
-        return Raced(certified, bandwidth, kappa, optima, value)
-    except (KeyError, TypeError, ValueError) as error:
-        raise store.damaged() from error
+        return replace(found, design=replace(found.design, local_optima=made.local_optima))
+
+    sampler.raced(sample_key(sampler.hash, theta, 0.0, 0.0))
+    return sampler.kept("race", theta, SectionsValue, raced)
+
+
+def value_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
+    """The value at θ with its design and envelope, from the store where it was made before."""
+    make = partial(sections_value, sampler.problem, theta)
+    return sampler.kept("value", theta, SectionsValue, make)
 
 
 def teller(label: str, quiet: bool) -> Callable[[str], None]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import lifted_bounds
+from ccd_casadi.codesign.versions import load_version
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.rows import Sample
@@ -14,7 +15,6 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from surrogates import GaussianProcess, SurrogateFileError
-from surrogates.versions import load_version
 
 SAME = 1e-9  # of the box: the rounding of a point that went through a surrogate
 

@@ -16,7 +16,6 @@ from ccd_casadi.codesign.sections_entries import (
     proof_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.sections_races import Raced
 from ccd_casadi.codesign.verdict import Line, State, look_words, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
@@ -26,6 +25,7 @@ from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ, counted
@@ -41,7 +41,7 @@ class VerifiedSections(Verified):
     """
 
     design: SectionsDesign
-    raced: Raced
+    raced: SectionsValue
     wide: Certificate
     checked: int
     proof: Proof
@@ -88,8 +88,8 @@ class VerifiedSections(Verified):
         found: dict[str, Any] = {
             "surrogate_bandwidth_hz": predicted / HZ if sections.figure is BANDWIDTH else None,
             "race": [
-                {"bandwidth_hz": value / HZ, "searches": count}
-                for value, count in self.raced.optima
+                {"bandwidth_hz": optimum.bandwidth / HZ, "searches": optimum.count}
+                for optimum in self.raced.design.local_optima
             ],
             "rounds": self.rounds,
             "anchors": [list(kappa) for kappa in sections.anchors],
@@ -194,8 +194,8 @@ class VerifiedSections(Verified):
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
         known, figures = look_words(starts, optima, look)
-        found, of = [value / HZ for value, _ in self.raced.optima], ""
-        if self.problem.figure is not BANDWIDTH:
+        found, of = [optimum.bandwidth / HZ for optimum in self.raced.design.local_optima], ""
+        if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"
         raced = ", ".join(f"{value:.2f}" for value in found)
         words = f"a full race at this theta ended at {raced} Hz{of}; {known}"

@@ -57,23 +57,17 @@ def simulate(
     return errors, (x, z)
 
 
-def measure_sensitivity(
-    plant: StateSpace, controller: StateSpace, bandwidth: float, seed: int
-) -> MeasuredSensitivity:
-    """S from a random-phase multisine on one reference after the other; ω_b to expect in rad/s.
-
-    All lines up to half the sampling rate, `LINES` of them up to ω_b, repeated until steady.
-    """
-    return measure_set([plant], controller, bandwidth, seed)[0]
-
-
 def measure_set(
     plants: Sequence[StateSpace],
     controller: StateSpace,
     bandwidth: float,
     seed: int,
 ) -> tuple[MeasuredSensitivity, ...]:
-    """The same on several plants, each with a copy of the controller, run side by side."""
+    """S from a random-phase multisine on one reference after the other; ω_b to expect in rad/s.
+
+    All lines up to half the sampling rate, `LINES` of them up to ω_b, repeated until steady, on
+    each plant with a copy of the controller, all run side by side.
+    """
     count, p, T = len(plants), len(plants[0].C), plants[0].period
     plant = _beside(plants)
     controller = _beside([controller] * count)

@@ -19,7 +19,7 @@ from ccd_casadi.explorer.session import Session
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.user_code import permit_user_code
-from ccd_casadi.support.worker_process import end_with_parent
+from ccd_casadi.support.worker_process import become_worker
 
 BEHIND = 10  # niceness of what fills the box
 
@@ -31,10 +31,9 @@ def _prepare(user_code: bool, behind: bool) -> None:
     """In a worker: one BLAS thread, Ctrl-C left to the parent, and no life beyond it."""
     if behind and hasattr(os, "nice"):
         os.nice(BEHIND)  # the page comes first
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(limits=1)
     permit_user_code(user_code).__enter__()
-    end_with_parent()
+    become_worker()
 
 
 class Background:

@@ -82,29 +82,22 @@ def judged_look(problem: CoDesignProblem, knobs: Knobs, kappa: Array, how: How) 
     standing, reason = _standing(found)
     if standing is Standing.KEPT and broken:
         standing, reason = Standing.MISSED, f"the constraint {broken[0]} on θ is not met"
-    return Look(
-        knobs=knobs,
-        problem=problem,
-        elements=elements,
-        modal=modal_plant(elements.system, problem.suspension),
-        plant=scaled_system(problem, elements.system),
-        weights=problem.weights,
-        figures=_figures(found),
-        controller=controller,
-        how=how,
-        standing=standing,
-        reason=reason,
-        cost=cost,
-        active=(),
-        seconds=perf_counter() - began,
-        kappa=kappa,
-    )
+    look = _look(problem, knobs, elements, cost, reason)
+    return replace(
+        look, figures=_figures(found), controller=controller, how=how, standing=standing,
+        kappa=kappa, seconds=perf_counter() - began,
+    )  # fmt: skip
 
 
 def empty_look(problem: CoDesignProblem, knobs: Knobs, elements: Elements, words: str) -> Look:
     """A place without a controller yet."""
+    return _look(problem, knobs, elements, hardware_at(problem, knobs.theta)[0], words)
+
+
+def _look(
+    problem: CoDesignProblem, knobs: Knobs, elements: Elements, cost: float, words: str
+) -> Look:
     nan = float("nan")
-    cost, _ = hardware_at(problem, knobs.theta)
     return Look(
         knobs=knobs,
         problem=problem,

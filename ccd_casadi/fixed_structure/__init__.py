@@ -1,8 +1,5 @@
 """Controllers of fixed structure for sets of plants, continuous or sampled."""
 
-from ccd_casadi.fixed_structure.bandwidth_gradient import (
-    bandwidth_and_gradient as bandwidth_and_gradient,
-)
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.bounds import ChannelBounds as ChannelBounds
 from ccd_casadi.fixed_structure.bounds import ShapeEnd as ShapeEnd

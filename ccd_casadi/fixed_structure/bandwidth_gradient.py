@@ -39,21 +39,6 @@ def bandwidth_envelope(
     return None if envelope is None else envelope.times(design.bandwidth)
 
 
-def bandwidth_and_gradient(
-    plants: Sequence[ScaledPlant],
-    bounds: Bounds,
-    design: SectionsDesign,
-    sampling: Sampling | None = None,
-) -> tuple[float, Array]:
-    """ω_b* in rad/s and dω_b*/dθ at a design that is optimal on these plants (envelope theorem).
-
-    Of one side where ω_b* has a kink; NaN where the point is not stationary to 1e-3.
-    """
-    envelope = bandwidth_envelope(plants, bounds, design, sampling)
-    unknown = np.full(len(plants[0].dA), np.nan)
-    return design.bandwidth, unknown if envelope is None else envelope.gradient
-
-
 def _at_the_bounds(problem: LoopProblem, kappa: Array, tau: float) -> Point:
     """The point with the largest ω_b of this κ; the judge's is lower, by its own grid."""
     assessment = assess(problem, kappa, tau)

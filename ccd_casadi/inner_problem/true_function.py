@@ -9,6 +9,7 @@ makes IPOPT shorten its step. Hessians are not available: use a quasi-Newton met
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -36,11 +37,11 @@ class TrueQuantities(VectorCallback):
     def __init__(
         self,
         problem: CoDesignProblem,
-        record: Callable[[Array, Sensitivities], None] | None = None,
+        kept: Callable[[Array, Callable[[], Sensitivities]], Sensitivities] | None = None,
     ) -> None:
-        """`record` is told every true synthesis (x, design)."""
+        """`kept(x, make)` gives the design at x from where designs are kept, or makes it."""
         self.problem = problem
-        self.record = record
+        self.kept = kept
         self.designs: dict[bytes, Sensitivities] = {}
         count = len(problem.names) + 2
         self.size = 2 + len(problem.inner.bounds)
@@ -56,10 +57,8 @@ class TrueQuantities(VectorCallback):
             # exp(log(bound)) may miss the bound by a rounding error
             omega_S = float(np.clip(omega[0], *inner.omega_S))
             omega_T = float(np.clip(omega[1], *inner.omega_T))
-            design = true_design(self.problem, tuple(x[:-2]), omega_S, omega_T)
-            self.designs[key] = design
-            if self.record is not None:
-                self.record(x, design)
+            make = partial(true_design, self.problem, tuple(x[:-2]), omega_S, omega_T)
+            self.designs[key] = make() if self.kept is None else self.kept(x, make)
         return self.designs[key]
 
     def values(self, x: Array) -> Array:

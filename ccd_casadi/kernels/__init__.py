@@ -9,11 +9,14 @@ import os
 from pathlib import Path
 
 
+def sources() -> str:
+    """Names, sizes and times of all sources of the kernels, a line each."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return "\n".join(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in files)
+
+
 def _drop_stale_cache() -> None:
-    here = Path(__file__).parent
-    cache = here / "__pycache__"
-    sources = sorted(here.glob("*.py"))
-    now = "\n".join(f"{f.name} {f.stat().st_size} {f.stat().st_mtime_ns}" for f in sources)
+    cache, now = Path(__file__).parent / "__pycache__", sources()
     stamp = cache / "sources.stamp"
     with contextlib.suppress(OSError):
         if stamp.read_text() == now:

@@ -26,8 +26,9 @@ from llvmlite import binding
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
+from ccd_casadi.kernels import sources
+from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.progress import Progress
-from surrogates.options import usable_cores
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate", "rows", "curvature")
@@ -102,11 +103,11 @@ def ensure_compiled() -> None:
     """
     kernels = _kernels()
     folder = Path(next(iter(kernels.values())).stats.cache_path)
-    stamp = folder / "compiled.stamp"
-    if _read(stamp) == _state():
+    stamp, state = folder / "compiled.stamp", _state()  # before: sources may change meanwhile
+    if _read(stamp) == state:
         return
     with _alone(folder / "compiled.lock"):
-        if _read(stamp) == _state():  # another process has done it
+        if _read(stamp) == state:  # another process has done it
             return
         count = min(len(PARTS), usable_cores())
         _say(
@@ -121,44 +122,36 @@ def ensure_compiled() -> None:
         if done:
             with contextlib.suppress(OSError):
                 draft = stamp.with_suffix(f".{os.getpid()}")
-                draft.write_text(_state())
+                draft.write_text(state)
                 draft.replace(stamp)
 
 
 def _compile(kernels: dict[str, Any], count: int) -> bool:
-    """Run the parts on `count` processes with a bar in percent; whether all ended well."""
+    """Run the parts on `count` processes, with a bar of kernels; whether all ended well."""
     root = str(Path(__file__).parents[PACKAGE.count(".") + 1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
     settings = os.environ | {WORKER: "1", "PYTHONPATH": path}
-    cost = {name: _cost(kernel) for name, kernel in kernels.items()}
-    total, done, shown = sum(cost.values()), 0.0, 0
-    # both ends of the pipe in one place: lines are short, so they do not mix
-    read, write = os.pipe()
-    workers = []
-    try:
-        for first in range(count):
-            # not -m, with which the package would import all that its commands need
-            start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
-            command = [*start, *PARTS[first::count]]
-            workers.append(subprocess.Popen(command, env=settings, stdout=write))
-        os.close(write)
-        write = -1
-        with Progress(100, "compiling kernels, %") as bar, os.fdopen(read) as lines:
-            read = -1
+    left, workers = set(kernels), []
+    # not -m, with which the package would import all that its commands need
+    start = [sys.executable, "-c", f"from {PACKAGE} import compilation as c; c.work()"]
+    read, write = os.pipe()  # one for all: lines are short, so they do not mix
+    with os.fdopen(read) as lines, Progress(len(left), "compiling kernels") as bar:
+        try:
+            with os.fdopen(write, "wb") as theirs:
+                for first in range(count):
+                    command = [*start, *PARTS[first::count]]
+                    workers.append(subprocess.Popen(command, env=settings, stdout=theirs))
             for line in lines:
-                done += cost.pop(line.strip(), 0.0)
-                bar.advance(int(100.0 * done / total) - shown)
-                shown = int(100.0 * done / total)
-            if all(worker.wait() == 0 for worker in workers):
-                bar.advance(100 - shown)  # what was on disk already
-    finally:
-        for worker in workers:
-            worker.kill()
-            worker.wait()
-        for end in (read, write):
-            if end >= 0:
-                os.close(end)
-    return all(worker.returncode == 0 for worker in workers)
+                if line.strip() in left:
+                    left.remove(line.strip())
+                    bar.advance()
+            done = sum(worker.wait() == 0 for worker in workers) == count
+            bar.advance(len(left) if done else 0)  # what was on disk already
+        finally:
+            for worker in workers:
+                worker.kill()
+                worker.wait()
+    return done
 
 
 def _kernels() -> dict[str, Any]:
@@ -178,32 +171,10 @@ def _name(kernel: Any) -> str:
     return f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
 
 
-def _cost(kernel: Any) -> float:
-    """What compiling one costs: its own code, and a third of what LLVM optimises with it anew."""
-    called = _called(kernel, {})
-    return _size(kernel) + sum(_size(other) for other in called.values()) / 3.0
-
-
-def _size(kernel: Any) -> int:
-    return 100 + len(kernel.py_func.__code__.co_code)
-
-
-def _called(kernel: Any, seen: dict[str, Any]) -> dict[str, Any]:
-    """All kernels that one calls, by others too."""
-    for name in kernel.py_func.__code__.co_names:
-        other = kernel.py_func.__globals__.get(name)
-        if isinstance(other, Dispatcher) and _name(other) not in seen:
-            seen[_name(other)] = other
-            _called(other, seen)
-    return seen
-
-
 def _state() -> str:
     """What compiled kernels depend on: sources, versions, processor."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    sources = [f"{file.name} {file.stat().st_size} {file.stat().st_mtime_ns}" for file in files]
     machine = [sys.version, binding.get_host_cpu_name()]
-    return "\n".join([*sources, *machine, *(version(name) for name in ("numba", "llvmlite"))])
+    return "\n".join([sources(), *machine, *(version(name) for name in ("numba", "llvmlite"))])
 
 
 def _read(file: Path) -> str:

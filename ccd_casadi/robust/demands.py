@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass
 
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW, Limits
-from surrogates.options import positive
+from ccd_casadi.support.options import positive
 
 
 @dataclass(frozen=True)

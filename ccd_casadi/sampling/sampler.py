@@ -1,12 +1,14 @@
 """Offline sampling of the truth on all cores, through the store: nothing is computed twice.
 
 The rows and the result of a unit of work (`units`) are written in one transaction, so a kill loses
-only units in flight. Not so for `truth`, which a polish asks one design after the other: these are
-made once a run, as what is asked of them besides, controller and local peaks of S, is in no row.
+only units in flight. What a polish asks for one after the other (`truth`) and what is judged in the
+end is stored whole (`kept`), with the controller, as it is made.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
+T = TypeVar("T")
 CHUNK = 8  # single designs a unit at most
 
 
@@ -145,15 +148,22 @@ class Sampler:
     @cached_property
     def truth(self) -> TrueQuantities:
         """The true quantities at any x, for IPOPT and what polishes: made in this process."""
-        return TrueQuantities(self.problem, self.record)
+        return TrueQuantities(self.problem, self._recorded)
 
-    def record(self, x: Array, design: Sensitivities) -> None:
-        """Keep a design made outside the pool (IPOPT on the true function)."""
+    def kept(self, what: str, point: Sequence[float], kind: type[T], make: Callable[[], T]) -> T:
+        """What `make` gives at a point of this problem, once for all runs on the store."""
+        owner = problem_hash({what: self.inner_hash})
+        return self.store.kept(sample_key(owner, point, 0.0, 0.0), owner, point, kind, make)
+
+    def _recorded(self, x: Array, make: Callable[[], Sensitivities]) -> Sensitivities:
+        """A design made outside the pool (IPOPT on the true function): a row too, and counted."""
         point = tuple(float(v) for v in x)
+        design = self.kept("design", point, Sensitivities, make)
         key = self._design_key(point)
         sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
+        return design
 
     def _spend(
         self,

@@ -8,15 +8,16 @@ may use the file at once (write-ahead log, busy timeout).
 import json
 import sqlite3
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from ccd_casadi.sampling.rows import COLUMNS, DAMAGED, Sample, decoded, from_row, numbers_of, to_row
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.plain_values import plain, restored
 
+T = TypeVar("T")
 SCHEMA = 1
 BUSY_SECONDS = 60.0
 
@@ -109,12 +110,7 @@ class SampleStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -140,7 +136,7 @@ class SampleStore:
     ) -> None:
         """Write a unit's samples and its result (key, problem, θ, payload): all or nothing."""
         key, owner, theta, payload = result
-        row = (key, owner, json.dumps(list(theta)), json.dumps(payload, sort_keys=True))
+        row = (key, owner, json.dumps(list(theta)), json.dumps(payload))
         with self.worded(), self._transaction():
             self._insert(samples, problem)
             self._db.execute("insert or ignore into results values (?, ?, ?, ?)", row)
@@ -163,6 +159,24 @@ class SampleStore:
         with self.worded():
             row = self._db.execute("select json from results where key = ?", (key,)).fetchone()
             return None if row is None else decoded(row[0])
+
+    def kept(
+        self, key: str, owner: str, theta: Sequence[float], kind: type[T], make: Callable[[], T]
+    ) -> T:
+        """The dataclass that was stored under a key, else what `make` gives, which is stored.
+
+        Raises SampleStoreError where the row holds something else.
+        """
+        stored = self.get_result(key)
+        if stored is None:
+            made = make()
+            self.put_unit([], (key, owner, theta, plain(made)))
+            return made
+        try:
+            found: T = restored(kind, stored)
+            return found
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.damaged() from error
 
     def select(self, problem: str | None = None) -> list[Sample]:
         """Every sample (of one problem hash, if given), ordered by θ, ω_S and ω_T."""

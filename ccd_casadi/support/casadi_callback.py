@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
-from surrogates.interrupts import pending
+from ccd_casadi.support.interrupts import pending
 
 
 class VectorCallback(ca.Callback):

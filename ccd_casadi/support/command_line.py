@@ -12,12 +12,12 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from ccd_casadi.support.errors import PlantError, UserError
+from ccd_casadi.support.interrupts import begun, ctrl_c_noticed, was_ctrl_c
+from ccd_casadi.support.options import ExitCode as ExitCode
+from ccd_casadi.support.options import Parser, one_line, usable_cores, whole
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
-from surrogates.interrupts import begun, ctrl_c_noticed, was_ctrl_c
-from surrogates.options import ExitCode as ExitCode
-from surrogates.options import Parser, one_line, usable_cores, whole
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
 _DISK = "see to the disk or choose another --out, then give the same command: it resumes"

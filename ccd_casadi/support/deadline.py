@@ -5,14 +5,13 @@ the pipe is pickled between this process and its own child, and never stored.
 """
 
 import math
-import pickle
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 from typing import ParamSpec, Self, TypeVar
 
-from ccd_casadi.support.worker_process import WorkerProcess, called, interrupts_held
+from ccd_casadi.support.worker_process import Ahead, WorkerLost
+from ccd_casadi.support.worker_process import Overrun as Overrun
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -21,26 +20,19 @@ GRACE = 2.0  # s of processor time beyond the deadline, after which the system e
 STARTING = 60.0  # seconds that the process itself may take to come up
 
 
-class Overrun(RuntimeError):
-    """The call did not return within its time, or its process died."""
-
-
 class Runner:
     """One process for calls with a deadline each; a context manager."""
 
     def __init__(self) -> None:
-        self._worker: WorkerProcess | None = None
+        self._process: Ahead | None = None
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._end()
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.__exit__()
+        self._process = None
 
     def call(
         self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
@@ -49,39 +41,22 @@ class Runner:
 
         Raises Overrun after `seconds`, and where the process dies.
         """
-        pipe = self._ready().pipe
         try:
-            pipe.send_bytes(pickle.dumps((_apply, (seconds, function, args, kwargs))))
-            if not pipe.poll(seconds):
-                raise Overrun(f"no answer within {seconds:g} s")
-            done, value = pickle.loads(pipe.recv_bytes())  # our own child wrote it
-        except (EOFError, OSError):
-            self._end()
-            raise Overrun("the process died") from None
-        except BaseException:  # an overrun, or Ctrl-C: what it is doing is of no use any more
-            self._end()
+            if self._process is None or not self._process.alive():
+                self.__exit__()
+                self._process = Ahead(int)
+                self._process.answer(STARTING)
+            self._process.begin(_apply, (seconds, function, args, kwargs))
+            done, value = self._process.answer(seconds)
+        except BaseException as error:  # what it is doing is of no use any more
+            self.__exit__()
+            if isinstance(error, WorkerLost):
+                raise Overrun("the process died") from None
             raise
         if not done:
             raise value
         result: R = value
         return result
-
-    def _ready(self) -> WorkerProcess:
-        if self._worker is None or not self._worker.process.is_alive():
-            self._end()
-            with interrupts_held():
-                self._worker = WorkerProcess()
-            self._worker.send(pickle.dumps((called, int)))  # answered as soon as it is up
-            if not self._worker.pipe.poll(STARTING):
-                self._end()
-                raise Overrun(f"the process did not start within {STARTING:g} s")
-            self._worker.answer()
-        return self._worker
-
-    def _end(self) -> None:
-        if self._worker is not None:
-            self._worker.end()
-        self._worker = None
 
 
 def _apply(task: tuple) -> object:

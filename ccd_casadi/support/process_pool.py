@@ -9,9 +9,9 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from multiprocessing import connection
 from reprlib import Repr
-from types import TracebackType
 from typing import Protocol, Self
 
+from ccd_casadi.support.interrupts import raise_dropped
 from ccd_casadi.support.worker_process import (
     R,
     T,
@@ -20,7 +20,6 @@ from ccd_casadi.support.worker_process import (
     interrupts_held,
     track_resources,
 )
-from surrogates.interrupts import raise_dropped
 
 PATIENCE = 2.0  # s of work that is not worth starting processes for
 _SHORT = Repr()
@@ -39,12 +38,7 @@ class Pool(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def map_unordered(
         self, function: Callable[[T], R], tasks: Sequence[T]
@@ -73,12 +67,7 @@ class Workers:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._end(self._workers)
 
     def map_unordered(

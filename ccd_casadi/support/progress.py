@@ -8,7 +8,6 @@ notebook it is on stdout, since stderr is painted there as a failure.
 import os
 import sys
 import time
-from types import TracebackType
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
@@ -43,12 +42,7 @@ class Progress:
             self._show(end="")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._show(end="\n")
 
     def advance(self, count: int = 1, note: str = "") -> None:

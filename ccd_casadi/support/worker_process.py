@@ -27,6 +27,10 @@ class WorkerLost(RuntimeError):
     """Workers died again and again on one task (killed, or out of memory), or never came back."""
 
 
+class Overrun(RuntimeError):
+    """The call did not return within its time, or its process died."""
+
+
 class Ahead:
     """A process that gets ready while this one is at work, for a task at the end of it.
 
@@ -52,15 +56,30 @@ class Ahead:
         self._worker.send(pickle.dumps((function, task)))
         self._waiting += 1
 
+    def alive(self) -> bool:
+        """Whether the process is there."""
+        return self._worker.process.is_alive()
+
+    def answer(self, seconds: float | None = None) -> tuple[bool, Any]:
+        """(True, what the next task came to) or (False, what it raised).
+
+        Raises WorkerLost if the process died, and Overrun after so many seconds.
+        """
+        with suppress(OSError):  # it is dead: its answer says so
+            if not self._worker.pipe.poll(seconds):
+                raise Overrun(f"no answer within {seconds:g} s")
+        answer = self._worker.answer()
+        if answer is None:
+            raise WorkerLost(f"a worker process died (exit code {self._worker.exit_code()})")
+        self._waiting -= 1
+        found: tuple[bool, Any] = pickle.loads(answer)  # our own child wrote it, into its pipe
+        return found
+
     def result(self) -> Any:
         """What the last task came to. Raises WorkerLost if it died, and what the task raised."""
         value = None
         while self._waiting:
-            answer = self._worker.answer()
-            if answer is None:
-                raise WorkerLost(f"a worker process died (exit code {self._worker.exit_code()})")
-            self._waiting -= 1
-            done, value = pickle.loads(answer)  # our own child wrote it, into its pipe
+            done, value = self.answer()
             if not done:
                 raise value
         return value
@@ -144,10 +163,7 @@ def interrupts_held() -> Iterator[None]:
 
 def _serve(pipe: connection.Connection) -> None:
     """A worker's life: answer tasks until the pipe or the parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    end_with_parent()
+    become_worker()
     with suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(answered(pipe.recv_bytes()))
@@ -169,8 +185,11 @@ def answered(message: bytes) -> bytes:
             return pickle.dumps((False, RuntimeError(text)))
 
 
-def end_with_parent() -> None:
-    """End this process as soon as its parent has ended, even by SIGKILL and in mid-task."""
+def become_worker() -> None:
+    """Leave Ctrl-C to the parent and end as soon as it has ended, even by SIGKILL in mid-task."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent: Any = multiprocessing.parent_process()
 
     def leave() -> None:

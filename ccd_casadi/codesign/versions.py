@@ -12,10 +12,10 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.support.errors import UserError
 from surrogates.files import write_whole
 from surrogates.gaussian_process import GaussianProcess
 from surrogates.serialise import SurrogateFileError, load, save
-from surrogates.truth import TruthError
 
 FOLDER, NEWEST = "surrogates", "surrogate.json"
 LOCK = "retrain.lock"  # a database that the job keeps locked, of what was spent before the first
@@ -25,7 +25,7 @@ LOCK = "retrain.lock"  # a database that the job keeps locked, of what was spent
 def only_job(run: Path, spent: int) -> Iterator[int]:
     """Hold a run folder, at most until the process ends; yields what its first job found spent.
 
-    Raises TruthError where another job holds it.
+    Raises UserError where another job holds it.
     """
     with ExitStack() as stack:
         try:
@@ -38,7 +38,7 @@ def only_job(run: Path, spent: int) -> Iterator[int]:
             (base,) = execute("select spent from job").fetchone()
             execute("commit")
         except sqlite3.DatabaseError as error:
-            raise TruthError(
+            raise UserError(
                 f"{run / LOCK}: {error}; wait for the job that retrains this folder, retrain a "
                 "copy (--out), or where no job runs delete that file"
             ) from None

@@ -7,8 +7,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.support.interrupts import interrupts_kept, raise_dropped
 from surrogates.interface import Array
-from surrogates.interrupts import interrupts_kept, raise_dropped
 
 OPTIONS: dict[str, Any] = {
     "print_time": False,

@@ -16,12 +16,11 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from surrogates.casadi_export import to_casadi
-from surrogates.gaussian_process import GaussianProcess, condition
-from surrogates.interface import Array
-from surrogates.ipopt import end_points
-from surrogates.sampling_plan import sobol
-from surrogates.truth import Observations, Truth
+from ccd_casadi.codesign.truth import Observations, Truth
+from ccd_casadi.optim.ipopt import end_points
+from ccd_casadi.support.arrays import Array
+from surrogates import GaussianProcess, sobol, to_casadi
+from surrogates.gaussian_process import condition
 
 NEAR = 1e-4  # of the box, largest component: nearer to a known point nothing is evaluated
 AVOID = 0.02  # of the box: so near to a point without truth nothing is asked or designed
