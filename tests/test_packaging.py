@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import ccd_casadi
-from surrogates import options
+from ccd_casadi.support import options
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = [*(ROOT / "ccd_casadi").rglob("*.py"), *(ROOT / "surrogates").rglob("*.py")]
