@@ -7,8 +7,8 @@ from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.codesign.design_entries import controller_dict
 from ccd_casadi.codesign.inner_answer import InnerAnswer
-from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
+from ccd_casadi.fixed_structure.measured_loop import controller_response
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.support.units import HZ
 

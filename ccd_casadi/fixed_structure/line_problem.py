@@ -9,6 +9,7 @@ where ln σ(S) is a straight line over ln v. Stability is the winding of det(I +
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.signal import find_peaks
@@ -79,8 +80,9 @@ class LineProblem(LoopProblem):
     def stable(self, kappa: Array) -> bool:
         """Whether the winding on every response is that of a stable loop."""
         plants, structure = self.plants, self.structure
-        alone = isinstance(structure, Structure)
-        parts = [(structure, kappa)] if alone else list(structure.split(kappa))
+        parts = [(structure, kappa)] if isinstance(structure, Structure) else [
+            *structure.split(kappa)
+        ]  # fmt: skip
         for measured in self.responses:
             whole = measured.followed
             s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
@@ -150,10 +152,10 @@ def _plants(
     out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
     into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
     A, B, C, D = (np.zeros((1, *shape)) for shape in ((0, 0), (0, m), (p, 0), (p, m)))
+    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
     T = None if period is None else period * omega_0
-    directions = (np.ascontiguousarray(M, float) for M in (out, into))
     return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, (), A, B, C, D,
-                      *directions, omega)  # fmt: skip
+                      out, into, omega)  # fmt: skip
 
 
 @assess.register
@@ -171,7 +173,7 @@ def _(
     v, lines = problem.v, problem.starts[-1]
     crossing = plants.variable(np.exp(tau + problem.leads))
     inside = all(v[a] < crossing.min() and crossing.max() < v[b - 1]
-                 for a, b in zip(starts, starts[1:], strict=False))  # fmt: skip
+                 for a, b in pairwise(starts))  # fmt: skip
     if not inside or not problem.stable(kappa):
         return Assessment(False, np.zeros(0), None, None)
     loop = problem.loop(kappa, tau)
@@ -200,7 +202,7 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarr
     numbers = np.flatnonzero(np.isfinite(problem.limits[Curve.CROSSING]))
     for number in numbers:
         place = crossing[number]
-        for a, b in zip(problem.starts, problem.starts[1:], strict=False):
+        for a, b in pairwise(problem.starts):
             i = a + int(np.clip(np.searchsorted(v[a:b], place), 1, b - a - 1))
             which, at = np.array([i - 1, i]), v[[i - 1, i]]
             code = np.full(2, Curve.CROSSING)
@@ -210,9 +212,8 @@ def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarr
             mean = np.array([1.0 - share, share])
             slope = (value[1] - value[0]) / width / problem.plants.chain(np.array(place))
             rows_of.append((number * P + i, at[1], mean @ value, mean @ to_kappa, slope))
-    row, at, value, to_kappa, to_tau = zip(*rows_of, strict=True)
-    code = np.full(len(row), Curve.CROSSING)
-    return (code, *(np.array(part) for part in (row, at, value, to_kappa, to_tau)))
+    parts = [np.array(part) for part in zip(*rows_of, strict=True)]
+    return (np.full(len(parts[0]), Curve.CROSSING), *parts)
 
 
 @hessians.register

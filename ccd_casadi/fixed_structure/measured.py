@@ -143,7 +143,8 @@ def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for name, value in variables.items():
         numbers = np.asarray(value)
         if not name.startswith("__") and numbers.dtype.kind in "iufc":
-            found[COLUMNS.get(name.lower(), name)] = numbers if numbers.ndim == 3 else numbers.ravel()
+            numbers = numbers if numbers.ndim == 3 else numbers.ravel()
+            found[COLUMNS.get(name.lower(), name)] = numbers
     return found
 
 

@@ -12,6 +12,7 @@ Uᵀ G V first, and the search on the whole begins where these are stable togeth
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, contr
 from ccd_casadi.fixed_structure.decoupling import Decoupling
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
 from ccd_casadi.fixed_structure.local_search import ascend
+from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge_all
 from ccd_casadi.fixed_structure.race import finished, run_race
@@ -141,11 +143,12 @@ def _judged(
 
 def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[Array]:
     """Half by rules and half at random, of those whose winding is that of a stable loop."""
-    inside = CROSSOVERS[CROSSOVERS > 2.0 * problem.base[0]]
-    rules = by_rules(problem, inside)
+    single = cast(Problem, problem)  # of one channel
+    inside = CROSSOVERS[2.0 * problem.base[0] < CROSSOVERS]
+    rules = by_rules(single, inside)
     found = _some(problem, rules[rng.permutation(len(rules))], max(starts // 2, 1))
     draws = np.exp(rng.uniform(np.log(inside[0]), np.log(inside[-1]), 12 * starts))
-    return found + _some(problem, at_random(problem, draws, rng), starts - len(found))
+    return found + _some(problem, at_random(single, draws, rng), starts - len(found))
 
 
 def _some(problem: LineProblem, kappa: Array, most: int) -> list[Array]:

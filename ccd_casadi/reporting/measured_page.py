@@ -67,7 +67,8 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
     top = 2.5 * max(bounds.S_max, float(size.max()))
     at = bandwidth_level(answer["bandwidth_hz"])
     locus = np.where(np.abs(L) <= FAR, L, np.nan)
-    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), np.where(reach < np.inf, reach, np.nan), "at most between lines", GREY, width=0.9)
+    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), np.where(reach < np.inf, reach, np.nan),
+                    "at most between lines", GREY, width=0.9)  # fmt: skip
     rows = [
         [sensitivity_panel(
             (allowed, Curve(hz, size, "at the lines")), ends, bounds.S_max, (at,), "|S| (–)",
