@@ -158,13 +158,13 @@ def test_two_channels_are_designed_on_two_responses_and_judged_apart(tmp_path: P
     assert found.usable, found.words
     assert found.controller is not None
     K = found.controller
-    for plant in plants:
-        s = 2j / period * np.tan(np.pi * plant.hz * period)
+    for one in plants:
+        s = 2j / period * np.tan(np.pi * one.hz * period)
         k = K.C @ np.linalg.solve(s[:, None, None] * np.eye(len(K.A)) - K.A, K.B + 0j) + K.D
-        back = np.eye(2) + plant.G @ k
+        back = np.eye(2) + one.G @ k
         S = np.linalg.norm(np.linalg.inv(back), 2, axis=(1, 2))
         assert S.max() <= 1.7 * (1.0 + 1e-5)
-        assert S[HZ * plant.hz <= found.bandwidth].max() <= np.sqrt(0.5) * (1.0 + 1e-4)
+        assert S[HZ * one.hz <= found.bandwidth].max() <= np.sqrt(0.5) * (1.0 + 1e-4)
         F = np.linalg.det(back)  # two integrators: from -180 deg to 0, an unstable loop to -360
         grown = np.angle(F[1:] / F[:-1]).sum()
         assert -np.pi + np.angle(-F[0]) + grown == pytest.approx(np.angle(F[-1]))
