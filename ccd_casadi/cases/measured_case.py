@@ -42,7 +42,7 @@ class MeasuredCase:
 
     path: Path
     file: str
-    response: MeasuredResponse
+    responses: tuple[MeasuredResponse, ...]
     structure: Structure
     bounds: Bounds
     period: float | None
@@ -82,7 +82,7 @@ def measured_case(path: Path) -> MeasuredCase | None:
     return MeasuredCase(
         path=path,
         file=str(plant["file"]),
-        response=response,
+        responses=(response,),
         structure=structure_of(controller),
         bounds=_bounds(inner, controller.weighted_level, weights),
         period=None if loop.rate_hz is None else 1.0 / loop.rate_hz,

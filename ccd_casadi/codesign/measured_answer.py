@@ -17,9 +17,9 @@ def measured_answer(
     case: MeasuredCase, *, seed: int, progress: Callable[[str], None] | None = None
 ) -> tuple[InnerAnswer, MeasuredDesign]:
     """The structure of the case on its measured lines, and the design behind the answer."""
-    hz = case.response.hz
+    hz = case.responses[0].hz
     made = design_on_data(
-        case.response, case.structure, case.bounds, period=case.period, starts=case.starts,
+        case.responses, case.structure, case.bounds, period=case.period, starts=case.starts,
         seed=seed, progress=progress,
     )  # fmt: skip
     plant = {"file": case.file, "lines": len(hz), "first_hz": hz[0], "last_hz": hz[-1]}
@@ -58,6 +58,6 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
     """Margins on the lines; nothing of an unstable loop."""
     if made.controller is None or made.figures is None or not made.figures.stable:
         return {}
-    hz = case.response.hz
-    L = case.response.G * controller_response(made.controller, hz, case.period)[:, 0, 0]
+    hz = case.responses[0].hz
+    L = case.responses[0].G * controller_response(made.controller, hz, case.period)[:, 0, 0]
     return measured_entry(HZ * hz, L, made.controller, made.bandwidth, made.figures.S_peak)

@@ -12,7 +12,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -31,7 +30,6 @@ from ccd_casadi.support.units import HZ
 
 REACH = 0.3  # ω₀ over the last line
 SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
-PEAK = 1.0  # ln: by so much a resonance stands out of |G|
 RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
 POLE = -1.0 + 1.0j  # of a line's mode, over its frequency
 SLOWEST = 0.01  # |p| T of it at least: below, digits of z - e^{pT} are lost
@@ -95,9 +93,7 @@ class LineProblem(LoopProblem):
     @cached_property
     def resonances(self) -> Array:
         """v at the peaks of the first response, the strongest first."""
-        size = np.log(np.linalg.norm(self.responses[0].matrix, axis=(1, 2)))
-        at, found = find_peaks(size, prominence=PEAK)
-        return self.base[at[np.argsort(-found["prominences"])]]
+        return self.base[self.responses[0].resonances]
 
     def first_response(self, v: Array) -> np.ndarray:
         """G (k,) of the first response's first entry, at the lines next to v."""

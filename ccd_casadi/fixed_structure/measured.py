@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
+from scipy.signal import find_peaks
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
@@ -16,6 +17,7 @@ from ccd_casadi.support.units import HZ
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
 FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
+PEAK = 1.0  # ln: by so much a resonance stands out of |G|
 COLUMNS = {"f_hz": "hz", "hz": "hz", "frequency_hz": "hz", "re": "re", "im": "im", "real": "re",
            "imag": "im", "magnitude": "size", "magnitude_db": "db", "phase_deg": "deg",
            "phase_rad": "rad", "response": "G", "g": "G"}  # fmt: skip
@@ -65,6 +67,13 @@ class MeasuredResponse:
     def static(self) -> np.ndarray:
         """R (p, m), real, of G ~ R (f₁/jf)^n below the first line f₁."""
         return np.asarray((self.matrix[0] * 1j**self.slope).real)
+
+    @property
+    def resonances(self) -> np.ndarray:
+        """The lines (indices) of the peaks of |G|, the strongest first."""
+        size = np.log(np.linalg.norm(self.matrix, axis=(1, 2)))
+        at, found = find_peaks(size, prominence=PEAK)
+        return np.asarray(at[np.argsort(-found["prominences"])])
 
     @property
     def gap(self) -> float:

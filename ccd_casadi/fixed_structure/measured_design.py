@@ -66,6 +66,7 @@ def design_on_data(
     period: float | None = None,
     starts: int = 12,
     seed: int = 0,
+    initial: Sequence[Array] = (),
     progress: Callable[[str], None] | None = None,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
@@ -73,7 +74,8 @@ def design_on_data(
 
     `period` (s): K is sampled and the responses hold hold and delay, as the controller sees them.
     A structure of one channel on responses of several is that of each channel of
-    `static_decoupling`. Raises UserError for responses of unlike shape, or lines beyond half the
+    `static_decoupling`. `initial`: κ of earlier designs, that race beside the `starts`, of several
+    channels instead of them. Raises UserError for responses of unlike shape, or lines beyond half the
     sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
@@ -87,10 +89,14 @@ def design_on_data(
         structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
     tell = progress or (lambda words: None)
     problem = line_problem(responses, structure, bounds, period, MARGIN)
-    if isinstance(structure, ChannelStructure):
+    begun = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
+    begun, spent = _some(problem, np.array(begun), len(begun)), 0
+    if isinstance(structure, ChannelStructure) and begun:
+        pool = begun
+    elif isinstance(structure, ChannelStructure):
         pool, spent = _channels_stacked(problem, structure, period, starts, seed, tell, workers)
     else:
-        pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
+        pool = begun + _pool(problem, starts, np.random.default_rng(seed))
     if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)

@@ -36,7 +36,7 @@ def write_measured(
 ) -> Path:
     """Write `folder`/report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
-    lines = f"{len(case.response.hz)} lines of {case.file}"
+    lines = f"{len(case.responses[0].hz)} lines of {case.file}"
     lead = (
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
         f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}; no model."
@@ -58,7 +58,7 @@ def write_measured(
 
 def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> str:
     """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight."""
-    hz, G, bounds = case.response.hz, case.response.G, case.bounds
+    hz, G, bounds = case.responses[0].hz, case.responses[0].G, case.bounds
     K = controller_response(controller, hz, case.period)[:, 0, 0]
     L = G * K
     S, ends = 1.0 / (1.0 + L), (float(hz[0]), float(hz[-1]))
