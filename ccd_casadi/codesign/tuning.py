@@ -25,21 +25,16 @@ from ccd_casadi.lti.grid import around, frequency_grid
 from ccd_casadi.lti.hold import delayed, in_w, parts, sampled, tustin
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis import interchange
-from ccd_casadi.synthesis.weights import Weights
 
 NOTCHES = 3  # at most, where none are asked for
 INSIDE = 2e-3  # of S_max - 1: so far inside it the lines of a model are kept
 PER_DECADE = 60
 BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
-EVEN = Weights(2.0, 1e-4, 1.0, 1.0, 1.0, 1.0, 1e3, 1e3, 1.0)  # |KS| <= M_K, |T| <= 1000
-SLACK = 0.1  # of the effort
-OCTAVES = np.geomspace(0.5, 2.0, 9)
-ROUNDS = 8  # of adding lines where the loop on the model is worse than on the lines
+ROUNDS = 5  # of adding lines where the loop on the model is worse than on the lines
 NEARBY = np.linspace(0.98, 1.02, 9)
 APART = 1e-6  # relative, of lines
 AT_REST = 1e-7  # of the largest root: below, it lies at 0
@@ -70,7 +65,7 @@ def tune(
     delay: float = 0.0,
     S_max: float = 1.8,
     shape: float = 1.1,
-    effort: float = 20.0,
+    effort: float | None = 20.0,
     structure: Structure | None = None,
     starts: int = 12,
     seed: int = 0,
@@ -85,9 +80,8 @@ def tune(
     `plants`: one or a list (a set, one controller for all): a file as `read_frequency_response`
     takes it, a `MeasuredResponse`, or of python-control an FRD, a TransferFunction or a StateSpace.
     K runs at `rate_hz`: models, stable or not, are held, responses have the hold in them. `delay`
-    (s) comes on top of both. `effort` keeps noise and lead in bounds: the largest singular value of
-    KS over one over the least of G, the mean over two octaves. `structure`: by default with a
-    biquad for each resonance, three at most.
+    (s) comes on top of both. `effort` keeps noise and lead in bounds. `structure`: by default with
+    a biquad for each resonance, three at most.
 
     Raises UserError for what is no such plant, and for a model without a rate.
 
@@ -105,41 +99,28 @@ def tune(
     if structure is None:
         biquads = min(NOTCHES, len(responses[0].resonances))
         structure = Structure(biquads=biquads, least_damping=0.1)
-    modelled = any(model is not None for model in models)
-    low = HZ * max(one.hz[0] for one in responses)
-    bounds = Bounds(S_max, S_max, low, shape)
-    inside = INSIDE * (S_max - 1.0) if modelled else 0.0
-    period = None if rate_hz is None else 1.0 / rate_hz
-    earlier: list[Array] = []
+    periods = [model.period for model in models if model is not None]
+    period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
+    bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
+    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
+    name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
+    inside = INSIDE * (S_max - 1.0) if periods else 0.0
     for _ in range(ROUNDS):
         aim = replace(bounds, S_max=S_max - inside)
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
-                                initial=earlier, progress=progress, workers=workers)  # fmt: skip
-        if design.figures is None or not design.figures.stable:
-            break
-        earlier = [design.kappa]
-        most = effort * max(_inverse(one, design.bandwidth) for one in responses)
-        strong = design.figures.KS > (1.0 + SLACK) * most
-        if strong:
-            weights = replace(EVEN, M_K=most)
-            bounds = replace(bounds, weighted_level=1.0, weights=weights)
+                                effort=effort, progress=progress, workers=workers)  # fmt: skip
         peaks = [None if G is None else _peak(G, design.controller) for G in models]
-        norms = tuple(None if peak is None else peak[0] for peak in peaks)
-        wrong = [i for i, norm in enumerate(norms) if norm is not None and not norm <= S_max]
-        if not wrong and not strong:
+        over = [(i, *peak) for i, peak in enumerate(peaks) if peak and not peak[0] <= S_max]
+        if not (design.usable and over):
             break
-        inside *= 2.0 if wrong else 1.0
-        responses = tuple(
-            one if G is None else _finer(one, G, [peaks[i][1] for i in wrong])
-            for one, G in zip(responses, models, strict=True)
-        )
-    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
-    name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
-    case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
-    if design.usable and wrong:
-        words = f"the closed loop with plant {wrong[0] + 1} has ‖S‖∞ = {norms[wrong[0]]:.4g}"
+        inside *= 2.0
+        responses = tuple(one if G is None else _finer(one, G, [omega for _, _, omega in over])
+                          for one, G in zip(responses, models, strict=True))  # fmt: skip
+    if design.usable and over:
+        words = f"the closed loop with plant {over[0][0] + 1} has ‖S‖∞ = {over[0][1]:.4g}"
         design = replace(design, usable=False, words=f"{words}; {design.words}")
-    return Tuned(case, design, models, norms)
+    case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
+    return Tuned(case, design, models, tuple(peak and peak[0] for peak in peaks))
 
 
 def _plant(
@@ -184,12 +165,6 @@ def _plant(
     one = G.shape[1:] == (1, 1)
     found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable)
     return found, model
-
-
-def _inverse(found: MeasuredResponse, omega: float) -> float:
-    """The mean of 1/σ_min(G) over the two octaves about ω."""
-    each = [np.linalg.norm(found.at(omega * ratio / HZ), -2) for ratio in OCTAVES]
-    return float(np.exp(-np.log(each).mean()))
 
 
 def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:

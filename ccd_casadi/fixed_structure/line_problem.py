@@ -12,6 +12,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -24,10 +25,12 @@ from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure, response
 from ccd_casadi.kernels import modes
 from ccd_casadi.kernels.loop_curvature import second
+from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
+OCTAVES = np.log(np.array([0.5, 2.0]))
 REACH = 0.3  # ω₀ over the last line
 SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
 RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
@@ -63,12 +66,53 @@ class LinePlants(PlantSet):
 class LineProblem(LoopProblem):
     """`responses` as they were measured; `starts`: index of the first line of each, and the end.
 
-    The last plants of the set are the responses at ω_low, one each.
+    `effort` bounds |KS| by that many times 1/|G| about ω_b. The last plants of the set are the
+    responses at ω_low, one each.
     """
 
     responses: tuple[MeasuredResponse, ...] = ()
     v: Array = field(default_factory=lambda: np.zeros(0))
     starts: tuple[int, ...] = ()
+    effort: float | None = None
+
+    @cached_property
+    def curves(self) -> tuple[Curve, ...]:
+        """KS too where the effort is bounded."""
+        found = super().curves
+        return found if self.effort is None or Curve.KS in found else (*found, Curve.KS)
+
+    def loop(self, kappa: Array, tau: float) -> Loop:
+        """With the bound of |KS| at this ω_b."""
+        loop = super().loop(kappa, tau)
+        loop.limits[Curve.KS, : self.first] = np.minimum(
+            loop.limits[Curve.KS, : self.first], self.ceiling(tau)[0]
+        )
+        return loop
+
+    def ceiling(self, tau: float) -> tuple[float, float]:
+        """ln of effort times the mean of 1/σ_min(G) over the two octaves about ω_b, of the response
+        where that is largest, and its slope to τ; infinite without an effort."""
+        if self.effort is None:
+            return np.inf, 0.0
+        found = []
+        for x, y, area in self._inverses:
+            ends = np.clip(tau + OCTAVES, x[0], x[-1])
+            low, high = np.interp(ends, x, area)
+            slope = np.subtract(*np.interp(ends[::-1], x, y))
+            found.append(((high - low) / (ends[1] - ends[0]), slope / (ends[1] - ends[0])))
+        value, slope = max(found)
+        return float(np.log(self.effort) + value), float(slope)
+
+    @cached_property
+    def _inverses(self) -> list[tuple[Array, Array, Array]]:
+        """ln ω/ω₀, ln 1/σ_min(G) and its integral of every response."""
+        found = []
+        for one in self.responses:
+            whole = one.followed
+            x = np.log(HZ * whole.hz / self.plants.omega_0)
+            y = -np.log(self.plants.force * np.linalg.norm(whole.G, -2, axis=(1, 2)))
+            found.append((x, y, cumulative_trapezoid(y, x, initial=0.0)))
+        return found
 
     @cached_property
     def base(self) -> Array:
@@ -107,6 +151,7 @@ def line_problem(
     bounds: Bounds,
     period: float | None = None,
     margin: float = 0.0,
+    effort: float | None = None,
 ) -> LineProblem:
     """The problem on all lines; `period` (s) as in `measured_loop.judge`."""
     hz = [one.hz for one in responses]
@@ -125,7 +170,8 @@ def line_problem(
     box = structure.bounds((slowest, fastest), gains)
     v = plants.variable(HZ * every / omega_0)
     starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
-    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts)
+    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts,
+                       effort)  # fmt: skip
 
 
 def _plants(
@@ -185,6 +231,7 @@ def _(
     row = np.concatenate([i + k * P, low])
     found, _, to_kappa, *_ = rows(curve, row // P, row % P, v[row % P], loop)
     to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
+    to_tau[curve == Curve.KS] = -problem.ceiling(tau)[1]
     ends = _ends(problem, loop, crossing)
     parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
     curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)

@@ -66,7 +66,7 @@ def design_on_data(
     period: float | None = None,
     starts: int = 12,
     seed: int = 0,
-    initial: Sequence[Array] = (),
+    effort: float | None = None,
     progress: Callable[[str], None] | None = None,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
@@ -74,9 +74,9 @@ def design_on_data(
 
     `period` (s): K is sampled and the responses hold hold and delay, as the controller sees them.
     A structure of one channel on responses of several is that of each channel of
-    `static_decoupling`. `initial`: κ of earlier designs, that race beside the `starts`, of several
-    channels instead of them. Raises UserError for responses of unlike shape, or lines beyond half the
-    sampling rate.
+    `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
+    about ω_b, where G has its least singular value. Raises UserError for responses of unlike shape,
+    or lines beyond half the sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
@@ -88,15 +88,11 @@ def design_on_data(
         decoupling = static_decoupling(responses[0])
         structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
     tell = progress or (lambda words: None)
-    problem = line_problem(responses, structure, bounds, period, MARGIN)
-    begun = [np.clip(in_problem_units(problem, kappa), *problem.box) for kappa in initial]
-    begun, spent = _some(problem, np.array(begun), len(begun)), 0
-    if isinstance(structure, ChannelStructure) and begun:
-        pool = begun
-    elif isinstance(structure, ChannelStructure):
+    problem = line_problem(responses, structure, bounds, period, MARGIN, effort)
+    if isinstance(structure, ChannelStructure):
         pool, spent = _channels_stacked(problem, structure, period, starts, seed, tell, workers)
     else:
-        pool = begun + _pool(problem, starts, np.random.default_rng(seed))
+        pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
     if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
         return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
@@ -187,6 +183,7 @@ def _channels_stacked(
             name = structure.decoupling.names[i]
             design = design_on_data(
                 entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,
+                effort=problem.effort,
                 progress=lambda words, name=name: tell(f"channel {name}: {words}"), workers=workers,  # type: ignore[misc]
             )  # fmt: skip
             spent += design.steps
