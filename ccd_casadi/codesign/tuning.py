@@ -34,6 +34,7 @@ NOTCHES = 3  # at most, where none are asked for
 INSIDE = 2e-3  # of S_max - 1: so far inside it the lines of a model are kept
 PER_DECADE = 60
 BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
+GIVEN_UP = 0.03  # of the bandwidth, for integral gain
 ROUNDS = 5  # of adding lines where the loop on the model is worse than on the lines
 NEARBY = np.linspace(0.98, 1.02, 9)
 APART = 1e-6  # relative, of lines
@@ -108,7 +109,8 @@ def tune(
     for _ in range(ROUNDS):
         aim = replace(bounds, S_max=S_max - inside)
         design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
-                                effort=effort, progress=progress, workers=workers)  # fmt: skip
+                                effort=effort, given_up=GIVEN_UP, progress=progress,
+                                workers=workers)  # fmt: skip
         peaks = [None if G is None else _peak(G, design.controller) for G in models]
         over = [(i, *peak) for i, peak in enumerate(peaks) if peak and not peak[0] <= S_max]
         if not (design.usable and over):

@@ -21,7 +21,7 @@ from ccd_casadi.fixed_structure.channel_design import TIGHTENED
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
 from ccd_casadi.fixed_structure.decoupling import Decoupling
 from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
-from ccd_casadi.fixed_structure.local_search import ascend
+from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
 from ccd_casadi.fixed_structure.loop_problem import Problem
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge_all
@@ -67,6 +67,7 @@ def design_on_data(
     starts: int = 12,
     seed: int = 0,
     effort: float | None = None,
+    given_up: float = 0.0,
     progress: Callable[[str], None] | None = None,
     workers: Pool | None = None,
 ) -> MeasuredDesign:
@@ -75,8 +76,9 @@ def design_on_data(
     `period` (s): K is sampled and the responses hold hold and delay, as the controller sees them.
     A structure of one channel on responses of several is that of each channel of
     `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
-    about ω_b, where G has its least singular value. Raises UserError for responses of unlike shape,
-    or lines beyond half the sampling rate.
+    about ω_b, where G has its least singular value. Of the bandwidth the share `given_up` is given
+    in the end for integral gain. Raises UserError for responses of unlike shape, or lines beyond
+    half the sampling rate.
     """
     responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
     shapes = {one.matrix.shape[1:] for one in responses}
@@ -100,13 +102,28 @@ def design_on_data(
     for runner in finished(run_race(problem, np.array(pool), tell, workers)):
         end = ascend(problem, runner.point, iterations=60, radius=1e-2, penalty=400.0)
         spent += runner.evaluations + end.evaluations
-        design = _judged(problem, end.point.kappa, period, spent)
+        kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
+        design = _judged(problem, kappa, period, spent)
         if best is None or design.usable:
             best = design
         if best.usable:
             break
     assert best is not None
     return best
+
+
+def _more_integral(problem: LineProblem, point: Point, share: float) -> Array:
+    """κ with the largest Π k ω_i = lim sK of the channels at this share of ω_b less.
+
+    ω_b asks for no more of it than S needs; a slow force moves the plant by its inverse.
+    """
+    parts = [name.endswith(("gain", "integrator")) for name in problem.structure.names]
+    slope, floor = -np.array(parts, float), point.tau + float(np.log(1.0 - share))
+    model = LoopModel(problem, lambda kappa: (float(slope @ kappa), slope), 0.0, floor)
+    begin = model.assessed(point.kappa, point.tau, point.assessment)
+    if begin is None:
+        return point.kappa
+    return descend(model, begin, np.zeros(2 * begin.x.shape), problem.margin)[0].x[:-1]
 
 
 def static_decoupling(measured: MeasuredResponse) -> Decoupling:
