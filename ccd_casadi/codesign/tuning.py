@@ -158,6 +158,8 @@ def _plant(
     top, rates = np.pi / T, system.rates
     rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
     zeros = system.rates_of(system.zeros(1.0 if own else top))
+    if (np.abs(zeros) <= AT_REST * top).any():
+        raise UserError("the plant has a zero at 0: no controller holds its output in the end")
     roots = np.concatenate([rates[~rest], zeros, [top]])
     low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
     omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
