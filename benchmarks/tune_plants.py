@@ -26,9 +26,12 @@ S_MAX = 1.8
 s = control.tf("s")
 
 
-def modes(rigid: control.TransferFunction, *parts: tuple[float, float, float]) -> control.StateSpace:
+def modes(rigid: control.TransferFunction, *parts: tuple[float, ...]) -> control.StateSpace:
     """A rigid part and modes of (Hz, damping, gain)."""
-    flexible = [control.tf([g], [1.0, 2.0 * d * ccd.HZ * f, (ccd.HZ * f) ** 2]) for f, d, g in parts]
+    flexible = []
+    for hz, damping, gain in parts:
+        omega = ccd.HZ * hz
+        flexible.append(control.tf([gain], [1.0, 2.0 * damping * omega, omega**2]))
     return control.parallel(*(control.ss(part) for part in (rigid, *flexible)))
 
 
@@ -74,7 +77,9 @@ PLANTS = {
     "1/s³": (1 / s**3, 100.0, 0.0),
     "stage, modes collocated": (modes(FREE, (120.0, 0.01, 0.02), (400.0, 0.01, 0.02)), 5e3, 2e-4),
     "stage, mode non-collocated": (modes(FREE, (150.0, 0.02, -0.05)), 5e3, 2e-4),
-    "stage, set of three": ([modes(FREE, (f, 0.01, 0.02)) for f in (110.0, 120.0, 130.0)], 5e3, 2e-4),
+    "stage, set of three": (
+        [modes(FREE, (f, 0.01, 0.02)) for f in (110.0, 120.0, 130.0)], 5e3, 2e-4
+    ),
     "MathWorks positioning": (positioning(), 2e3, 5e-4),
     "MathWorks flexible beam": (beam(), 5e3, 0.0),
     "unstable 1/(s - 1)": (1 / (s - 1), 50.0, 0.0),
@@ -158,7 +163,8 @@ def main() -> None:
             print(f"| {name} | {rate:g} | {delay:g} | | | | | | {error} |", flush=True)
             continue
         seconds.append(process_time() - began)
-        row, design = f"| {name} | {rate:g} | {delay:g} | {found.design.structure.biquads}", found.design
+        design = found.design
+        row = f"| {name} | {rate:g} | {delay:g} | {design.structure.biquads}"
         if not design.usable:
             print(f"{row} | | | | {seconds[-1]:.1f} | {design.words} |", flush=True)
             continue
@@ -169,8 +175,8 @@ def main() -> None:
         if words:
             refuted.append(name)
         S, over = (max(figures[key] for _, figures in judged) for key in ("S", "overshoot"))
-        print(f"{row} | {design.bandwidth:.4g} | {S:.3f} | {100 * over:.0f} % | {seconds[-1]:.1f} | "
-              f"{words and 'REFUTED: ' + words} |", flush=True)  # fmt: skip
+        end = f"{seconds[-1]:.1f} | {words and 'REFUTED: ' + words} |"
+        print(f"{row} | {design.bandwidth:.4g} | {S:.3f} | {100 * over:.0f} % | {end}", flush=True)
         if given.plots:
             given.plots.mkdir(exist_ok=True)
             drawn(given.plots / f"{number:02d}.png", name, design, judged[0][1])

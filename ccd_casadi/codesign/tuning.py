@@ -167,7 +167,7 @@ def _plant(
     unstable = int((rates[~rest].real > 0.0).sum())
     G = model.response(omega)
     one = G.shape[1:] == (1, 1)
-    found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable)
+    found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable, modelled=True)
     return found, model
 
 

@@ -6,20 +6,25 @@ frequencies that do not move. ω_b lies between two lines,
 where ln σ(S) is a straight line over ln v. Stability is the winding of det(I + GK).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.loop import PlantSet
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, Curve, LoopProblem
+from ccd_casadi.fixed_structure.loop_problem import (
+    FIRST,
+    Assessment,
+    Constraints,
+    Curve,
+    LoopProblem,
+)
 from ccd_casadi.fixed_structure.measured import MeasuredResponse
 from ccd_casadi.fixed_structure.measured_loop import winding
 from ccd_casadi.fixed_structure.structure import Structure, response
@@ -30,7 +35,8 @@ from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
-OCTAVES = np.log(np.array([0.5, 2.0]))
+OCTAVES = np.log(2.0) * np.linspace(-1.0, 1.0, 33)  # about ω_b
+STEP = 1e-5  # of τ
 REACH = 0.3  # ω₀ over the last line
 SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
 RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
@@ -94,33 +100,37 @@ class LineProblem(LoopProblem):
         where that is largest, and its slope to τ; infinite without an effort."""
         if self.effort is None:
             return np.inf, 0.0
-        found = []
-        for x, y, area in self._inverses:
-            ends = np.clip(tau + OCTAVES, x[0], x[-1])
-            low, high = np.interp(ends, x, area)
-            slope = np.subtract(*np.interp(ends[::-1], x, y))
-            found.append(((high - low) / (ends[1] - ends[0]), slope / (ends[1] - ends[0])))
-        value, slope = max(found)
-        return float(np.log(self.effort) + value), float(slope)
+        places = tau + np.array([[0.0], [-STEP], [STEP]]) + OCTAVES
+        means = [np.interp(places, x, y).mean(axis=1) for x, y in self._inverses]
+        value, before, after = max(means, key=lambda mean: float(mean[0]))
+        return float(np.log(self.effort) + value), float(after - before) / (2.0 * STEP)
 
     @cached_property
-    def _inverses(self) -> list[tuple[Array, Array, Array]]:
-        """ln ω/ω₀, ln 1/σ_min(G) and its integral of every response."""
-        found = []
-        for one in self.responses:
-            whole = one.followed
-            x = np.log(HZ * whole.hz / self.plants.omega_0)
-            y = -np.log(self.plants.force * np.linalg.norm(whole.G, -2, axis=(1, 2)))
-            found.append((x, y, cumulative_trapezoid(y, x, initial=0.0)))
-        return found
+    def _inverses(self) -> list[tuple[Array, Array]]:
+        """ln ω/ω₀ and ln 1/σ_min(G) of every response."""
+        return [(np.log(HZ * one.followed.hz / self.plants.omega_0),
+                 -np.log(self.plants.force * np.linalg.norm(one.followed.G, -2, axis=(1, 2))))
+                for one in self.responses]  # fmt: skip
 
     @cached_property
     def base(self) -> Array:
         """The lines of the first response."""
         return self.v[: self.starts[1]]
 
+    def begin(self, kappa: Array) -> float:
+        """Half the first crossover of the first response's first entry, ω₀/10 at most."""
+        measured, L = next(self._open(kappa))
+        measured = measured.followed
+        beyond = HZ * measured.hz[np.argmax(np.abs(L[:, 0, 0]) < 1.0)] / self.plants.omega_0
+        return float(np.clip(np.log(0.5 * beyond), np.log(2.0 * self.base[0]), FIRST))
+
     def stable(self, kappa: Array) -> bool:
         """Whether the winding on every response is that of a stable loop."""
+        integrators = int(self.structure.integrator)
+        return all(winding(measured, L, integrators)[0] == 0 for measured, L in self._open(kappa))
+
+    def _open(self, kappa: Array) -> Iterator[tuple[MeasuredResponse, np.ndarray]]:
+        """L on the followed lines of every response."""
         plants, structure = self.plants, self.structure
         parts = [(structure, kappa)] if isinstance(structure, Structure) else [
             *structure.split(kappa)
@@ -129,10 +139,7 @@ class LineProblem(LoopProblem):
             whole = measured.followed
             s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
             k = np.stack([response(own, part, s) for own, part in parts], axis=-1)
-            L = plants.force * whole.G @ (plants.into * k[:, None, :]) @ plants.out
-            if winding(measured, L, int(structure.integrator))[0] != 0:
-                return False
-        return True
+            yield measured, plants.force * whole.G @ (plants.into * k[:, None, :]) @ plants.out
 
     @cached_property
     def resonances(self) -> Array:

@@ -25,6 +25,7 @@ from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
+FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
 PER_DECADE = 24
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
 
@@ -41,6 +42,10 @@ class LoopProblem:
     bounds: Bounds
     box: Array
     margin: float = 0.0
+
+    def begin(self, kappa: Array) -> float:
+        """τ from which a search climbs that starts at κ."""
+        return FIRST
 
     @cached_property
     def low(self) -> float:

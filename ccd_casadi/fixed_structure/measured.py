@@ -28,13 +28,15 @@ class MeasuredResponse:
     """G (k,), or (k, p, m) of several channels, in m/N at rising lines (k,) in Hz.
 
     `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
-    slope of the first lines. Raises UserError where that is no response.
+    slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
+    open. Raises UserError where that is no response.
     """
 
     hz: Array
     G: np.ndarray
     unstable_poles: int = 0
     poles_at_zero: int | None = None
+    modelled: bool = False
 
     def __post_init__(self) -> None:
         shape = self.G.shape

@@ -36,8 +36,11 @@ from ccd_casadi.support.process_pool import Pool
 
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
-CROSSOVERS = np.geomspace(0.003, 1.0, 16)  # of starts, over ω₀
-NO_START = "no start is stable by its winding; give poles_at_zero, or more low lines"
+CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
+NO_START = (
+    "no start is stable by its winding: this structure may not stabilise the plant; of data give "
+    "poles_at_zero, or more low lines"
+)
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,8 @@ def _more_integral(problem: LineProblem, point: Point, share: float) -> Array:
     begin = model.assessed(point.kappa, point.tau, point.assessment)
     if begin is None:
         return point.kappa
-    return descend(model, begin, np.zeros(2 * begin.x.shape), problem.margin)[0].x[:-1]
+    end, _ = descend(model, begin, np.zeros(2 * begin.x.shape), problem.margin)
+    return point.kappa if end.violation > problem.margin else end.x[:-1]
 
 
 def static_decoupling(measured: MeasuredResponse) -> Decoupling:

@@ -99,7 +99,7 @@ def judge(
         f"{head} by the winding of {of}, with {measured.unstable_poles} unstable poles of G, and G "
         f"as (jω)^-{measured.slope} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz"
     )
-    words, sure = "; ".join([assumed, *doubts]), not doubts
+    words, sure = "; ".join([assumed, *doubts]), measured.modelled or not doubts
     if Z != 0:
         return MeasuredFigures(False, sure, Z, words)
     L, k, eye = joint[first:], k[first:], np.eye(joint.shape[1])
