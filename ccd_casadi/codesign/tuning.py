@@ -68,7 +68,7 @@ def tune(
     shape: float = 1.1,
     effort: float | None = 20.0,
     structure: Structure | None = None,
-    starts: int = 12,
+    starts: int = 24,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
     workers: Pool | None = None,
