@@ -78,7 +78,7 @@ def test_effort_bounds_the_controller_and_costs_bandwidth() -> None:
 
 def test_the_bound_of_effort_has_its_slope() -> None:
     bounds = ccd.Bounds(1.8, 1.8, ccd.HZ, 1.1)
-    problem = line_problem([two_by_two(1.0).entry(np.eye(2)[0], np.eye(2)[0])],
+    problem = line_problem([two_by_two(1.0).entry(np.eye(2)[0], np.eye(2)[0], 600)],
                            ccd.Structure(biquads=0), bounds, effort=20.0)  # fmt: skip
     for tau in (-3.0, -1.3, -0.2):
         ends = [problem.ceiling(tau + h)[0] for h in (1e-6, -1e-6)]

@@ -34,6 +34,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 
+FEWER = 600  # lines that starts of single channels are designed on
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
 EXCEEDED = 1e-5  # relative: of a bound, by rounding
 CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
@@ -202,7 +203,7 @@ def _channels_stacked(
         for i in structure.free:
             limits = problem.bounds.of_channel(i)
             limits = replace(limits, S_max=1.0 + share * (limits.S_max - 1.0))
-            entries = [one.entry(U[:, i], V[:, i]) for one in problem.responses]
+            entries = [one.entry(U[:, i], V[:, i], FEWER) for one in problem.responses]
             name = structure.decoupling.names[i]
             design = design_on_data(
                 entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,
