@@ -45,8 +45,7 @@ from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import RESTORING, problem_for
 from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point, ascend
-from ccd_casadi.fixed_structure.loop_problem import Curve, LoopProblem
-from ccd_casadi.fixed_structure.race import FIRST
+from ccd_casadi.fixed_structure.loop_problem import FIRST, Curve, LoopProblem
 from ccd_casadi.fixed_structure.sections_design import MARGIN, designed
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant

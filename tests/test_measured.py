@@ -10,14 +10,17 @@ from fixed_structure_loops import BOUNDS, FAST, loop, plant
 from scipy.io import savemat
 
 from ccd_casadi.fixed_structure import Sampling, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.fixed_structure.local_search import LoopModel
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.measured import (
     MeasuredResponse,
     from_control,
-    judge,
     read_frequency_response,
 )
-from ccd_casadi.fixed_structure.measured_design import _OnLines, design_on_data
+from ccd_casadi.fixed_structure.measured_design import design_on_data
+from ccd_casadi.fixed_structure.measured_loop import judge
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
@@ -72,10 +75,12 @@ def test_the_design_on_lines_is_that_on_the_model() -> None:
 
 def test_rows_on_lines_have_their_derivatives() -> None:
     structure = Structure(biquads=1)
-    problem, kappa = loop(3, structure)
-    kappa = structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
-    model = _OnLines(measured(None, 60), structure, BOUNDS, None, 0, None)
-    tau = float(np.log(2.0 * HZ * 1.013))
+    modelled, kappa = loop(3, structure)
+    kappa = structure.in_units(kappa, modelled.plants.omega_0, modelled.plants.force)
+    problem = line_problem([measured(None, 60)], structure, BOUNDS)
+    kappa = in_problem_units(problem, kappa)
+    model = LoopModel(problem)
+    tau = float(np.log(2.0 * HZ * 1.013 / problem.plants.omega_0))
     x = np.append(kappa, tau)
     point = model.at(x)
     assert point is not None
@@ -85,7 +90,7 @@ def test_rows_on_lines_have_their_derivatives() -> None:
     ends = [model.at(x + s * h * way) for s in (1.0, -1.0)]
     assert ends[0] is not None
     assert ends[1] is not None
-    values = [end.data.value for end in ends if end is not None]
+    values = [end.data.peaks.value for end in ends if end and end.data.peaks is not None]
     assert len(values[0]) == len(values[1]) == len(rows.value)
     difference = (values[0] - values[1]) / (2.0 * h)
     slope = rows.slopes @ way
@@ -103,7 +108,7 @@ def test_what_the_data_do_not_show_is_said() -> None:
     high = MeasuredResponse(whole.hz[whole.hz > 40.0], whole.G[whole.hz > 40.0])
     assert not judge(high, K, BOUNDS).sure
     # An unstable pole that is told moves the count by as many.
-    assert judge(whole, K, BOUNDS, unstable_poles=2).right_half_plane == 2
+    assert judge(replace(whole, unstable_poles=2), K, BOUNDS).right_half_plane == 2
 
 
 def test_files_of_every_kind_hold_the_same_response(tmp_path: Path) -> None:
@@ -123,10 +128,49 @@ def test_files_of_every_kind_hold_the_same_response(tmp_path: Path) -> None:
         read.append(read_frequency_response(path))
     savemat(tmp_path / "G.mat", {"f_hz": hz, "G": G})
     read.append(read_frequency_response(tmp_path / "G.mat"))
+    np.savez(tmp_path / "G.npz", frequency_hz=hz, response=G)
+    read.append(read_frequency_response(tmp_path / "G.npz"))
     read.append(from_control(control.FRD(G, HZ * hz)))
     for one in read:
         np.testing.assert_allclose(one.hz, hz, rtol=1e-12)
         np.testing.assert_allclose(one.G, G, rtol=1e-10)
+
+
+def two_by_two(gain: float) -> MeasuredResponse:
+    """Two coupled channels with a lag and a mode each, at 1 kHz behind a hold."""
+    hz = np.geomspace(0.5, 490.0, 90)
+    s = HZ * 1j * hz
+    turn = np.array([[1.0, 0.2], [-0.15, 0.9]])
+    modes = [gain * k * w**2 / (s**2 + 0.8 * w * s + w**2) for k, w in ((1.0, 300.0), (0.8, 420.0))]
+    held = -np.expm1(-1e-3 * s) / (1e-3 * s)
+    G = held[:, None, None] * (turn @ (np.stack(modes, -1)[:, :, None] * np.linalg.inv(turn)))
+    return MeasuredResponse(hz, G)
+
+
+def test_two_channels_are_designed_on_two_responses_and_judged_apart(tmp_path: Path) -> None:
+    """Every bound on every line by NumPy alone, and the winding of det(I + GK)."""
+    plants, period = [two_by_two(1.0), two_by_two(1.25)], 1e-3
+    np.savez(tmp_path / "G.npz", f_hz=plants[0].hz, G=plants[0].G)
+    np.testing.assert_array_equal(read_frequency_response(tmp_path / "G.npz").G, plants[0].G)
+    bounds = replace(KEPT, S_max=1.7, S_low=0.9, omega_low=HZ, weights=None, weighted_level=None)
+    structure = Structure(lead=0, biquads=0, roll_off=1)
+    found = design_on_data(plants, structure, bounds, period=period, starts=2)
+    assert found.usable, found.words
+    assert found.controller is not None
+    K = found.controller
+    for one in plants:
+        s = 2j / period * np.tan(np.pi * one.hz * period)
+        k = K.C @ np.linalg.solve(s[:, None, None] * np.eye(len(K.A)) - K.A, K.B + 0j) + K.D
+        back = np.eye(2) + one.G @ k
+        S = np.linalg.norm(np.linalg.inv(back), 2, axis=(1, 2))
+        assert S.max() <= 1.7 * (1.0 + 1e-5)
+        assert S[HZ * one.hz <= found.bandwidth].max() <= np.sqrt(0.5) * (1.0 + 1e-4)
+        F = np.linalg.det(back)  # two integrators: from -180 deg to 0, an unstable loop to -360
+        grown = np.angle(F[1:] / F[:-1]).sum()
+        assert -np.pi + np.angle(-F[0]) + grown == pytest.approx(np.angle(F[-1]))
+    other = MeasuredResponse(plants[0].hz, plants[0].G[:, :1, :1])
+    with pytest.raises(UserError, match="unlike numbers of channels"):
+        design_on_data([plants[0], other], structure, bounds, period=period)
 
 
 @pytest.mark.parametrize(

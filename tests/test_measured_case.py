@@ -13,7 +13,7 @@ from test_measured import measured
 
 from ccd_casadi.cases.case import CaseError
 from ccd_casadi.cases.measured_case import measured_case
-from ccd_casadi.fixed_structure.measured import controller_response, judge
+from ccd_casadi.fixed_structure.measured_loop import controller_response, judge
 from ccd_casadi.inner import main as inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.page import escape
@@ -56,7 +56,7 @@ def test_inner_designs_on_the_lines(
     case = measured_case(path)
     assert case is not None
     assert (case.period is not None) == sampled
-    figures = judge(case.response, K, case.bounds, period=case.period)
+    figures = judge(case.responses[0], K, case.bounds, period=case.period)
     assert figures.stable
     assert figures.S_peak <= 2.0
     assert figures.bandwidth == pytest.approx(HZ * answer["bandwidth_hz"], rel=1e-6)
@@ -66,9 +66,9 @@ def test_inner_designs_on_the_lines(
     assert ("sampled at 10000 Hz" in shown) == sampled
     data = re.findall(r"<tr>((?:<td[^>]*>[^<]*</td>){7})</tr>", shown)
     cells = np.array([[float(v) for v in re.findall(r">([^<]+)</td>", row)] for row in data])
-    k = controller_response(K, case.response.hz, case.period)
-    S = np.abs(1.0 / (1.0 + case.response.G * k))
-    at = [int(np.abs(case.response.hz - hz).argmin()) for hz in cells[:, 0]]
+    k = controller_response(K, case.responses[0].hz, case.period)[:, 0, 0]
+    S = np.abs(1.0 / (1.0 + case.responses[0].G * k))
+    at = [int(np.abs(case.responses[0].hz - hz).argmin()) for hz in cells[:, 0]]
     np.testing.assert_allclose(cells[:, 2], S[at], rtol=1e-3)
     assert cells[:, 2].max() == pytest.approx(figures.S_peak, rel=1e-4)
 
@@ -79,7 +79,7 @@ def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
     savemat(tmp_path / "stage.mat", {"f_hz": found.hz, "G": found.G, "note": "by hand"})
     case = measured_case(path)
     assert case is not None
-    np.testing.assert_allclose(case.response.G, found.G)
+    np.testing.assert_allclose(case.responses[0].G, found.G)
 
 
 @pytest.mark.parametrize(

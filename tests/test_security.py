@@ -66,7 +66,7 @@ COMMANDS = sorted(
         for p in SOURCES
         if "return run(command, " in p.read_text()
     }
-    - {"ccd_casadi.imported"}  # takes a folder of matrices or results, no case
+    - {"ccd_casadi.imported", "ccd_casadi.tune"}  # take files of numbers, no case
 )
 
 

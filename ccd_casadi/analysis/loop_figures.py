@@ -151,22 +151,24 @@ def loop_warnings(
 
 
 def measured_entry(
-    omega: Array, L: np.ndarray, controller: StateSpace, bandwidth: float, sensitivity_peak: float
-) -> dict[str, Any]:
-    """The same of one loop known on lines ω (k,) in rad/s: between them ln|L| and its phase are
+    loops: Sequence[tuple[Array, np.ndarray]], controller: StateSpace, bandwidth: float,
+    sensitivity_peak: float,
+) -> dict[str, Any]:  # fmt: skip
+    """The same of loops L (k,) known on lines ω (k,) in rad/s: between them ln|L| and its phase are
     straight over ln ω. There are no steps."""
-    x, size, phase = np.log(omega), np.log(np.abs(L)), np.unwrap(np.angle(L))
+    margins, growth = [], 1.0
+    for omega, L in loops:
+        x, ln_L = np.log(omega), np.log(np.abs(L)) + 1j * np.unwrap(np.angle(L))
 
-    def response(w: Array) -> np.ndarray:
-        at = np.log(w)
-        return np.asarray(np.exp(np.interp(at, x, size) + 1j * np.interp(at, x, phase)))
+        def response(w: Array, x: Array = x, ln_L: np.ndarray = ln_L) -> np.ndarray:
+            return np.exp(np.interp(np.log(w), x, ln_L))
 
-    margins = classical_margins(response, omega)
-    above = bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30)
-    S = np.abs(1.0 / (1.0 + response(above)))
+        margins.append(classical_margins(response, omega))
+        S = np.abs(1.0 / (1.0 + response(bandwidth * 2.0 ** np.linspace(0.0, OCTAVE, 30))))
+        growth = max(growth, float((S / S[0]).max()))
     roots = light_roots(controller, bandwidth)
-    return _entry(margins, sensitivity_peak) | {
-        "loop_warnings": loop_warnings(float((S / S[0]).max()), roots, bandwidth)
+    return _entry(least_of(margins), sensitivity_peak) | {
+        "loop_warnings": loop_warnings(growth, roots, bandwidth)
     }
 
 

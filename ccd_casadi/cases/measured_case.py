@@ -11,7 +11,7 @@ with [inner], [controller] structure = "sections", [weights] where weighted_leve
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,10 @@ class MeasuredCase:
 
     path: Path
     file: str
-    response: MeasuredResponse
+    responses: tuple[MeasuredResponse, ...]
     structure: Structure
     bounds: Bounds
     period: float | None
-    unstable_poles: int
-    poles_at_zero: int | None
     starts: int
 
 
@@ -84,12 +82,10 @@ def measured_case(path: Path) -> MeasuredCase | None:
     return MeasuredCase(
         path=path,
         file=str(plant["file"]),
-        response=response,
+        responses=(response,),
         structure=structure_of(controller),
         bounds=_bounds(inner, controller.weighted_level, weights),
         period=None if loop.rate_hz is None else 1.0 / loop.rate_hz,
-        unstable_poles=int(plant.get("unstable_poles", 0)),
-        poles_at_zero=plant.get("poles_at_zero"),
         starts=controller.starts,
     )
 
@@ -106,9 +102,11 @@ def _response(
     if "file" not in plant:
         raise fail("plant.file", f"is missing; add it, which {MODEL} needs")
     try:
-        return read_frequency_response(path.parent / plant["file"])
+        found = read_frequency_response(path.parent / plant["file"])
     except UserError as error:
         raise fail("plant.file", str(error)) from error
+    unstable, at_zero = int(plant.get("unstable_poles", 0)), plant.get("poles_at_zero")
+    return replace(found, unstable_poles=unstable, poles_at_zero=at_zero)
 
 
 def _check(sections: Mapping[str, Any], fail: Callable[[str, str], CaseError]) -> None:

@@ -50,7 +50,7 @@ def realise(
     """The controllers of all channels as one block-diagonal system from e to u."""
     parts, blocks = [], []
     for controller in controllers:
-        part, sizes = _block_diagonal(controller)
+        part, sizes = block_diagonal(controller)
         parts.append(part)
         blocks += sizes
     whole = assemble(channels, parts)
@@ -58,7 +58,8 @@ def realise(
     return Realisation(system, tuple(blocks), saturation)
 
 
-def _block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
+def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
+    """K with A block-diagonal, and the sizes of its blocks."""
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
     from control import bdschur  # it takes a second to import, and reports import this module

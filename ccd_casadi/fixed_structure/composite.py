@@ -213,7 +213,7 @@ def kinds_of_rows(problem: LoopProblem, found: Constraints) -> list[str]:
         for j, row in zip(at.tolist(), inside.plant.tolist(), strict=True):
             channel = part.channel
             if isinstance(part.problem, MatrixProblem):
-                past = row // len(part.problem.plants.plants) - part.problem.first
+                past = row // part.problem.plants.count - part.problem.first
                 channel = past if past >= 0 else None
             if channel is None:
                 continue

@@ -19,7 +19,7 @@ STEP = 1e-5  # of ln v
 @singledispatch
 def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
     """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
-    n, m, P = len(kappa), len(rows.v), len(problem.plants.plants)
+    n, m, P = len(kappa), len(rows.v), problem.plants.count
     out = np.zeros((m, n + 1, n + 1))
     if not m:
         return out

@@ -94,7 +94,7 @@ def evaluate_rows(
     problem: LoopProblem, kappa: Array, tau: float, curve: np.ndarray, row: np.ndarray, v: Array
 ) -> Any:
     """What `kernels.loop_rows.rows` has of these rows; without the margin."""
-    P = len(problem.plants.plants)
+    P = problem.plants.count
     return rows(curve, row // P, row % P, v, problem.loop(kappa, tau))
 
 

@@ -64,6 +64,11 @@ class PlantSet:
     out: Array
     into: Array
 
+    @property
+    def count(self) -> int:
+        """How many plants."""
+        return len(self.poles)
+
     @cached_property
     def modes(self) -> modes.Plants:
         """Conjugate poles in pairs, as the kernels have them."""

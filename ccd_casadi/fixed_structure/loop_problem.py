@@ -25,6 +25,7 @@ from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.weights import Weights
 
+FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
 PER_DECADE = 24
 FLANKS = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # in half widths of a root
 
@@ -41,6 +42,10 @@ class LoopProblem:
     bounds: Bounds
     box: Array
     margin: float = 0.0
+
+    def begin(self, kappa: Array) -> float:
+        """τ from which a search climbs that starts at κ."""
+        return FIRST
 
     @cached_property
     def low(self) -> float:
@@ -112,6 +117,19 @@ class LoopProblem:
         own = self.structure
         found = roots(own, kappa) if isinstance(own, Structure) else own.roots(kappa)
         return np.concatenate(found)
+
+    @cached_property
+    def resonances(self) -> Array:
+        """|p| of the flexible modes of the first plant that the loop sees, the strongest first."""
+        p, r = self.plants.poles[0], self.plants.residues[0, :, 0, 0]
+        light = (p.imag > 0.0) & (-p.real < 0.2 * np.abs(p))
+        strength = np.abs(r) / np.maximum(-p.real, 1e-300)
+        order = np.argsort(-strength[light])
+        return np.asarray(np.abs(p[light])[order])
+
+    def first_response(self, v: Array) -> np.ndarray:
+        """The first entry of the first plant's G (k,) at jv."""
+        return self.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
 
     @cached_property
     def leads(self) -> Array:
@@ -199,7 +217,7 @@ class Constraints:
 
 def plant_of_row(problem: LoopProblem, row: np.ndarray) -> np.ndarray:
     """The plant that a constraint's `plant` belongs to: several rows of a plant are numbered on."""
-    return row % len(problem.plants.plants)
+    return row % problem.plants.count
 
 
 @dataclass(frozen=True)

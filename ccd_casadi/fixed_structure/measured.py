@@ -1,100 +1,123 @@
-"""A measured frequency response as the plant: read, and a controller judged on its lines.
-
-Bounds are looked at on every line. Between two lines L = GK is taken to lie within r of the chord,
-
-    r = 2 h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
-
-twice the error of linear interpolation, where L bends between two lines as around them. A
-resonance that fits between two lines is not seen. With it |S| <= 1/(distance of -1 to the chord
-less r).
-
-Stability is the winding of 1 + GK. Over all ω > 0 its angle grows by
-
-    Δ = (π/2)(q + 2P - 2Z)
-
-with Z poles of the closed loop and P of GK in the right half plane, and q of GK at 0. P is given.
-The angle below the first line is that of the known K and of a G that is taken to go on as its first
-lines rise, c (jω)^-n: stable poles far below, where |GK| >> 1, count as poles at 0. Above the last
-line |GK| is taken to stay below 1. What of this the data can show is looked at: `sure`.
-"""
+"""Measured frequency responses: a plant as its lines, read from files and from python-control."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.io import loadmat
+from scipy.signal import find_peaks
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.lti.hold import tustin
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ
 
-HALF_POWER = 2.0**-0.5
-GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
-BELOW = 3  # decades that K is followed below the first line
-SAFETY = 2.0  # on the error of interpolation
-LARGE, SMALL = 2.0, 0.5  # |L| at the first line at least, at the last at most
-FIGURES = ("S_peak", "S_peak_frequency", "S_between", "S_low", "bandwidth", "KS", "T", "GS",
-           "weighted_KS", "weighted_T")  # fmt: skip
+BELOW = 3  # decades that a response is followed below its first line
+PER_DECADE = 25
+FIRST = 1.5  # times the first line: up to there its slope says how many poles lie at 0
+PEAK = 1.0  # ln: by so much a resonance stands out of |G|
 COLUMNS = {"f_hz": "hz", "hz": "hz", "frequency_hz": "hz", "re": "re", "im": "im", "real": "re",
            "imag": "im", "magnitude": "size", "magnitude_db": "db", "phase_deg": "deg",
-           "phase_rad": "rad"}  # fmt: skip
+           "phase_rad": "rad", "response": "G", "g": "G"}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class MeasuredResponse:
-    """G (k,) in m/N at rising lines (k,) in Hz. Raises UserError where that is none."""
+    """G (k,), or (k, p, m) of several channels, in m/N at rising lines (k,) in Hz.
+
+    `unstable_poles` of G. `poles_at_zero`: n of G ~ (jω)^-n below the first line; by default by the
+    slope of the first lines. `modelled`: a model stands behind it, which decides what lines leave
+    open. Raises UserError where that is no response.
+    """
 
     hz: Array
     G: np.ndarray
+    unstable_poles: int = 0
+    poles_at_zero: int | None = None
+    modelled: bool = False
 
     def __post_init__(self) -> None:
-        if self.hz.ndim != 1 or self.hz.shape != self.G.shape or len(self.hz) < 5:
+        shape = self.G.shape
+        if self.hz.ndim != 1 or len(self.hz) < 5 or shape[:1] != self.hz.shape or (
+            len(shape) not in (1, 3)
+        ):  # fmt: skip
             raise UserError("a measured response needs five lines or more, one value at each")
         if not (np.isfinite(self.hz).all() and np.isfinite(self.G).all()):
             raise UserError("a measured response holds finite numbers only; drop the other lines")
         if self.hz[0] <= 0.0 or (np.diff(self.hz) <= 0.0).any():
             raise UserError("the lines of a measured response have to rise from above 0 Hz")
-        if (self.G == 0.0).any():
+        if (self.matrix == 0.0).all(axis=(1, 2)).any():
             raise UserError("a measured response is 0 at a line; drop it")
 
+    @property
+    def matrix(self) -> np.ndarray:
+        """G (k, p, m)."""
+        return self.G if self.G.ndim == 3 else self.G[:, None, None]
 
-@dataclass(frozen=True)
-class MeasuredFigures:
-    """A loop on its lines. Frequencies in rad/s, KS in N/m, GS in m/N; NaN where not stable.
+    @cached_property
+    def slope(self) -> int:
+        """n of G ~ (jω)^-n below the first line."""
+        if self.poles_at_zero is not None:
+            return self.poles_at_zero
+        many = max(3, int(np.searchsorted(self.hz, FIRST * self.hz[0])))
+        size = np.linalg.norm(self.matrix[:many], axis=(1, 2))
+        return max(0, round(-float(np.polyfit(np.log(self.hz[:many]), np.log(size), 1)[0])))
 
-    `right_half_plane`: Z. `sure`: whether the assumptions that the data can show hold. `S_between`
-    bounds |S| between the lines by r, infinite where -1 may lie on the curve; `bandwidth` is the
-    largest that the shape allows on the lines.
-    """
+    @cached_property
+    def static(self) -> np.ndarray:
+        """R (p, m), real, of G ~ R (f₁/jf)^n below the first line f₁."""
+        return np.asarray((self.matrix[0] * 1j**self.slope).real)
 
-    stable: bool
-    sure: bool
-    right_half_plane: int
-    S_peak: float
-    S_peak_frequency: float
-    S_between: float
-    S_low: float
-    bandwidth: float
-    KS: float
-    T: float
-    GS: float
-    weighted_KS: float
-    weighted_T: float
-    words: str
+    @property
+    def resonances(self) -> np.ndarray:
+        """The lines (indices) of the peaks of |G|, the strongest first."""
+        size = np.log(np.linalg.norm(self.matrix, axis=(1, 2)))
+        at, found = find_peaks(size, prominence=PEAK)
+        return np.asarray(at[np.argsort(-found["prominences"])])
+
+    @property
+    def gap(self) -> float:
+        """The angle (rad) between G at the first line and its asymptote there."""
+        turned = self.matrix[0] * 1j**self.slope
+        return float(np.arctan2(np.linalg.norm(turned.imag), np.linalg.norm(turned.real)))
+
+    @cached_property
+    def followed(self) -> "MeasuredResponse":
+        """With three decades more below the first line, where it turns into its asymptote."""
+        hz, first = self.hz, self.matrix[0]
+        below = np.geomspace(10.0**-BELOW * hz[0], hz[0], PER_DECADE * BELOW + 1)[:-1]
+        turned = np.clip(1.0 + np.log10(below / hz[0]), 0.0, 1.0)[:, None, None]  # in a decade
+        start = self.static * (-1j) ** self.slope
+        lower = (start + turned * (first - start)) * ((below / hz[0]) ** -self.slope)[:, None, None]
+        return replace(self, hz=np.append(below, hz), G=np.concatenate([lower, self.matrix]))
+
+    def at(self, hz: float) -> np.ndarray:
+        """G (p, m) between the lines, straight over ln f."""
+        whole, x = self.followed, np.log(hz)
+        lines = np.log(whole.hz)
+        i = int(np.clip(np.searchsorted(lines, x), 1, len(lines) - 1))
+        share = np.clip((x - lines[i - 1]) / (lines[i] - lines[i - 1]), 0.0, 1.0)
+        return np.asarray((1.0 - share) * whole.G[i - 1] + share * whole.G[i])
+
+    def entry(self, left: Array, right: Array, most: int) -> "MeasuredResponse":
+        """leftᵀ G right as a response of one channel, on about `most` of the lines."""
+        every = slice(None, None, 1 + len(self.hz) // most)
+        G = np.einsum("p,kpm,m->k", left, self.matrix[every], right)
+        return replace(self, hz=self.hz[every], G=G, poles_at_zero=self.slope)
 
 
 def read_frequency_response(path: str | Path) -> MeasuredResponse:
     """A CSV with a header of f_hz and re, im (or magnitude or magnitude_db, and phase_deg or
-    phase_rad), or a .mat file with these names or with f_hz and a complex G.
+    phase_rad), or a .mat or .npz file with these names or with f_hz and a complex G.
 
-    G is displacement over force, m/N. Raises UserError with what is missing.
+    G is displacement over force, m/N; of several channels (k, p, m), .mat and .npz only. Raises
+    UserError with what is missing.
     """
     path = Path(path)
+    if path.suffix.lower() == ".npz":
+        return _of_columns(_npz(path), path)
     if path.suffix.lower() == ".mat":
         return _of_columns(_mat(path), path)
     try:
@@ -111,12 +134,30 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
 
 
 def from_control(system: Any) -> MeasuredResponse:
-    """Of a SISO python-control FRD (frequencies in rad/s)."""
-    data = np.asarray(system.frdata)
-    if data.shape[:2] != (1, 1):
-        raise UserError("the frequency response is not SISO; take one channel of it")
-    omega = np.asarray(system.omega, float)
-    return MeasuredResponse(omega / HZ, data[0, 0].astype(complex))
+    """Of a python-control FRD (frequencies in rad/s)."""
+    data = np.moveaxis(np.asarray(system.frdata), -1, 0).astype(complex)
+    one = data.shape[1:] == (1, 1)
+    return MeasuredResponse(np.asarray(system.omega, float) / HZ, data[:, 0, 0] if one else data)
+
+
+def _npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return _named(dict(file))
+    except (OSError, ValueError) as error:
+        words = f"cannot be read as a frequency response: {described(error)}"
+        raise UserError(f"{path}: {words}") from None
+
+
+def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Those that hold numbers, by the names that count; a matrix at each line as it is."""
+    found = {}
+    for name, value in variables.items():
+        numbers = np.asarray(value)
+        if not name.startswith("__") and numbers.dtype.kind in "iufc":
+            numbers = numbers if numbers.ndim == 3 else numbers.ravel()
+            found[COLUMNS.get(name.lower(), name)] = numbers
+    return found
 
 
 def _mat(path: Path) -> dict[str, np.ndarray]:
@@ -128,12 +169,7 @@ def _mat(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # whatever its reader stumbles over in a damaged or newer file
         words = f"is no .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
         raise UserError(f"{path}: {words}") from None
-    found = {}
-    for name, value in variables.items():
-        numbers = np.asarray(value).ravel()
-        if not name.startswith("__") and numbers.dtype.kind in "iufc":
-            found[COLUMNS.get(name.lower(), name)] = numbers
-    return found
+    return _named(variables)
 
 
 def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
@@ -141,7 +177,10 @@ def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
         raise UserError(f"{path}: has no column f_hz; name the frequencies so")
     hz = np.real(columns["hz"]).astype(float)
     if "G" in columns:
-        return MeasuredResponse(hz, np.asarray(columns["G"], complex))
+        G = np.asarray(columns["G"], complex)
+        if G.ndim == 3 and len(G) != len(hz):  # lines last, as MATLAB has them
+            G = np.moveaxis(G, -1, 0)
+        return MeasuredResponse(hz, G)
     if "re" in columns and "im" in columns:
         return MeasuredResponse(hz, columns["re"] + 1j * columns["im"])
     size = columns.get("size")
@@ -154,166 +193,3 @@ def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
         words = "needs re and im, or magnitude (or magnitude_db) and phase_deg (or phase_rad)"
         raise UserError(f"{path}: {words}")
     return MeasuredResponse(hz, size * np.exp(1j * angle))
-
-
-def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
-    """K at frequencies in Hz; with a period by Tustin's rule, without prewarping."""
-    runs = K if period is None else tustin(K, period)
-    return runs.response(HZ * np.asarray(hz, float))[:, 0, 0]
-
-
-@dataclass(frozen=True)
-class Extended:
-    """A measured response with G as c (jω)^-n on further lines below; `first` of the measured ones.
-
-    `gap`: the angle between G there and its asymptote.
-    """
-
-    hz: Array
-    G: np.ndarray
-    first: int
-    poles_at_zero: int
-    gap: float
-
-
-def extended(measured: MeasuredResponse, poles_at_zero: int | None = None) -> Extended:
-    """Three decades further down; n by the slope of |G| at its first lines where none is given."""
-    hz, G = measured.hz, measured.G
-    n = poles_at_zero
-    if n is None:
-        many = max(3, int(np.searchsorted(hz, 1.5 * hz[0])))
-        x, y = np.log(hz[:many]), np.log(np.abs(G[:many]))
-        n = max(0, round(-float(np.polyfit(x, y, 1)[0])))
-    angle = float(np.angle(G[0]))
-    asymptotes = -0.5 * np.pi * n + np.pi * np.arange(-4, 5)
-    nearest = float(asymptotes[np.argmin(np.abs(angle - asymptotes))])
-    below = np.geomspace(10.0**-BELOW * hz[0], hz[0], 25 * BELOW + 1)[:-1]
-    turned = np.clip(1.0 + np.log10(below / hz[0]), 0.0, 1.0)  # within the last decade
-    phase = nearest + turned * (angle - nearest)
-    G_below = np.abs(G[0]) * (below / hz[0]) ** -n * np.exp(1j * phase)
-    return Extended(np.append(below, hz), np.append(G_below, G), len(below), n,
-                    abs(angle - nearest))  # fmt: skip
-
-
-def judge(
-    measured: MeasuredResponse,
-    K: StateSpace,
-    bounds: Bounds,
-    *,
-    period: float | None = None,
-    unstable_poles: int = 0,
-    poles_at_zero: int | None = None,
-    integrator: bool = True,
-) -> MeasuredFigures:
-    """The figures of an SI controller (e in, u out) on the lines.
-
-    `period` in s: K is sampled, and G was measured as the controller sees it, hold and delay in it.
-    `unstable_poles` and `poles_at_zero` of G; the latter by default by the slope of its first
-    lines. `integrator` of K: then the shape counts from 0 on, else from ω_low.
-    """
-    if period is not None and measured.hz[-1] > 0.5 / period:
-        raise UserError("the lines reach beyond half the sampling rate; drop those above")
-    whole = extended(measured, poles_at_zero)
-    k = controller_response(K, whole.hz, period)
-    Z, doubts = winding(whole, whole.G * k, unstable_poles, int(integrator))
-    head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
-    assumed = (
-        f"{head} by the winding of 1 + GK, with {unstable_poles} unstable poles of G, and G as "
-        f"(jω)^-{whole.poles_at_zero} below {measured.hz[0]:.4g} Hz and |GK| < 1 above "
-        f"{measured.hz[-1]:.4g} Hz"
-    )
-    words, sure = "; ".join([assumed, *doubts]), not doubts
-    if Z != 0:
-        none = dict.fromkeys(FIGURES, np.nan)
-        return MeasuredFigures(False, sure, Z, words=words, **none)
-    hz, G, k = measured.hz, measured.G, k[whole.first :]
-    L = G * k
-    S = 1.0 / (1.0 + L)
-    omega = HZ * hz
-    KS, T = np.nan, np.nan
-    if bounds.weights is not None:
-        _, W_KS, W_T = np.abs(bounds.weights.responses(omega))
-        KS, T = float(np.abs(W_KS * k * S).max()), float(np.abs(W_T * L * S).max())
-    ln_S = np.log(np.abs(S))
-    at = int(np.argmax(ln_S))
-    between = clearances(hz, L)
-    return MeasuredFigures(
-        stable=True,
-        sure=sure,
-        right_half_plane=0,
-        S_peak=float(np.abs(S[at])),
-        S_peak_frequency=float(omega[at]),
-        S_between=float(1.0 / between.min()) if (between > 0.0).all() else np.inf,
-        S_low=float(np.exp(np.interp(np.log(bounds.omega_low), np.log(omega), ln_S))),
-        bandwidth=_bandwidth(omega, ln_S, bounds, integrator),
-        KS=float(np.abs(k * S).max()),
-        T=float(np.abs(L * S).max()),
-        GS=float(np.abs(G * S).max()),
-        weighted_KS=KS,
-        weighted_T=T,
-        words=words,
-    )
-
-
-def clearances(hz: Array, L: np.ndarray) -> Array:
-    """Least distance of -1 to L between neighbouring lines (k - 1,): to the chord, less r."""
-    start, step = 1.0 + L[:-1], np.diff(L)
-    size = np.abs(step) ** 2
-    share = np.clip(-(start * step.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
-    return np.asarray(np.abs(start + share * step) - interpolation_errors(hz, L))
-
-
-def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
-    """r between neighbouring lines (k - 1,), by second divided differences over ln f."""
-    x = np.log(hz)
-    slope = np.diff(L) / np.diff(x)
-    second = np.abs(2.0 * np.diff(slope) / (x[2:] - x[:-2]))
-    around = np.concatenate([second[:1], second, second[-1:]])  # at each line
-    wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
-    each = np.maximum(around, wider)
-    return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
-
-
-def winding(
-    whole: Extended, L: np.ndarray, unstable_poles: int = 0, integrators: int = 0
-) -> tuple[int, list[str]]:
-    """Z of L = GK (with `integrators` of K) on the extended lines, and what the data leave open."""
-    F = 1.0 + L
-    q = whole.poles_at_zero + integrators
-    begins = float(np.angle(F[0]))
-    asymptotes = -0.5 * np.pi * q + np.pi * np.arange(-4, 5)
-    first = float(asymptotes[np.argmin(np.abs(begins - asymptotes))])
-    grown = begins - first + float(np.angle(F[1:] / F[:-1]).sum() - np.angle(F[-1]))
-    Z = round(unstable_poles + 0.5 * q - grown / np.pi)
-    hz, measured = whole.hz[whole.first :], L[whole.first :]
-    near = int((clearances(hz, measured) <= 0.0).sum())
-    doubts = []
-    if whole.gap > GAP:
-        doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
-    if q > 0 and abs(measured[0]) < LARGE:
-        doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large")
-    if abs(measured[-1]) > SMALL:
-        doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
-    if near:
-        doubts.append(f"between {near} pairs of lines GK may pass -1")
-    return Z, doubts
-
-
-def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
-    """The largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape."""
-    level = np.log(HALF_POWER)
-    above = np.flatnonzero(ln_S > level)
-    crossing = float(omega[-1])
-    if len(above):
-        i = int(above[0])
-        if i == 0:
-            return 0.0
-        share = (level - ln_S[i - 1]) / (ln_S[i] - ln_S[i - 1])
-        crossing = float(np.exp(np.log(omega[i - 1]) + share * np.log(omega[i] / omega[i - 1])))
-    if bounds.shape is None:
-        return crossing
-    counted = omega if integrator else np.maximum(omega, bounds.omega_low)
-    allowed = bounds.shape * counted * HALF_POWER / np.exp(ln_S)
-    if bounds.shape_ends is ShapeEnd.CROSSING:
-        allowed = allowed[omega <= crossing]
-    return float(min(crossing, allowed.min()))

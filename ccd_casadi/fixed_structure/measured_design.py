@@ -1,48 +1,47 @@
-"""The largest bandwidth of a fixed structure on a measured frequency response, without a model.
+"""The largest bandwidth of a fixed structure on measured responses, without a model.
 
-    max ω_b   s.t.  1 + GK winds as a stable loop does, and on every line
+    max ω_b   s.t.  det(I + GK) winds as a stable loop's does on every response, and on every line
                     |S| <= S_max,  |S| <= 1/√2 below ω_b,  |S| <= shape (ω/ω_b)/√2,
                     |S(jω_low)| <= S_low,
                     |W_KS KS|, |W_T T| <= weighted_level,  |GS| <= compliance_max
 
-Every line is a row of its own, with exact derivatives to κ; ω_b and ω_low lie between lines, where
-ln|S| is a straight line over ln ω. The search is `local_search`'s, from controllers by rules whose
-winding is right; the judge is `measured.judge`.
+with |M| the largest singular value. Starts and searches are those of models, on `line_problem`; the
+judge is `measured_loop.judge`. Of several channels each is designed on its own entry of
+Uᵀ G V first, and the search on the whole begins where these are stable together.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.local_search import descend
-from ccd_casadi.fixed_structure.loop_problem import Constraints, Curve, log_weights
-from ccd_casadi.fixed_structure.measured import (
-    MeasuredFigures,
-    MeasuredResponse,
-    extended,
-    judge,
-    winding,
-)
-from ccd_casadi.fixed_structure.structure import (
-    Kind,
-    Structure,
-    response,
-    response_and_slopes,
-    second_slopes,
-    state_space,
-)
-from ccd_casadi.kernels.limits import HALF_POWER
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_design import TIGHTENED
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure, controller_of
+from ccd_casadi.fixed_structure.decoupling import Decoupling
+from ccd_casadi.fixed_structure.line_problem import LineProblem, line_problem
+from ccd_casadi.fixed_structure.local_search import LoopModel, Point, ascend, descend
+from ccd_casadi.fixed_structure.loop_problem import Problem
+from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.fixed_structure.measured_loop import MeasuredFigures, judge_all
+from ccd_casadi.fixed_structure.race import finished, run_race
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.starts import at_random, by_rules
+from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.optim.trust_region import Iterate, Model, Rows
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
 
+FEWER = 600  # lines that starts of single channels are designed on
 MARGIN = 1e-6  # in logarithms: what is designed lies so far within its bounds
-RELEVANT = -1.0  # ln of a figure over its bound below which a line is none of ours
-RACED = 4  # starts that climb
-SHORT = 0.05  # of ω over a crossover that a start aims at: its bandwidth at first
+EXCEEDED = 1e-5  # relative: of a bound, by rounding
+CROSSOVERS = np.geomspace(1e-4, 1.0, 24)  # of starts, over ω₀
+NO_START = (
+    "no start is stable by its winding: this structure may not stabilise the plant; of data give "
+    "poles_at_zero, or more low lines"
+)
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class MeasuredDesign:
     every line. `words` say what is missing.
     """
 
-    structure: Structure
+    structure: Structure | ChannelStructure
     kappa: Array
     controller: StateSpace | None
     bandwidth: float
@@ -64,202 +63,159 @@ class MeasuredDesign:
 
 
 def design_on_data(
-    measured: MeasuredResponse,
-    structure: Structure,
+    measured: MeasuredResponse | Sequence[MeasuredResponse],
+    structure: Structure | ChannelStructure,
     bounds: Bounds,
     *,
     period: float | None = None,
-    unstable_poles: int = 0,
-    poles_at_zero: int | None = None,
     starts: int = 12,
     seed: int = 0,
+    effort: float | None = None,
+    given_up: float = 0.0,
     progress: Callable[[str], None] | None = None,
+    workers: Pool | None = None,
 ) -> MeasuredDesign:
-    """max ω_b of a structure on the lines; `period`, `unstable_poles` as in `judge`.
+    """max ω_b over the parameters of a structure, with every bound on every line of every response.
 
-    `poles_at_zero`: those of G; by default by the slope of |G| at its first lines. The frequencies
-    of K lie between a tenth of the first line and three times the last, sampled 2/T at most.
+    `period` (s): K is sampled and the responses hold hold and delay, as the controller sees them.
+    A structure of one channel on responses of several is that of each channel of
+    `static_decoupling`. With an `effort` also |KS| <= effort/|G|, the mean over the two octaves
+    about ω_b, where G has its least singular value. Of the bandwidth the share `given_up` is given
+    in the end for integral gain. Raises UserError for responses of unlike shape, or lines beyond
+    half the sampling rate.
     """
-    model = _OnLines(measured, structure, bounds, period, unstable_poles, poles_at_zero)
+    responses = [measured] if isinstance(measured, MeasuredResponse) else list(measured)
+    shapes = {one.matrix.shape[1:] for one in responses}
+    if len(shapes) != 1:
+        raise UserError("the measured responses have unlike numbers of channels; give one kind")
+    if period is not None and any(one.hz[-1] > 0.5 / period for one in responses):
+        raise UserError("the lines reach beyond half the sampling rate; drop those above")
+    if shapes != {(1, 1)} and isinstance(structure, Structure):
+        decoupling = static_decoupling(responses[0])
+        structure = ChannelStructure(decoupling, (structure,) * len(decoupling.names))
     tell = progress or (lambda words: None)
-    tried = (model.at(np.append(*start)) for start in _starts(model, starts, seed))
-    points = [point for point in tried if point is not None]
-    points = sorted(points, key=lambda point: point.violation)[:RACED]
-    if not points:
-        words = "no start is stable by its winding; give poles_at_zero, or more low lines"
+    problem = line_problem(responses, structure, bounds, period, MARGIN, effort)
+    if isinstance(structure, ChannelStructure):
+        pool, spent = _channels_stacked(problem, structure, period, starts, seed, tell, workers)
+    else:
+        pool, spent = _pool(problem, starts, np.random.default_rng(seed)), 0
+    if not len(pool):
         nothing = np.full(len(structure.names), np.nan)
-        return MeasuredDesign(structure, nothing, None, np.nan, None, False, words, 0)
-    ends, steps = [], 0
-    for point in points:
-        end, count = descend(model, point, np.zeros((len(point.x), len(point.x))), MARGIN)
-        steps += count
-        ends.append(end)
-        tell(f"{np.exp(end.x[-1]) / HZ:.2f} Hz, bounds exceeded by {end.violation:.1g}")
-    best = min(ends, key=lambda end: (end.violation > 1e-5, -end.x[-1]))
-    kappa = best.x[:-1]
-    controller = state_space(structure, kappa)
-    figures = judge(
-        measured, controller, bounds, period=period, unstable_poles=unstable_poles,
-        poles_at_zero=poles_at_zero, integrator=structure.integrator,
-    )  # fmt: skip
+        return MeasuredDesign(structure, nothing, None, np.nan, None, False, NO_START, spent)
+    best: MeasuredDesign | None = None
+    for runner in finished(run_race(problem, np.array(pool), tell, workers)):
+        end = ascend(problem, runner.point, iterations=60, radius=1e-2, penalty=400.0)
+        spent += runner.evaluations + end.evaluations
+        kappa = _more_integral(problem, end.point, given_up) if given_up else end.point.kappa
+        design = _judged(problem, kappa, period, spent)
+        if best is None or design.usable:
+            best = design
+        if best.usable:
+            break
+    assert best is not None
+    return best
+
+
+def _more_integral(problem: LineProblem, point: Point, share: float) -> Array:
+    """κ with the largest Π k ω_i = lim sK of the channels at this share of ω_b less.
+
+    ω_b asks for no more of it than S needs; a slow force moves the plant by its inverse.
+    """
+    parts = [name.endswith(("gain", "integrator")) for name in problem.structure.names]
+    slope, floor = -np.array(parts, float), point.tau + float(np.log(1.0 - share))
+    model = LoopModel(problem, lambda kappa: (float(slope @ kappa), slope), 0.0, floor)
+    begin = model.assessed(point.kappa, point.tau, point.assessment)
+    if begin is None:
+        return point.kappa
+    end, _ = descend(model, begin, np.zeros(2 * begin.x.shape), problem.margin)
+    return point.kappa if end.violation > problem.margin else end.x[:-1]
+
+
+def static_decoupling(measured: MeasuredResponse) -> Decoupling:
+    """Directions in which a response of several channels moves in its first decade, by falling
+    gain: the singular vectors of R in G ~ R (f₁/jf)^n, the mean over the lines."""
+    hz = measured.hz
+    first = hz <= 10.0 * hz[0]
+    turned = measured.matrix[first] * ((1j * hz[first] / hz[0]) ** measured.slope)[:, None, None]
+    U, _, Vt = np.linalg.svd(turned.real.mean(axis=0))
+    if U.shape != Vt.shape:
+        raise UserError("the response has not as many inputs as outputs; leave some out")
+    names = tuple(str(i + 1) for i in range(len(U)))
+    return Decoupling(names, U, Vt.T)
+
+
+def _judged(
+    problem: LineProblem, kappa: Array, period: float | None, spent: int
+) -> MeasuredDesign:
+    """The controller at κ and what the judge says of it."""
+    structure, bounds, plants = problem.structure, problem.bounds, problem.plants
+    si = structure.in_units(kappa, plants.omega_0, plants.force)
+    K = controller_of(structure, si)
+    figures = judge_all(
+        problem.responses, K, bounds, period=period, integrator=structure.integrator
+    )
     broken = [f"{name} by {ratio - 1.0:.2g}" for name, ratio in bounds.shares(figures).items()
-              if figures.stable and not ratio <= 1.0 + 1e-5]  # fmt: skip
+              if figures.stable and not ratio <= 1.0 + EXCEEDED]  # fmt: skip
     words = figures.words
     if broken:
         words = f"exceeds its bound on {', '.join(broken)} (relative); {words}"
     usable = figures.stable and figures.sure and not broken
     return MeasuredDesign(
-        structure, kappa, controller, figures.bandwidth, figures, usable, words, steps
+        structure, si, K, figures.bandwidth, figures, usable, words, spent
     )
 
 
-class _OnLines(Model[Constraints]):
-    """The lines as rows over x = (κ, τ), κ in SI."""
-
-    corrected = True
-
-    def __init__(
-        self,
-        measured: MeasuredResponse,
-        structure: Structure,
-        bounds: Bounds,
-        period: float | None,
-        unstable_poles: int,
-        poles_at_zero: int | None,
-    ) -> None:
-        self.structure, self.bounds, self.G = structure, bounds, measured.G
-        self.hz, self.omega = measured.hz, HZ * measured.hz
-        self.unstable_poles = unstable_poles
-        self.s = 1j * self.omega
-        fastest = 3.0 * self.omega[-1]
-        if period is not None:
-            self.s = 2j / period * np.tan(0.5 * self.omega * period)
-            fastest = min(fastest, 2.0 / period)
-        self.whole = extended(measured, poles_at_zero)
-        below = 1j * HZ * self.whole.hz[: self.whole.first]
-        if period is not None:
-            below = 2j / period * np.tan(0.5 * below.imag * period)
-        self.below = below
-        inverse = 1.0 / np.abs(self.G)
-        self.box = structure.bounds(
-            (0.1 * self.omega[0], fastest), (1e-3 * inverse.min(), 1e3 * inverse.max())
-        )
-
-        self.low, self.high = np.append(self.box[0], -np.inf), np.append(self.box[1], np.inf)
-
-    def at(self, x: Array) -> Iterate[Constraints] | None:
-        """Every line within a factor e of its bound, and the two points between lines."""
-        kappa, tau = np.clip(x[:-1], *self.box), float(x[-1])
-        n = len(kappa)
-        K, g, _ = response_and_slopes(self.structure, kappa, self.s)
-        L = self.G * K
-        low = self.whole.G[: self.whole.first] * response(self.structure, kappa, self.below)
-        joint = np.append(low, L)
-        integrators = int(self.structure.integrator)
-        stable = winding(self.whole, joint, self.unstable_poles, integrators)[0] == 0
-        if not stable or not np.log(self.omega[0]) < tau < np.log(self.omega[-1]):
-            return None
-        S = 1.0 / (1.0 + L)
-        of_s, of_t = -((1.0 - S)[:, None] * g).real, (S[:, None] * g).real
-        ln_S, bounds, omega = np.log(np.abs(S)), self.bounds, self.omega
-        lines = np.arange(len(omega))
-        parts = [(Curve.S_MAX, lines, ln_S - np.log(bounds.S_max), of_s, np.zeros(len(omega)))]
-        below = lines[np.log(omega) <= tau]
-        level = ln_S + HALF_POWER
-        parts.append((Curve.LEVEL, below, level[below], of_s[below], np.zeros(len(below))))
-        if bounds.shape is not None:
-            at = lines if bounds.shape_ends is ShapeEnd.S_MAX else below
-            counted = omega[at]
-            if not self.structure.integrator:
-                counted = np.maximum(counted, bounds.omega_low)
-            shaped = np.log(bounds.shape * counted) - tau
-            parts.append((Curve.SHAPE, at, level[at] - shaped, of_s[at], np.ones(len(at))))
-        ends = (
-            (Curve.CROSSING, tau, -HALF_POWER),
-            (Curve.S_LOW, np.log(bounds.omega_low), np.log(bounds.S_low)),
-        )
-        for kind, place, level in ends:
-            i = int(np.clip(np.searchsorted(np.log(omega), place), 1, len(omega) - 1))
-            width = np.log(omega[i] / omega[i - 1])
-            share = np.clip((place - np.log(omega[i - 1])) / width, 0.0, 1.0)
-            weights = np.array([1.0 - share, share])
-            value, slope = weights @ ln_S[i - 1 : i + 1], weights @ of_s[i - 1 : i + 1]
-            to_tau = (ln_S[i] - ln_S[i - 1]) / width if kind is Curve.CROSSING else 0.0
-            parts.append((kind, np.array([i]), np.array([value - level]), slope[None],
-                          np.array([to_tau])))  # fmt: skip
-        nothing = np.zeros(len(omega))
-        if bounds.weighted_level is not None and bounds.weights is not None:
-            W, _ = log_weights(bounds.weights, omega)
-            level = np.log(bounds.weighted_level)
-            ln_K = np.log(np.abs(K))
-            parts.append((Curve.KS, lines, ln_K + ln_S + W[0] - level, of_t, nothing))
-            ln_T = np.log(np.abs(L)) + ln_S
-            parts.append((Curve.T, lines, ln_T + W[1] - level, of_t, nothing))
-        if bounds.compliance_max is not None:
-            ln_GS = np.log(np.abs(self.G)) + ln_S
-            parts.append((Curve.GS, lines, ln_GS - np.log(bounds.compliance_max), of_s, nothing))
-        curve = np.concatenate([np.full(len(part[1]), part[0]) for part in parts])
-        at, value, to_kappa, to_tau = (
-            np.concatenate([part[i] for part in parts]) for i in (1, 2, 3, 4)
-        )
-        value = value + MARGIN
-        kept = value > RELEVANT
-        rows = Constraints(
-            curve[kept], at[kept], omega[at[kept]], value[kept], to_kappa[kept], to_tau[kept]
-        )
-        violation = max(0.0, float(value.max()))
-        return Iterate(np.append(kappa, tau), -tau, -np.eye(n + 1)[n], violation, rows)
-
-    def rows(self, here: Iterate[Constraints], radius: float) -> Rows:
-        """All of them curved."""
-        rows = here.data
-
-        def second(index: np.ndarray) -> Array:
-            return self.hessians(here.x[:-1], rows.only(index))
-
-        slopes = np.column_stack([rows.to_kappa, rows.to_tau])
-        return Rows(rows.value, slopes, hessians=second, curved=len(rows.v))
-
-    def hessians(self, kappa: Array, rows: Constraints) -> Array:
-        """(m, n + 1, n + 1) at fixed lines: -Re(S T g gᵀ + T ∂²ln K) of S, -Re(S T g gᵀ - S ∂²ln K)
-        of KS and T."""
-        n, s = len(kappa), self.s[rows.plant]
-        K, g, _ = response_and_slopes(self.structure, kappa, s)
-        S = 1.0 / (1.0 + self.G[rows.plant] * K)
-        T = 1.0 - S
-        sign = np.where(np.isin(rows.curve, (Curve.KS, Curve.T)), S, -T)[:, None, None]
-        weighted = sign * second_slopes(self.structure, kappa, s)
-        out = np.zeros((len(s), n + 1, n + 1))
-        out[:, :n, :n] = (weighted - (S * T)[:, None, None] * g[:, :, None] * g[:, None, :]).real
-        return out
+def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[Array]:
+    """Half by rules, the fastest, half at random, of those whose winding is a stable loop's."""
+    single = cast(Problem, problem)  # of one channel
+    inside = CROSSOVERS[2.0 * problem.base[0] < CROSSOVERS]
+    rules = by_rules(single, inside)[::-1]
+    _, first = np.unique(rules, axis=0, return_index=True)  # without notches many are alike
+    found = _some(problem, rules[np.sort(first)], max(starts // 2, 1))
+    slowest = np.exp(problem.begin(found[0])) if found else inside[0]
+    draws = np.exp(rng.uniform(np.log(slowest), np.log(inside[-1]), 12 * starts))
+    return found + _some(problem, at_random(single, draws, rng), starts - len(found))
 
 
-def _starts(model: _OnLines, count: int, seed: int) -> list[tuple[Array, float]]:
-    """PID by the rule of a third at crossovers over the lines, biquads neutral, and jittered."""
-    rng = np.random.default_rng(seed)
-    structure, omega = model.structure, model.omega
-    found = []
-    for crossover in np.geomspace(3.0 * omega[0], 0.3 * omega[-1], max(count, 2)):
-        for turn in range(3):
-            kappa = np.zeros(len(structure.names))
-            for i, (name, kind) in enumerate(zip(structure.names, structure.kinds, strict=True)):
-                share = 1.0
-                if name == "integrator":
-                    share = 0.1
-                elif name.startswith("lead"):
-                    share = 0.33 if name.endswith("zero") else 3.0
-                elif name.startswith("roll-off"):
-                    share = 6.0
-                elif name.startswith("biquad"):
-                    share = 2.0
-                if kind is Kind.FREQUENCY:
-                    kappa[i] = np.log(share * crossover)
-                elif kind is Kind.DAMPING:
-                    kappa[i] = np.log(0.7)
-            kappa[1:] += 0.5 * turn * rng.normal(size=len(kappa) - 1)
-            at = int(np.argmin(np.abs(omega - crossover)))
-            K = response_and_slopes(structure, kappa, model.s[at : at + 1])[0][0]
-            kappa[0] = -np.log(abs(model.G[at] * K))
-            tau = float(np.log(max(SHORT * crossover, 1.01 * omega[0])))
-            found.append((kappa, tau))
+def _some(problem: LineProblem, kappa: Array, most: int) -> list[Array]:
+    """The first `most` that are stable."""
+    found: list[Array] = []
+    for one in kappa:
+        if len(found) < most and problem.stable(one):
+            found.append(one)
     return found
+
+
+def _channels_stacked(
+    problem: LineProblem,
+    structure: ChannelStructure,
+    period: float | None,
+    starts: int,
+    seed: int,
+    tell: Callable[[str], None],
+    workers: Pool | None,
+) -> tuple[list[Array], int]:
+    """The channels' own designs as one κ, with ever tighter S_max until it is stable."""
+    U, V = structure.decoupling.outputs, structure.decoupling.inputs
+    spent = 0
+    for share in TIGHTENED:
+        parts = []
+        for i in structure.free:
+            limits = problem.bounds.of_channel(i)
+            limits = replace(limits, S_max=1.0 + share * (limits.S_max - 1.0))
+            entries = [one.entry(U[:, i], V[:, i], FEWER) for one in problem.responses]
+            name = structure.decoupling.names[i]
+            design = design_on_data(
+                entries, structure.structures[i], limits, period=period, starts=starts, seed=seed,
+                effort=problem.effort,
+                progress=lambda words, name=name: tell(f"channel {name}: {words}"), workers=workers,  # type: ignore[misc]
+            )  # fmt: skip
+            spent += design.steps
+            parts.append(design.kappa)
+        stack = np.concatenate(parts)
+        if not np.isfinite(stack).all():
+            return [], spent
+        kappa = np.clip(in_problem_units(problem, stack), *problem.box)
+        if problem.stable(kappa):
+            return [kappa], spent
+    return [], spent

@@ -17,7 +17,6 @@ from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
 
-FIRST = float(np.log(0.1))  # τ at the start, ω_b over ω₀
 ROUNDS = (15, 30, 60, 60, 60, 60, 60, 60)  # steps of each
 HALVINGS = 3  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
@@ -90,7 +89,8 @@ def run_race(
 
 def started(problem: LoopProblem, kappa: Array) -> Point:
     """A controller at the bandwidth that searches start from."""
-    return Point(kappa, FIRST, assess(problem, kappa, FIRST))
+    tau = problem.begin(kappa)
+    return Point(kappa, tau, assess(problem, kappa, tau))
 
 
 def finished(runners: Sequence[Runner]) -> list[Runner]:

@@ -26,16 +26,6 @@ SKEWED = (
 )
 
 
-def resonances(problem: Problem) -> Array:
-    """|p| of the flexible modes of the first plant that the loop sees, the strongest first."""
-    plants = problem.plants
-    p, r = plants.poles[0], plants.residues[0, :, 0, 0]
-    light = (p.imag > 0.0) & (-p.real < 0.2 * np.abs(p))
-    strength = np.abs(r) / np.maximum(-p.real, 1e-300)
-    order = np.argsort(-strength[light])
-    return np.asarray(np.abs(p[light])[order])
-
-
 def by_rules(problem: Problem, crossovers: Array) -> Array:
     """(N, n) controllers by rules: PID with roll-off at each crossover, notches at resonances.
 
@@ -43,7 +33,7 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
     notches at the first resonance too, which turn its circle away from -1; where the shape ends at
     ω_b the last one is a filter at the crossover instead.
     """
-    tops, count = resonances(problem), problem.structure.biquads
+    tops, count = problem.resonances, problem.structure.biquads
     shapes = [(0.5, 1.0, 0.0), (1.0, 1.0, 0.0), (0.5, 0.8, 0.0), (0.5, 1.25, 0.0)]
     narrow = problem.bounds.shape is None or problem.bounds.shape_ends is ShapeEnd.CROSSING
     if count > 1 and narrow:
@@ -75,7 +65,7 @@ def by_rules(problem: Problem, crossovers: Array) -> Array:
 
 def at_random(problem: Problem, crossovers: Array, rng: np.random.Generator) -> Array:
     """(N, n) random controllers with these crossovers."""
-    tops = resonances(problem)
+    tops = problem.resonances
     found = []
     for crossover in crossovers:
         values = _around(problem, float(crossover), rng, 1.0)
@@ -144,8 +134,7 @@ def with_crossover(problem: Problem, kappa: Array, crossovers: Array) -> Array:
     v = problem.plants.variable(np.asarray(crossovers, float))
     kappa[:, kinds] = 0.0
     K = response(problem.structure, kappa.T, 1j * v)
-    G = problem.plants.responses(np.zeros(len(v), int), v)[0][:, 0, 0]
-    kappa[:, kinds] = -np.log(np.abs(G * K))[:, None]
+    kappa[:, kinds] = -np.log(np.abs(problem.first_response(v) * K))[:, None]
     return np.clip(kappa, *problem.box)
 
 

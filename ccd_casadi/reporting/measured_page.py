@@ -1,13 +1,16 @@
 """The page of a controller on a measured response: figures, sections, the loop on its lines."""
 
+from collections import defaultdict
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.fixed_structure.measured import clearances, controller_response
+from ccd_casadi.fixed_structure.measured_loop import between, controller_response
+from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
 from ccd_casadi.reporting.lines import Curve, Level, figure_lines
@@ -23,7 +26,7 @@ from ccd_casadi.reporting.page import (
     paragraph,
 )
 from ccd_casadi.reporting.sections_page import controller_html
-from ccd_casadi.reporting.svg import GREY
+from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import HZ
 from surrogates.files import write_whole
@@ -36,10 +39,11 @@ def write_measured(
 ) -> Path:
     """Write `folder`/report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
-    lines = f"{len(case.response.hz)} lines of {case.file}"
+    lines = f"{len(case.responses[0].hz)} lines of {case.file}"
+    basis = " and by the poles of the closed loop" if answer.get("models") else "; no model"
     lead = (
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
-        f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}; no model."
+        f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}{basis}."
     )
     head = header(
         f"Controller on {case.file}", good, "verified" if good else "not verified",
@@ -57,29 +61,39 @@ def write_measured(
 
 
 def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> str:
-    """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight."""
-    hz, G, bounds = case.response.hz, case.response.G, case.bounds
-    K = controller_response(controller, hz, case.period)
-    L = G * K
-    S, ends = 1.0 / (1.0 + L), (float(hz[0]), float(hz[-1]))
-    size = np.abs(S)
-    room = clearances(hz, L)
-    between = np.full(len(room), np.nan)  # what |S| may reach between two lines, at their middle
-    between[room > 0.0] = 1.0 / room[room > 0.0]
-    top = 2.5 * max(bounds.S_max, float(size.max()))
+    """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight.
+
+    Of several channels the largest singular values, and the loops opened one at a time.
+    """
+    bounds, curves, loci = case.bounds, defaultdict(list), []
+    for one, colour in zip(case.responses, cycle((BLUE, GREEN, ORANGE)), strict=False):
+        hz, K = one.hz, controller_response(controller, one.hz, case.period)
+        joint = one.matrix @ K
+        S, reach = sensitivity(joint), between(hz, joint)  # drawn at the middle of two lines
+        curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
+                                       np.where(reach < np.inf, reach, np.nan), colour=GREY,
+                                       width=0.9))  # fmt: skip
+        gains = {"G": one.matrix, "S": S, "KS": K @ S, "T": joint @ S}
+        for name, M in gains.items():
+            curves[name].append(Curve(hz, largest(M), colour=colour))
+        loops = [open_alone(joint, i) for i in range(joint.shape[1])]
+        curves["L"] += [Curve(hz, np.abs(L), colour=colour) for L in loops]
+        loci += loops
+    hz, size = curves["S"][0].x, curves["S"][0].y
+    ends = (float(hz[0]), float(hz[-1]))
+    top = 2.5 * max(bounds.S_max, *(float(curve.y.max()) for curve in curves["S"]))
     at = bandwidth_level(answer["bandwidth_hz"])
-    locus = np.where(np.abs(L) <= FAR, L, np.nan)
-    allowed = Curve(np.sqrt(hz[1:] * hz[:-1]), between, "at most between lines", GREY, width=0.9)
+    shown = [np.where(np.abs(L) <= FAR, L, np.nan) for L in loci]
     rows = [
         [sensitivity_panel(
-            (allowed, Curve(hz, size, "at the lines")), ends, bounds.S_max, (at,), "|S| (–)",
+            (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
             y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
-         nyquist_panel([locus], bounds.S_max, HEIGHT)],
-        [over_hz("|G| measured (m/N)", (Curve(hz, np.abs(G)),), ends),
-         over_hz("|L| (–)", (Curve(hz, np.abs(L)),), ends, levels=(Level(1.0, "1"), at))],
-        [over_hz("|KS| (N/m)", (Curve(hz, np.abs(K * S)),), ends, levels=(at,)),
-         over_hz("|T| (–)", (Curve(hz, np.abs(L * S)),), ends, levels=(at,))],
+         nyquist_panel(shown, bounds.S_max, HEIGHT)],
+        [over_hz("|G| measured (m/N)", curves["G"], ends),
+         over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))],
+        [over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
+         over_hz("|T| (–)", curves["T"], ends, levels=(at,))],
     ]  # fmt: skip
     svg = figure_lines(rows, key="measured", title="The loop on the measured lines",
                        heights=(HEIGHT, 2.6, 2.6))  # fmt: skip
@@ -90,7 +104,8 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
     )
     table = over_frequency(
         ("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"),
-        hz, np.abs(G), size, L.real, L.imag, np.abs(K * S), np.abs(L * S),
+        hz, curves["G"][0].y, size, loci[0].real, loci[0].imag, curves["KS"][0].y,
+        curves["T"][0].y,
         special=[answer["bandwidth_hz"], answer["sensitivity_peak_hz"]],
     )  # fmt: skip
     return figure_html(svg, words, table)

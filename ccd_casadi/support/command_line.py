@@ -74,11 +74,12 @@ def run_parser(
     *,
     metavar: str = "RUN_DIR",
     about: str = "the folder of a finished solve",
+    nargs: str | None = None,
     without_effect: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
     """As `parser`, with the positional RUN_DIR of a finished run."""
     result = Parser(prog=program(command), description=description)
-    result.add_argument("run", metavar=metavar, type=Path, help=about)
+    result.add_argument("run", metavar=metavar, type=Path, help=about, nargs=nargs)
     _shared(result, without_effect)
     return result
 

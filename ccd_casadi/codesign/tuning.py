@@ -1,0 +1,187 @@
+"""`tune`: the fastest PID with notches for plants that exist, measured or modelled.
+
+A model becomes lines, hold and delay exact, and is designed on as a measured response is. At the
+end it is a model again: the poles of the sampled loop and ‖S‖∞ by a Hamiltonian matrix decide.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.measured_case import MeasuredCase
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.measured import (
+    MeasuredResponse,
+    from_control,
+    read_frequency_response,
+)
+from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
+from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.hold import delayed, in_w, parts, sampled, tustin
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis import interchange
+
+NOTCHES = 3  # at most, where none are asked for
+INSIDE = 2e-3  # of S_max - 1: so far inside it the lines of a model are kept
+PER_DECADE = 60
+BELOW, ABOVE = 3e-3, 0.98  # first line over the slowest root, last line over half the rate
+GIVEN_UP = 0.03  # of the bandwidth, for integral gain
+ROUNDS = 5  # of adding lines where the loop on the model is worse than on the lines
+NEARBY = np.linspace(0.98, 1.02, 9)
+APART = 1e-6  # relative, of lines
+AT_REST = 1e-7  # of the largest root: below, it lies at 0
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """`design` on the lines of `case`; `models`: the plants in discrete time, None where measured.
+
+    `norms`: ‖S‖∞ of each model's closed loop, infinite where its poles are not all stable.
+    """
+
+    case: MeasuredCase
+    design: MeasuredDesign
+    models: tuple[StateSpace | None, ...]
+    norms: tuple[float | None, ...]
+
+    @property
+    def controller(self) -> StateSpace | None:
+        """K(s) in SI, e = r - y to u; it runs by Tustin's rule."""
+        return self.design.controller
+
+
+def tune(
+    plants: Any,
+    *,
+    rate_hz: float | None = None,
+    delay: float = 0.0,
+    S_max: float = 1.8,
+    shape: float = 1.1,
+    effort: float | None = 20.0,
+    structure: Structure | None = None,
+    starts: int = 24,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+    workers: Pool | None = None,
+) -> Tuned:
+    """The largest bandwidth of integrator, lead, notches and a second-order roll-off.
+
+        max ω_b   s.t.  on each plant: stable, |S| <= S_max, |S(jω)| <= 1/√2 for ω <= ω_b,
+                        |S(jω)| <= shape (ω/ω_b)/√2,   |KS| <= effort/|G| about ω_b
+
+    `plants`: one or a list (a set, one controller for all): a file as `read_frequency_response`
+    takes it, a `MeasuredResponse`, or of python-control an FRD, a TransferFunction or a StateSpace.
+    K runs at `rate_hz`: models, stable or not, are held, responses have the hold in them. `delay`
+    (s) comes on top of both. `effort` keeps noise and lead in bounds. `structure`: by default with
+    a biquad for each resonance, three at most.
+
+    Raises UserError for what is no such plant, and for a model without a rate.
+
+    >>> import ccd_casadi as ccd, control
+    >>> found = ccd.tune(control.tf([1.0], [1.0, 3.0, 3.0, 1.0]), rate_hz=10.0, starts=2)
+    >>> found.design.usable, found.design.structure.biquads
+    (True, 0)
+    """
+    given = list(plants) if isinstance(plants, list | tuple) else [plants]
+    if not given:
+        raise UserError("there is no plant to tune for; give one")
+    read = [_plant(item, rate_hz, delay) for item in given]
+    responses = tuple(response for response, _ in read)
+    models = tuple(model for _, model in read)
+    if structure is None:
+        biquads = min(NOTCHES, len(responses[0].resonances))
+        structure = Structure(biquads=biquads, least_damping=0.1)
+    periods = [model.period for model in models if model is not None]
+    period = 1.0 / rate_hz if rate_hz else periods[0] if periods else None
+    bounds = Bounds(S_max, S_max, HZ * max(one.hz[0] for one in responses), shape)
+    names = [Path(item).name if isinstance(item, str | Path) else "" for item in given]
+    name = ", ".join(n or f"plant {i}" for i, n in enumerate(names, 1))
+    inside = INSIDE * (S_max - 1.0) if periods else 0.0
+    for _ in range(ROUNDS):
+        aim = replace(bounds, S_max=S_max - inside)
+        design = design_on_data(responses, structure, aim, period=period, starts=starts, seed=seed,
+                                effort=effort, given_up=GIVEN_UP, progress=progress,
+                                workers=workers)  # fmt: skip
+        peaks = [None if G is None else _peak(G, design.controller) for G in models]
+        over = [(i, *peak) for i, peak in enumerate(peaks) if peak and not peak[0] <= S_max]
+        if not (design.usable and over):
+            break
+        inside *= 2.0
+        responses = tuple(one if G is None else _finer(one, G, [omega for _, _, omega in over])
+                          for one, G in zip(responses, models, strict=True))  # fmt: skip
+    if design.usable and over:
+        words = f"the closed loop with plant {over[0][0] + 1} has ‖S‖∞ = {over[0][1]:.4g}"
+        design = replace(design, usable=False, words=f"{words}; {design.words}")
+    case = MeasuredCase(Path(name), name, responses, structure, bounds, period, starts)
+    return Tuned(case, design, models, tuple(peak and peak[0] for peak in peaks))
+
+
+def _plant(
+    item: Any, rate_hz: float | None, delay: float
+) -> tuple[MeasuredResponse, StateSpace | None]:
+    """The response as the controller sees it; of a model also itself in discrete time."""
+    if isinstance(item, str | Path):
+        item = read_frequency_response(item)
+    elif hasattr(item, "frdata"):
+        item = from_control(item)
+    if isinstance(item, MeasuredResponse):
+        kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
+        lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
+        G = (item.matrix * lag).reshape(item.G.shape)
+        return replace(item, hz=item.hz[kept], G=G[kept]), None
+    system, own = interchange.from_control(item)
+    if own and rate_hz is None:
+        rate_hz = 1.0 / own
+    if rate_hz is None:
+        words = "rate_hz is missing: without a rate no model limits the bandwidth of its controller"
+        raise UserError(f"{words}; give that of the controller, and its delay")
+    if system.D.any():
+        raise UserError("the plant has feedthrough; give it the lag of its sensor or actuator")
+    T = 1.0 / rate_hz
+    if not own:
+        model = sampled(system, T, delay)
+    elif not np.isclose(own, T) or not np.isclose(parts(T, delay)[1], 0.0, atol=1e-6 * T):
+        raise UserError("a plant in discrete time runs at its rate, and a delay of whole periods")
+    else:
+        whole = parts(T, delay)[0]
+        model = delayed(system.A, [0.0 * system.B] * whole + [system.B], system.C, T)
+    system = replace(system, period=own)
+    top, rates = np.pi / T, system.rates
+    rest = np.abs(rates) <= AT_REST * np.abs(rates).max(initial=0.0)
+    zeros = system.rates_of(system.zeros(1.0 if own else top))
+    if (np.abs(zeros) <= AT_REST * top).any():
+        raise UserError("the plant has a zero at 0: no controller holds its output in the end")
+    roots = np.concatenate([rates[~rest], zeros, [top]])
+    low = BELOW * np.abs(roots[np.abs(roots) > 1e-9 * top]).min()
+    omega = frequency_grid(low, ABOVE * top, int(PER_DECADE * np.log10(top / low)),
+                           around(roots), apart=APART)  # fmt: skip
+    unstable = int((rates[~rest].real > 0.0).sum())
+    G = model.response(omega)
+    one = G.shape[1:] == (1, 1)
+    found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable, modelled=True)
+    return found, model
+
+
+def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:
+    """‖S‖∞ of the sampled loop and its ω in rad/s; infinite where it is not stable."""
+    if K is None:
+        return np.inf, np.nan
+    norm, v = hinf_norm(in_w(closed_loop(G, tustin(K, G.period)).S))
+    return norm, float(2.0 / G.period * np.arctan(0.5 * v * G.period))
+
+
+def _finer(found: MeasuredResponse, G: StateSpace, omega: list[float]) -> MeasuredResponse:
+    """With lines where |S| was too large between two, and nearby."""
+    more = (np.array(omega)[:, None] * NEARBY).ravel() / HZ
+    hz = np.unique(np.append(found.hz, more[(more > found.hz[0]) & (more < found.hz[-1])]))
+    hz = hz[np.append(True, np.diff(hz) > APART * hz[1:])]
+    return replace(found, hz=hz, G=G.response(HZ * hz).reshape(len(hz), *found.G.shape[1:]))

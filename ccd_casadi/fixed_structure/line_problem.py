@@ -1,0 +1,276 @@
+"""The problem of a controller on measured lines: the same constraints as on models, without one.
+
+Each line is a plant of its own: one mode whose response at that line is the one that was measured.
+The rows, their slopes and their curvature are so those of every other set (`kernels.loop_rows`), at
+frequencies that do not move. ω_b lies between two lines,
+where ln σ(S) is a straight line over ln v. Stability is the winding of det(I + GK).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.curvature import hessians
+from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.loop import PlantSet
+from ccd_casadi.fixed_structure.loop_problem import (
+    FIRST,
+    Assessment,
+    Constraints,
+    Curve,
+    LoopProblem,
+)
+from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.fixed_structure.measured_loop import winding
+from ccd_casadi.fixed_structure.structure import Structure, response
+from ccd_casadi.kernels import modes
+from ccd_casadi.kernels.loop_curvature import second
+from ccd_casadi.kernels.loop_point import Loop
+from ccd_casadi.kernels.loop_rows import levels, rows
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import HZ
+
+OCTAVES = np.log(2.0) * np.linspace(-1.0, 1.0, 33)  # about ω_b
+STEP = 1e-5  # of τ
+REACH = 0.3  # ω₀ over the last line
+SHORT = 12.0  # ω₀ over the first line at least: searches start from ω_b = 0.1 ω₀
+RELEVANT = -1.0  # ln of a gain over its bound below which a line is none of the rows
+POLE = -1.0 + 1.0j  # of a line's mode, over its frequency
+SLOWEST = 0.01  # |p| T of it at least: below, digits of z - e^{pT} are lost
+
+
+@dataclass(frozen=True)
+class LinePlants(PlantSet):
+    """The lines as plants, each of one pole and its conjugate; `omega` (N,) over ω₀.
+
+    A sampled loop sees what was measured, and a disturbing force is taken to see the same: with
+    z = α + βs at a line and its conjugate, f = β/(z - α - βp) is 1/(s - p) there.
+    """
+
+    omega: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def modes(self) -> modes.Plants:
+        """As the kernels have them."""
+        p, r = self.poles, self.residues
+        residues = np.stack([r.real, r.imag], axis=2)
+        if self.period is None:
+            return modes.Plants(np.stack([p] * 4, axis=-1), residues, 0.0, 0.0)
+        turn = (self.omega * self.period)[:, None]
+        slope = np.sin(turn) / self.omega[:, None]
+        grown = np.cos(turn) + slope * p
+        terms = np.stack([p, slope.astype(complex), np.zeros_like(p), grown], axis=-1)
+        return modes.Plants(terms, residues, self.period, 0.0)
+
+
+@dataclass(frozen=True)
+class LineProblem(LoopProblem):
+    """`responses` as they were measured; `starts`: index of the first line of each, and the end.
+
+    `effort` bounds |KS| by that many times 1/|G| about ω_b. The last plants of the set are the
+    responses at ω_low, one each.
+    """
+
+    responses: tuple[MeasuredResponse, ...] = ()
+    v: Array = field(default_factory=lambda: np.zeros(0))
+    starts: tuple[int, ...] = ()
+    effort: float | None = None
+
+    @cached_property
+    def curves(self) -> tuple[Curve, ...]:
+        """KS too where the effort is bounded."""
+        found = super().curves
+        return found if self.effort is None or Curve.KS in found else (*found, Curve.KS)
+
+    def loop(self, kappa: Array, tau: float) -> Loop:
+        """With the bound of |KS| at this ω_b."""
+        loop = super().loop(kappa, tau)
+        loop.limits[Curve.KS, : self.first] = np.minimum(
+            loop.limits[Curve.KS, : self.first], self.ceiling(tau)[0]
+        )
+        return loop
+
+    def ceiling(self, tau: float) -> tuple[float, float]:
+        """ln of effort times the mean of 1/σ_min(G) over the two octaves about ω_b, of the response
+        where that is largest, and its slope to τ; infinite without an effort."""
+        if self.effort is None:
+            return np.inf, 0.0
+        places = tau + np.array([[0.0], [-STEP], [STEP]]) + OCTAVES
+        means = [np.interp(places, x, y).mean(axis=1) for x, y in self._inverses]
+        value, before, after = max(means, key=lambda mean: float(mean[0]))
+        return float(np.log(self.effort) + value), float(after - before) / (2.0 * STEP)
+
+    @cached_property
+    def _inverses(self) -> list[tuple[Array, Array]]:
+        """ln ω/ω₀ and ln 1/σ_min(G) of every response."""
+        return [(np.log(HZ * one.followed.hz / self.plants.omega_0),
+                 -np.log(self.plants.force * np.linalg.norm(one.followed.G, -2, axis=(1, 2))))
+                for one in self.responses]  # fmt: skip
+
+    @cached_property
+    def base(self) -> Array:
+        """The lines of the first response."""
+        return self.v[: self.starts[1]]
+
+    def begin(self, kappa: Array) -> float:
+        """Half the first crossover of the first response's first entry, ω₀/10 at most."""
+        measured, L = next(self._open(kappa))
+        measured = measured.followed
+        beyond = HZ * measured.hz[np.argmax(np.abs(L[:, 0, 0]) < 1.0)] / self.plants.omega_0
+        return float(np.clip(np.log(0.5 * beyond), np.log(2.0 * self.base[0]), FIRST))
+
+    def stable(self, kappa: Array) -> bool:
+        """Whether the winding on every response is that of a stable loop."""
+        integrators = int(self.structure.integrator)
+        return all(winding(measured, L, integrators)[0] == 0 for measured, L in self._open(kappa))
+
+    def _open(self, kappa: Array) -> Iterator[tuple[MeasuredResponse, np.ndarray]]:
+        """L on the followed lines of every response."""
+        plants, structure = self.plants, self.structure
+        parts = [(structure, kappa)] if isinstance(structure, Structure) else [
+            *structure.split(kappa)
+        ]  # fmt: skip
+        for measured in self.responses:
+            whole = measured.followed
+            s = 1j * plants.variable(HZ * whole.hz / plants.omega_0)
+            k = np.stack([response(own, part, s) for own, part in parts], axis=-1)
+            yield measured, plants.force * whole.G @ (plants.into * k[:, None, :]) @ plants.out
+
+    @cached_property
+    def resonances(self) -> Array:
+        """v at the peaks of the first response, the strongest first."""
+        return self.base[self.responses[0].resonances]
+
+    def first_response(self, v: Array) -> np.ndarray:
+        """G (k,) of the first response's first entry, at the lines next to v."""
+        at = np.clip(np.searchsorted(self.base, v), 0, len(self.base) - 1)
+        return self.plants.responses(at, self.base[at])[0][:, 0, 0]
+
+
+def line_problem(
+    responses: Sequence[MeasuredResponse],
+    structure: Structure | ChannelStructure,
+    bounds: Bounds,
+    period: float | None = None,
+    margin: float = 0.0,
+    effort: float | None = None,
+) -> LineProblem:
+    """The problem on all lines; `period` (s) as in `measured_loop.judge`."""
+    hz = [one.hz for one in responses]
+    low = bounds.omega_low / HZ
+    every = np.concatenate([*hz, np.full(len(hz), low)])
+    G = np.concatenate([one.matrix for one in responses] + [one.at(low)[None] for one in responses])
+    size = np.linalg.norm(G, axis=(1, 2))
+    omega_0 = HZ * max(REACH * min(one[-1] for one in hz), SHORT * max(one[0] for one in hz))
+    force = 1.0 / float(np.exp(np.log(size).mean()))
+    plants = _plants(HZ * every / omega_0, force * G, structure, omega_0, force, period)
+    fastest = 3.0 * HZ * max(one[-1] for one in hz) / omega_0
+    if plants.period is not None:
+        fastest = min(fastest, 2.0 / plants.period)
+    slowest = 0.1 * HZ * min(one[0] for one in hz) / omega_0
+    gains = (1e-3 / (force * float(size.max())), 1e3 / (force * float(size.min())))
+    box = structure.bounds((slowest, fastest), gains)
+    v = plants.variable(HZ * every / omega_0)
+    starts = (0, *np.cumsum([len(one) for one in hz]).tolist())
+    return LineProblem(plants, structure, bounds, box, margin, tuple(responses), v, starts,
+                       effort)  # fmt: skip
+
+
+def _plants(
+    omega: Array,
+    G: np.ndarray,
+    structure: Structure | ChannelStructure,
+    omega_0: float,
+    force: float,
+    period: float | None,
+) -> LinePlants:
+    """A plant for each line with G (N, p, m) there: Re r and Im r solve G = r f + r̄ f̃."""
+    count, p, m = G.shape
+    least = 0.0 if period is None else SLOWEST / (period * omega_0)
+    pole = POLE * np.maximum(omega, least)
+    f, other = 1.0 / (1j * omega - pole), 1.0 / (1j * omega - pole.conj())
+    both, apart = f + other, 1j * (f - other)
+    basis = np.array([[both.real, apart.real], [both.imag, apart.imag]]).transpose(2, 0, 1)
+    parts = np.linalg.solve(basis, np.stack([G.real, G.imag], axis=1).reshape(count, 2, p * m))
+    residues = (parts[:, 0] + 1j * parts[:, 1]).reshape(count, 1, p, m)
+    out = np.eye(p) if isinstance(structure, Structure) else structure.decoupling.outputs.T
+    into = np.eye(m) if isinstance(structure, Structure) else structure.decoupling.inputs
+    A, B, C, D = (np.zeros((1, *shape)) for shape in ((0, 0), (0, m), (p, 0), (p, m)))
+    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
+    T = None if period is None else period * omega_0
+    return LinePlants((), omega_0, force, T, 0.0, pole[:, None], residues, (), A, B, C, D,
+                      out, into, omega)  # fmt: skip
+
+
+@assess.register
+def _(
+    problem: LineProblem,
+    kappa: Array,
+    tau: float,
+    *,
+    within: float | None = None,
+    depth: float | None = None,
+    each: bool = False,
+) -> Assessment:
+    """Every line within a factor e of its bound, the two next to ω_b, and |S| at ω_low."""
+    plants, starts, P = problem.plants, problem.starts, problem.plants.count
+    v, lines = problem.v, problem.starts[-1]
+    crossing = plants.variable(np.exp(tau + problem.leads))
+    inside = all(v[a] < crossing.min() and crossing.max() < v[b - 1]
+                 for a, b in pairwise(starts))  # fmt: skip
+    if not inside or not problem.stable(kappa):
+        return Assessment(False, np.zeros(0), None, None)
+    loop = problem.loop(kappa, tau)
+    codes = np.array(problem.curves, np.int64)
+    every = np.arange(lines)
+    value = levels(np.tile(codes, (lines, 1)), every, v[:lines, None], loop, RELEVANT)[:, 0]
+    short = np.array([problem.ends_at_crossing(curve) for curve in problem.curves])
+    value = np.where(short[:, None] & (v[:lines, None, None] > crossing), -np.inf, value)
+    i, c, k = np.nonzero(value > RELEVANT)
+    at_low = np.flatnonzero(np.isfinite(problem.limits[Curve.S_LOW]))
+    low = (at_low[:, None] * P + np.arange(lines, P)).ravel()
+    curve = np.concatenate([codes[c], np.full(len(low), Curve.S_LOW)])
+    row = np.concatenate([i + k * P, low])
+    found, _, to_kappa, *_ = rows(curve, row // P, row % P, v[row % P], loop)
+    to_tau = np.where(curve == Curve.SHAPE, 1.0, 0.0)
+    to_tau[curve == Curve.KS] = -problem.ceiling(tau)[1]
+    ends = _ends(problem, loop, crossing)
+    parts = zip((curve, row, v[row % P], found, to_kappa, to_tau), ends, strict=True)
+    curve, row, at, found, to_kappa, to_tau = (np.concatenate(part) for part in parts)
+    peaks = Constraints(curve, row, at, found + problem.margin, to_kappa, to_tau)
+    return Assessment(True, np.zeros(0), peaks, peaks.only(np.zeros(0, np.int64)))
+
+
+def _ends(problem: LineProblem, loop: object, crossing: Array) -> tuple[np.ndarray, ...]:
+    """ln|S(jω_b)| + ½ ln 2 of every response and number: curve, row, v, value and slopes."""
+    P, v, rows_of = problem.plants.count, problem.v, []
+    numbers = np.flatnonzero(np.isfinite(problem.limits[Curve.CROSSING]))
+    for number in numbers:
+        place = crossing[number]
+        for a, b in pairwise(problem.starts):
+            i = a + int(np.clip(np.searchsorted(v[a:b], place), 1, b - a - 1))
+            which, at = np.array([i - 1, i]), v[[i - 1, i]]
+            code = np.full(2, Curve.CROSSING)
+            value, _, to_kappa, *_ = rows(code, np.full(2, number), which, at, loop)
+            width = np.log(at[1] / at[0])
+            share = np.log(place / at[0]) / width
+            mean = np.array([1.0 - share, share])
+            slope = (value[1] - value[0]) / width / problem.plants.chain(np.array(place))
+            rows_of.append((number * P + i, at[1], mean @ value, mean @ to_kappa, slope))
+    parts = [np.array(part) for part in zip(*rows_of, strict=True)]
+    return (np.full(len(parts[0]), Curve.CROSSING), *parts)
+
+
+@hessians.register
+def _(problem: LineProblem, kappa: Array, tau: float, found: Constraints) -> Array:
+    """At fixed lines."""
+    n, P = len(kappa), problem.plants.count
+    out = np.zeros((len(found.v), n + 1, n + 1))
+    loop = problem.loop(kappa, tau)
+    out[:, :n, :n] = second(found.curve, found.plant // P, found.plant % P, found.v, loop)
+    return out

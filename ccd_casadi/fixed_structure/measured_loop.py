@@ -1,0 +1,246 @@
+"""A controller judged on the lines of a measured response.
+
+Bounds are held on every line. Between two lines L = GK is taken to lie within r of the chord,
+
+    r = 2 h²/8 max|L''|,   L'' by the second differences at both ends and one line further:
+
+twice the error of linear interpolation, where L bends between two lines as around them. A
+resonance that fits between two lines is not seen. With it σ_max(S) <= 1/(least σ_min(I + L) on the
+chord less r); where L is large the same of L⁻¹ = (GK)⁻¹, which is nearly straight there.
+
+Stability is the winding of F = det(I + GK). Over all ω > 0 its angle grows by
+
+    Δ = (π/2)(q + 2P - 2Z)
+
+with Z poles of the closed loop and P of GK in the right half plane, and q of GK at 0. P is given.
+The angle below the first line is that of the known K and of a G that is taken to go on as its first
+lines rise, R (jω)^-n: stable poles far below, where |GK| >> 1, count as poles at 0. Above the last
+line |GK| is taken to stay below 1. What of this the data can show is examined: `sure`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.kernels.limits import HALF_POWER
+from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+
+GAP = 0.25 * np.pi  # of G's angle at the first line to its asymptote, above which Z is not sure
+SAFETY = 2.0  # on the error of interpolation
+LARGE, SMALL = 2.0, 0.5  # gains of L at the first line at least, at the last at most
+BETWEEN = np.linspace(0.0, 1.0, 9)  # places on a chord
+
+
+@dataclass(frozen=True)
+class MeasuredFigures:
+    """A loop on its lines. Frequencies in rad/s, KS in N/m, GS in m/N; NaN where not stable.
+
+    Of several channels the largest singular values. `right_half_plane`: Z. `sure`: whether the
+    assumptions that the data can show hold. `S_between` bounds |S| between the lines by r, infinite
+    where I + L may be singular on the curve; `bandwidth` is the largest that the shape allows on
+    the lines.
+    """
+
+    stable: bool
+    sure: bool
+    right_half_plane: int
+    words: str
+    S_peak: float = np.nan
+    S_peak_frequency: float = np.nan
+    S_between: float = np.nan
+    S_low: float = np.nan
+    bandwidth: float = np.nan
+    KS: float = np.nan
+    T: float = np.nan
+    GS: float = np.nan
+    weighted_KS: float = np.nan
+    weighted_T: float = np.nan
+
+
+def controller_response(K: StateSpace, hz: Array, period: float | None = None) -> np.ndarray:
+    """K (k, m, p) at frequencies in Hz; with a period by Tustin's rule, without prewarping."""
+    runs = K if period is None else tustin(K, period)
+    return runs.response(HZ * np.asarray(hz, float))
+
+
+def judge(
+    measured: MeasuredResponse,
+    K: StateSpace,
+    bounds: Bounds,
+    *,
+    period: float | None = None,
+    integrator: bool = True,
+) -> MeasuredFigures:
+    """The figures of an SI controller (e in, u out) on the lines.
+
+    `period` in s: K is sampled, and G was measured as the controller sees it, hold and delay in it.
+    `integrator` of K: then the shape counts from 0 on, else from ω_low.
+    """
+    if period is not None and measured.hz[-1] > 0.5 / period:
+        raise UserError("the lines reach beyond half the sampling rate; drop those above")
+    whole, hz, G = measured.followed, measured.hz, measured.matrix
+    k = controller_response(K, whole.hz, period)
+    joint = whole.G @ k
+    Z, doubts = winding(measured, joint, int(integrator))
+    first = len(whole.hz) - len(hz)
+    reach = between(hz, joint[first:])
+    if not np.isfinite(reach).all():
+        doubts.append(f"between {np.isinf(reach).sum()} pairs of lines GK may pass -1")
+    head = "stable" if Z == 0 else f"unstable, {Z} poles in the right half plane"
+    of = "1 + GK" if len(G[0]) == 1 else "det(I + GK)"
+    assumed = (
+        f"{head} by the winding of {of}, with {measured.unstable_poles} unstable poles of G, and G "
+        f"as (jω)^-{measured.slope} below {hz[0]:.4g} Hz and |GK| < 1 above {hz[-1]:.4g} Hz"
+    )
+    words, sure = "; ".join([assumed, *doubts]), measured.modelled or not doubts
+    if Z != 0:
+        return MeasuredFigures(False, sure, Z, words)
+    L, k, eye = joint[first:], k[first:], np.eye(joint.shape[1])
+    S, omega = np.linalg.inv(eye + L), HZ * hz
+    KS, T = gain(k @ S), gain(L @ S)
+    weighted_KS, weighted_T = np.nan, np.nan
+    if bounds.weights is not None:
+        _, W_KS, W_T = np.abs(bounds.weights.responses(omega))
+        weighted_KS, weighted_T = float((W_KS * KS).max()), float((W_T * T).max())
+    size = gain(S)
+    low = bounds.omega_low / HZ
+    K_low = controller_response(K, np.array([low]), period)[0]
+    S_low = np.linalg.inv(eye + measured.at(low) @ K_low)
+    return MeasuredFigures(
+        stable=True,
+        sure=sure,
+        right_half_plane=0,
+        words=words,
+        S_peak=float(size.max()),
+        S_peak_frequency=float(omega[np.argmax(size)]),
+        S_between=float(reach.max()),
+        S_low=float(gain(S_low)),
+        bandwidth=_bandwidth(omega, np.log(size), bounds, integrator),
+        KS=float(KS.max()),
+        T=float(T.max()),
+        GS=float(gain(G @ np.linalg.inv(eye + k @ G)).max()),
+        weighted_KS=weighted_KS,
+        weighted_T=weighted_T,
+    )  # fmt: skip
+
+
+def judge_all(
+    responses: Sequence[MeasuredResponse],
+    K: StateSpace,
+    bounds: Bounds,
+    *,
+    period: float | None = None,
+    integrator: bool = True,
+) -> MeasuredFigures:
+    """The worst figures of a controller on all responses of a set."""
+    each = [judge(one, K, bounds, period=period, integrator=integrator) for one in responses]
+    if len(each) == 1:
+        return each[0]
+    words = "; ".join(f"response {i}: {one.words}" for i, one in enumerate(each, 1))
+    stable, sure = all(one.stable for one in each), all(one.sure for one in each)
+    unstable = max(one.right_half_plane for one in each)
+    if not stable:
+        return MeasuredFigures(False, sure, unstable, words)
+    names = [field.name for field in fields(MeasuredFigures)][4:]
+    worst = {name: max(getattr(one, name) for one in each) for name in names}
+    worst["bandwidth"] = min(one.bandwidth for one in each)
+    worst["S_peak_frequency"] = max(each, key=lambda one: one.S_peak).S_peak_frequency
+    return MeasuredFigures(True, sure, unstable, words, **worst)
+
+
+def gain(M: np.ndarray) -> Array:
+    """The largest singular values (...) of matrices (..., p, m)."""
+    return np.asarray(np.linalg.norm(M, 2, axis=(-2, -1)))
+
+
+def interpolation_errors(hz: Array, L: np.ndarray) -> Array:
+    """r between neighbouring lines (k - 1,) of L (k, p, p), by second differences over ln f."""
+    x = np.log(hz)
+    slope = np.diff(L, axis=0) / np.diff(x)[:, None, None]
+    second = gain(2.0 * np.diff(slope, axis=0) / (x[2:] - x[:-2])[:, None, None])
+    around = np.concatenate([second[:1], second, second[-1:]])  # at each line
+    wider = np.maximum(np.append(around[1:], 0.0), np.insert(around[:-1], 0, 0.0))
+    each = np.maximum(around, wider)
+    return np.asarray(SAFETY * np.diff(x) ** 2 / 8.0 * np.maximum(each[:-1], each[1:]))
+
+
+def between(hz: Array, L: np.ndarray) -> Array:
+    """What σ_max(S) may reach between neighbouring lines (k - 1,): infinite where nothing is sure.
+
+    By L, or where it is large and its inverse the smoother by 1 + σ_max(T), T = (I + L⁻¹)⁻¹.
+    """
+    direct, inverse = _clearances(hz, L), _clearances(hz, np.linalg.inv(L))
+    with np.errstate(divide="ignore"):
+        by_L = np.where(direct > 0.0, 1.0 / np.maximum(direct, 0.0), np.inf)
+        by_inverse = np.where(inverse > 0.0, 1.0 + 1.0 / np.maximum(inverse, 0.0), np.inf)
+    return np.minimum(by_L, by_inverse)
+
+
+def _clearances(hz: Array, L: np.ndarray) -> Array:
+    """Least σ_min(I + L) between neighbouring lines (k - 1,): on the chord, less r.
+
+    Of several channels that at a place near by, less half the step to the next.
+    """
+    step = np.diff(L, axis=0)
+    if L.shape[1] == 1:
+        start, along = 1.0 + L[:-1, 0, 0], step[:, 0, 0]
+        size = np.abs(along) ** 2
+        share = np.clip(-(start * along.conj()).real / np.where(size == 0.0, 1.0, size), 0.0, 1.0)
+        least = np.abs(start + share * along)
+    else:
+        places = np.eye(L.shape[1]) + L[:-1] + BETWEEN[:, None, None, None] * step
+        least = np.linalg.svd(places, compute_uv=False)[..., -1].min(axis=0)
+        least = least - 0.5 * BETWEEN[1] * gain(step)
+    return np.asarray(least - interpolation_errors(hz, L))
+
+
+def winding(
+    measured: MeasuredResponse, L: np.ndarray, integrators: int = 0
+) -> tuple[int, list[str]]:
+    """Z of L = GK (k, p, p), with `integrators` of every channel of K, on the lines of
+    `measured.followed`; and what the data leave open."""
+    channels = L.shape[1]
+    F = np.linalg.det(np.eye(channels) + L)
+    q = (measured.slope + integrators) * channels
+    begins = float(np.angle(F[0]))
+    asymptotes = -0.5 * np.pi * q + np.pi * np.arange(-4 * channels, 4 * channels + 1)
+    first = float(asymptotes[np.argmin(np.abs(begins - asymptotes))])
+    grown = begins - first + float(np.angle(F[1:] / F[:-1]).sum() - np.angle(F[-1]))
+    Z = round(measured.unstable_poles + 0.5 * q - grown / np.pi)
+    hz = measured.hz
+    own = L[len(L) - len(hz) :]
+    doubts = []
+    if measured.gap > GAP:
+        doubts.append(f"at the first line, {hz[0]:.4g} Hz, the angle of G is not that of its slope")
+    if q > 0 and np.linalg.norm(own[0], -2) < LARGE:
+        doubts.append(f"at the first line, {hz[0]:.4g} Hz, |GK| is not large")
+    if np.linalg.norm(own[-1], 2) > SMALL:
+        doubts.append(f"at the last line, {hz[-1]:.4g} Hz, |GK| is not small")
+    return Z, doubts
+
+
+def _bandwidth(omega: Array, ln_S: Array, bounds: Bounds, integrator: bool) -> float:
+    """The largest ω_b with |S| <= 1/√2 on the lines below it and |S| within the shape."""
+    level = -HALF_POWER
+    above = np.flatnonzero(ln_S > level)
+    crossing = float(omega[-1])
+    if len(above):
+        i = int(above[0])
+        if i == 0:
+            return 0.0
+        share = (level - ln_S[i - 1]) / (ln_S[i] - ln_S[i - 1])
+        crossing = float(np.exp(np.log(omega[i - 1]) + share * np.log(omega[i] / omega[i - 1])))
+    if bounds.shape is None:
+        return crossing
+    counted = omega if integrator else np.maximum(omega, bounds.omega_low)
+    allowed = bounds.shape * counted * np.exp(level - ln_S)
+    if bounds.shape_ends is ShapeEnd.CROSSING:
+        allowed = allowed[omega <= crossing]
+    return float(min(crossing, allowed.min()))

@@ -1,0 +1,91 @@
+"""`python -m ccd_casadi.tune DATA...`: a controller for a plant that was measured."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+
+from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
+from ccd_casadi.support.options import number, one_line, positive, whole
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Tune, print a table, write result.json, controller.json, report.html and the C code."""
+    from ccd_casadi.analysis.loop_figures import loop_lines
+    from ccd_casadi.codesign.measured_answer import answer_of
+    from ccd_casadi.codesign.tuning import tune
+    from ccd_casadi.deployment.c_code import write_c
+    from ccd_casadi.deployment.realisation import Realisation, block_diagonal
+    from ccd_casadi.fixed_structure import Structure
+    from ccd_casadi.inner_problem.sections_words import SectionWords
+    from ccd_casadi.lti.hold import tustin
+    from ccd_casadi.reporting.measured_page import write_measured
+    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.process_pool import Workers
+    from ccd_casadi.support.versions import versions
+
+    began = perf_counter()
+    folder = run_folder(options.run[0], options.out)
+    structure = None if options.biquads is None else Structure(
+        lead=options.lead, biquads=options.biquads, least_damping=0.1
+    )  # fmt: skip
+    with Workers(options.workers) as workers:
+        found = tune(
+            options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
+            shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
+            progress=None if options.quiet else lambda words: print(words, file=sys.stderr),
+            workers=workers,
+        )  # fmt: skip
+    answer, case = answer_of(found.case, found.design), found.case
+    result = clean({
+        "status": answer.status, **answer.figures, "seconds": perf_counter() - began,
+        "seed": options.seed, "formulation": "tune", "versions": versions(),
+    })  # fmt: skip
+    write_json(folder / "result.json", result)
+    K = found.controller
+    if K is not None and "phase_margin_deg" in result:
+        write_json(folder / "controller.json", answer.controller)
+        write_measured(folder, case, K, result)
+        if case.period is not None:
+            system, blocks = block_diagonal(tustin(K, case.period))
+            whole = Realisation(replace(system, period=case.period), tuple(blocks))
+            write_c(folder, whole, title=case.file, delay=options.delay,
+                    verified=found.design.usable)  # fmt: skip
+        lines = [
+            f"{'bandwidth':14s}{result['bandwidth_hz']:.6g} Hz, |S| at most "
+            f"{result['sensitivity_peak']:.4g} at {result['sensitivity_peak_hz']:.4g} Hz",
+            *loop_lines(result),
+            *(f"{'':14s}{SectionWords(**item).text}" for item in result["controller"]["sections"]),
+            f"{'report':14s}{folder / 'report.html'}",
+        ]
+        if not options.quiet:
+            print("\n".join([f"{'status':14s}{answer.status}", *lines]))
+    if answer.status != "verified":
+        print(one_line(f"{case.file}: {answer.status}: {result['reason']}"), file=sys.stderr)
+    return ExitCode.of(answer.status)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.tune", "The fastest PID with notches for a measured plant, with its C code.",
+        metavar="DATA", nargs="+",
+        about="measured responses, .csv, .mat or .npz; several are one set",
+    )  # fmt: skip
+    for name, metavar, kind, default, words in (
+        ("--rate-hz", "X", positive, None, "of the controller; the hold is in DATA"),
+        ("--delay", "SECONDS", number(), 0.0, "on top of what is in DATA"),
+        ("--s-max", "X", number(1.0, strict=True), 1.8, "the largest |S|"),
+        ("--shape", "X", number(1.0), 1.1, "|S| over ω/(√2 ω_b) at most"),
+        ("--effort", "X", positive, 20.0, "|KS| at most, over 1/|G| about ω_b"),
+        ("--lead", "N", whole(0), 1, "how many leads, with --biquads"),
+        ("--biquads", "N", whole(0), None, "notches (default: one for each resonance, up to 3)"),
+    ):
+        shown = words if default is None else f"{words} (default: {default:g})"
+        arguments.add_argument(name, metavar=metavar, type=kind, default=default, help=shown)
+    return run(command, arguments, argv, needs=["ccd_casadi.codesign.tuning"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,150 @@
+"""One call from a plant that exists to a controller, and the same as a command."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+from test_measured import two_by_two
+
+import ccd_casadi as ccd
+from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.fixed_structure.measured import MeasuredResponse
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.tune import main
+from surrogates.lazy_names import from_stub
+
+s = control.tf("s")
+LAGS = 1.0 / (s + 1.0) ** 3
+
+
+def judged(plant: object, K: object, rate: float, delay: int = 0) -> float:
+    """‖S‖∞ on a fine grid by SciPy and python-control; infinite where a pole is unstable."""
+    G = control.ss(plant)
+    A, B, C, D, _ = cont2discrete((G.A, G.B, G.C, G.D), 1.0 / rate)
+    late = control.ss(control.tf([1], [1] + [0] * delay, 1.0 / rate))
+    held = control.ss(A, B, C, D, 1.0 / rate) * late
+    k = control.ss(*cont2discrete((K.A, K.B, K.C, K.D), 1.0 / rate, "bilinear")[:4], 1.0 / rate)  # type: ignore[attr-defined]
+    S = control.feedback(1, held * k)
+    if np.abs(S.poles()).max() >= 1.0:
+        return float(np.inf)
+    return float(np.abs(S(np.exp(1j * np.linspace(1e-4, np.pi, 20000)))).max())
+
+
+@pytest.mark.parametrize(
+    ("plant", "rate", "delay"),
+    [
+        (LAGS, 20.0, 0),
+        (1.0 / (s**2 * (s + 10.0)), 200.0, 1),
+        (1.0 / (s - 1.0), 50.0, 0),
+        ([1.0 / (s**2 + 0.1 * s + a) for a in (1.0, 1.3)], 50.0, 2),
+        ((1.0 - s) / (s + 1.0) ** 3, 20.0, 0),
+    ],
+)
+def test_models_are_tuned_and_judged_apart(plant: object, rate: float, delay: int) -> None:
+    """Integrating, unstable, resonant and non-minimum-phase ones, by other libraries alone."""
+    found = ccd.tune(plant, rate_hz=rate, delay=delay / rate, starts=6)
+    assert found.design.usable, found.design.words
+    for one, norm in zip(plant if isinstance(plant, list) else [plant], found.norms, strict=True):
+        S = judged(one, found.controller, rate, delay)
+        assert norm is not None
+        assert S <= norm * (1.0 + 1e-6) <= 1.8 * (1.0 + 1e-6)
+        assert norm == pytest.approx(S, rel=1e-3)
+
+
+def test_every_form_of_a_plant_is_the_same_plant() -> None:
+    """A state space, a sampled one and its response: one bandwidth."""
+    sampled = control.sample_system(control.ss(LAGS), 0.1)
+    omega = np.geomspace(1e-2, 0.98 * np.pi / 0.1, 400)
+    lines = control.FRD(sampled(np.exp(0.1j * omega)), omega)
+    plants = (LAGS, control.ss(LAGS), sampled, lines)
+    found = [ccd.tune(plant, rate_hz=10.0, starts=4).design for plant in plants]
+    assert all(design.usable for design in found)
+    np.testing.assert_allclose([d.bandwidth / found[0].bandwidth for d in found], 1.0, rtol=1e-2)
+
+
+def test_effort_bounds_the_controller_and_costs_bandwidth() -> None:
+    free, less = (ccd.tune(LAGS, rate_hz=20.0, starts=4, effort=e).design for e in (None, 5.0))
+    assert free.figures is not None
+    assert less.figures is not None
+    assert less.bandwidth < free.bandwidth
+    omega = less.bandwidth * np.geomspace(0.5, 2.0, 200)
+    mean = np.exp(np.log(np.abs(LAGS(1j * omega))).mean())
+    assert less.figures.KS <= 5.0 / mean * 1.1 < free.figures.KS
+
+
+def test_the_bound_of_effort_has_its_slope() -> None:
+    bounds = ccd.Bounds(1.8, 1.8, ccd.HZ, 1.1)
+    problem = line_problem([two_by_two(1.0).entry(np.eye(2)[0], np.eye(2)[0], 600)],
+                           ccd.Structure(biquads=0), bounds, effort=20.0)  # fmt: skip
+    for tau in (-3.0, -1.3, -0.2):
+        ends = [problem.ceiling(tau + h)[0] for h in (1e-6, -1e-6)]
+        assert problem.ceiling(tau)[1] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("plant", "how", "words"),
+    [
+        ([], {}, "no plant"),
+        (LAGS, {}, "rate_hz is missing"),
+        (s / (s + 1.0) ** 2, {"rate_hz": 10.0}, "a zero at 0"),
+        ((s + 2.0) / (s + 1.0), {"rate_hz": 10.0}, "feedthrough"),
+        (control.sample_system(LAGS, 0.1), {"rate_hz": 20.0}, "runs at its rate"),
+        (control.sample_system(LAGS, 0.1), {"delay": 0.05}, "whole periods"),
+        ("none.csv", {}, "cannot be read"),
+    ],
+)
+def test_what_is_no_plant_is_said(plant: object, how: dict, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        ccd.tune(plant, **how)
+
+
+def test_what_no_pid_stabilises_is_said() -> None:
+    found = ccd.tune(1.0 / (s - 1.0), rate_hz=50.0, delay=2.0, starts=2)
+    assert found.controller is None
+    assert "no start is stable" in found.design.words
+
+
+def test_the_call_is_public() -> None:
+    assert {"tune", "Tuned"} <= set(from_stub("ccd_casadi"))
+    assert "tune" in ccd.__all__
+
+
+def written(path: Path, found: MeasuredResponse) -> str:
+    np.savez(path, f_hz=found.hz, G=found.G)
+    return str(path)
+
+
+def test_the_command_writes_what_can_be_built(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two channels, a set of two; the C code gives what its own test expects."""
+    files = [written(tmp_path / f"{i}.npz", two_by_two(g)) for i, g in enumerate((1.0, 1.2))]
+    out = tmp_path / "out"
+    words = ["--rate", "1000", "--biquads", "0", "--lead", "0", "--out", str(out), "--workers", "1"]
+    assert main([*files, *words, "--s-max", "1.7"]) == 0
+    said = capsys.readouterr().out
+    assert all(word in said for word in ("bandwidth", "margins", "integrator", "report.html"))
+    result = json.loads((out / "result.json").read_text())
+    assert result["status"] == "verified"
+    assert result["sensitivity_peak"] <= 1.7 * (1.0 + 1e-5)
+    page = (out / "report.html").read_text()
+    assert "0.npz, 1.npz" in page
+    subprocess.run(["cc", "-std=c99", "-ffp-contract=off", "-o", "t", "controller.c",
+                    "controller_test.c", "-lm"], cwd=out, check=True)  # fmt: skip
+    subprocess.run(["./t"], cwd=out, check=True, capture_output=True)
+
+
+def test_the_command_says_why_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A response without low lines; and a file that is none."""
+    one = two_by_two(1.0)
+    high = MeasuredResponse(one.hz[50:], one.G[50:, 0, 0])
+    code = main([written(tmp_path / "a.npz", high), "--rate", "1000", "--quiet"])
+    said = capsys.readouterr().err
+    assert code in (3, 4)
+    assert "a.npz: " in said
+    assert main([str(tmp_path / "none.csv"), "--quiet"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
