@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccd_casadi.cases.run_folder import read_json
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_parser
 from ccd_casadi.support.errors import UserError
@@ -69,6 +68,8 @@ def formulation_in(folder: Path) -> str:
 
     Raises UserError.
     """
+    from ccd_casadi.cases.run_folder import read_json
+
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such run folder; make one with a solve")
     path = folder / "truth.json"

@@ -229,8 +229,9 @@ def test_the_value_on_measured_lines(tmp_path: Path) -> None:
     assert (answer.status, answer.figures["certificate"]["passed"]) == ("verified", True)
     assert answer.controller is not None
     K = StateSpace(*(np.array(answer.controller[name]) for name in "ABCD"))
-    hz = case.response.hz
-    S = abs(1.0 / (1.0 + case.response.G * state_response(K, HZ * hz)[:, 0, 0]))
+    (response,) = case.responses
+    hz = response.hz
+    S = abs(1.0 / (1.0 + response.G * state_response(K, HZ * hz)[:, 0, 0]))
     above = int(np.argmax(S * S > 0.5))
     assert hz[above - 1] <= answer.figures["bandwidth_hz"] <= hz[above]
     assert answer.figures["sensitivity_peak"] == pytest.approx(S.max(), rel=1e-9)

@@ -146,7 +146,7 @@ def test_margins_on_dense_lines_are_those_of_the_model() -> None:
     made, w = Loop(G, K), 20.0 * HZ
     omega = np.geomspace(1.0, 3000.0, 20_000)
     L = made.controller_response(omega) @ made.plant_response(omega)
-    lines = measured_entry(omega, L[:, 0, 0], K, w, 1.5)
+    lines = measured_entry([(omega, L[:, 0, 0])], K, w, 1.5)
     exact = loop_figures([G], K, None, w).margins
     assert lines["phase_margin_deg"] == pytest.approx(exact.phase_deg, abs=0.05)
     assert lines["gain_margin"] == pytest.approx(gain_margin(exact), rel=1e-3)
