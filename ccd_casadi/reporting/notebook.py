@@ -11,7 +11,6 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
@@ -137,17 +136,6 @@ def _(item: SectionsDesign) -> str:
         parts.append(facts_html([("Bandwidth ω_b", hz, "on every plant")]))
         parts.append(controller_html({"controller": sections_dict(item.structure, item.kappa)}))
     return _cell(*parts)
-
-
-@html_of.register
-def _(item: ModalFit) -> str:
-    n, off = len(item.hz), 100.0 * item.deviations
-    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains[:n], off[2 * n : 3 * n],
-               strict=True)  # fmt: skip
-    head = ("Hz", "± %", "damping ratio", "± %", "gain 1/kg", "± %")
-    words = f"{item.lines} lines; what is not fitted is {100.0 * item.noise:.3g} % of |G|."
-    table = table_html(Table(head, tuple(tuple(map(float, row)) for row in rows)))
-    return _cell(f"<h1>{n} modes of a measured response</h1>", table, paragraph(words))
 
 
 def _result_head(result: Mapping[str, Any]) -> str:
