@@ -3,7 +3,7 @@
 A full race at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of the climbs
 from all anchors, and from nothing else: it depends neither on the order in which θ are asked for
 nor on the number of workers. Where no anchor climbs to a certified design a race of a few seeded
-starts is run at that θ, which is a function of θ too.
+starts is run at that θ, which is a function of θ too; not with `starts` = 0.
 """
 
 from collections.abc import Sequence
@@ -88,7 +88,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
             initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
-    if made is None or not made.certified:
+    if made is None or (sections.starts and not made.certified):
         made = synthesise(
             plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
