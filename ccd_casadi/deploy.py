@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import UserError, require
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ

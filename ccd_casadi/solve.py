@@ -15,7 +15,7 @@ from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 
@@ -150,9 +150,8 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.diagnosis import diagnose, first_seen
-    from ccd_casadi.cases.findings import Severity, Topic
+    from ccd_casadi.cases.findings import Severity, Topic, peak_words
     from ccd_casadi.cases.plant_report import size_words
-    from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import model_named
 
@@ -173,7 +172,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
 
 def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit."""
-    from ccd_casadi.cases.unit_findings import unit_findings
+    from ccd_casadi.cases.findings import unit_findings
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.facts import facts_of
     from ccd_casadi.plants.modal import modal_plant

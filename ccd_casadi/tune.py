@@ -13,7 +13,7 @@ from ccd_casadi.support.options import number, one_line, positive, whole
 def command(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.analysis.loop_figures import loop_lines
-    from ccd_casadi.codesign.measured_answer import answer_of
+    from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.realisation import Realisation, block_diagonal

@@ -23,8 +23,8 @@ from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet

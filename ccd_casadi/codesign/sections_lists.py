@@ -23,8 +23,8 @@ from ccd_casadi.codesign.outer_problem import (
 )
 from ccd_casadi.codesign.outer_sections import SectionsOuter
 from ccd_casadi.codesign.sections_polish import by_pieces
-from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -34,10 +34,10 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     plants_of,
     sections_of_problem,
     structure_of,
+    warm_starts,
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample

@@ -8,8 +8,7 @@ is not in it.
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import largest
-from ccd_casadi.lti.grid import frequency_grid
-from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.grid import climbed, frequency_grid, local_maxima
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 

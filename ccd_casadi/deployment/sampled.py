@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
 from ccd_casadi.lti.closed_loop import largest
-from ccd_casadi.lti.peaks import climbed
+from ccd_casadi.lti.grid import climbed
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 

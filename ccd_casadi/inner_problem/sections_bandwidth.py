@@ -26,12 +26,12 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     sections_of_problem,
     structure_of,
     uncertain_plant,
+    warm_starts,
     with_channels,
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import worst_members
-from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError

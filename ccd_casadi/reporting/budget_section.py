@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.budget import BudgetFigures
-from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.lines import Curve, Panel, figure_lines

@@ -9,7 +9,7 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.kinds import kind_of

@@ -11,7 +11,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.surrogate_quality import recommendation
+from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
@@ -75,7 +75,7 @@ from ccd_casadi.support.worker_process import Ahead, WorkerLost
 from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
 
 ORDER = (
     "glance", "design", "controller", "beside", "start", "theta", "stage", "loop", "move", "force",
