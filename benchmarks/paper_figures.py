@@ -15,12 +15,12 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.drawing.lines import Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.drawing.page import Section, Table, figure_html, page, paragraph, table_html
+from ccd_casadi.drawing.svg import CYCLE
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
 from ccd_casadi.reporting.bode import figure_bode, table_bode
-from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
 from ccd_casadi.reporting.loops import synthesised_loop, table_gains
-from ccd_casadi.reporting.page import Section, Table, figure_html, page, paragraph, table_html
-from ccd_casadi.reporting.svg import CYCLE
 from ccd_casadi.studies.published import TWO_MASS
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,8 +11,8 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.later_lines import told
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deploy import main as deploy
+from ccd_casadi.drawing.page import page
 from ccd_casadi.reporting.index import write_index
-from ccd_casadi.reporting.page import page
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.robustness import main as robustness
 

@@ -5,10 +5,10 @@ import shutil
 import pytest
 
 from ccd_casadi.deploy import main as deploy
+from ccd_casadi.drawing.page import Section
+from ccd_casadi.drawing.page import page as html_page
+from ccd_casadi.drawing.steps import steps_html
 from ccd_casadi.insight import main as insight
-from ccd_casadi.reporting.page import Section
-from ccd_casadi.reporting.page import page as html_page
-from ccd_casadi.reporting.steps import steps_html
 from ccd_casadi.robustness import main as robustness
 
 WIDTHS, SCHEMES = (1300, 390), ("light", "dark")

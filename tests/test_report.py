@@ -22,14 +22,14 @@ from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.deployment.channels import split
+from ccd_casadi.drawing.lines import Curve, Panel, figure_lines
+from ccd_casadi.drawing.maps import Landscape, ThetaPath, figure_landscape
+from ccd_casadi.drawing.page import Section, Table, number, page, table_html
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.bode import figure_bode
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
-from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
-from ccd_casadi.reporting.page import Section, Table, number, page, table_html
 from ccd_casadi.reporting.solve_page import report_html, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

@@ -15,10 +15,9 @@ import pytest
 from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
 from ccd_casadi.case_studies.rib_stage.drawing import TALLER, draw_stages, drawing
 from ccd_casadi.case_studies.rib_stage.geometry import LOWER, UPPER, mass
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
-from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
-from ccd_casadi.reporting.page import Section, page
-from ccd_casadi.reporting.turntable import (
+from ccd_casadi.drawing.page import Section, page
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.turntable import (
     HEIGHT,
     MARGIN,
     REACH,
@@ -29,6 +28,7 @@ from ccd_casadi.reporting.turntable import (
     data,
     still,
 )
+from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
 
 Array = np.ndarray
 A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)

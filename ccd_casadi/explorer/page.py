@@ -10,6 +10,7 @@ from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
+from ccd_casadi.drawing.page import escape
 from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.controls import Controls
 from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
@@ -25,7 +26,6 @@ from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.words import end_words, move_words, standing_html
 from ccd_casadi.reporting.machine import machine_html
-from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once

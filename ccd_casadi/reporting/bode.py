@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLACK, CYCLE
+from ccd_casadi.drawing.lines import Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import BLACK, CYCLE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
 

@@ -5,11 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.budget import BudgetFigures
-from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.lines import Curve, Panel, figure_lines
+from ccd_casadi.drawing.page import (
     Section,
     Table,
     figure_html,
@@ -17,7 +14,10 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
-from ccd_casadi.reporting.svg import BLACK, CYCLE
+from ccd_casadi.drawing.svg import BLACK, CYCLE
+from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.tables import ROWS, over_frequency
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together

@@ -3,9 +3,9 @@
 import numpy as np
 
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number, paragraph
-from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.drawing.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, figure_html, number, paragraph
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 
 POINTS = 1200  # of a curve
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)

@@ -13,18 +13,8 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import against, reason_words, short_status
-from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.sections_words import gain_of, section_words
-from ccd_casadi.lti.closed_loop import largest, sensitivity
-from ccd_casadi.lti.grid import frequency_grid
-from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.deploy_move import move_html
-from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.index import write_index
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
-from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.lines import Curve, Panel, figure_lines
+from ccd_casadi.drawing.page import (
     INDEX,
     Section,
     Table,
@@ -37,7 +27,17 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
-from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, ORANGE
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, ORANGE
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.sections_words import gain_of, section_words
+from ccd_casadi.lti.closed_loop import largest, sensitivity
+from ccd_casadi.lti.grid import frequency_grid
+from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
+from ccd_casadi.reporting.deploy_move import move_html
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import write_index
+from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ

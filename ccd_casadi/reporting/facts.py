@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.drawing.page import Table, number
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.support.units import HZ, shown_unit
 
 Fact = tuple[str, str, str]

@@ -5,13 +5,13 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front, FrontPoint
+from ccd_casadi.drawing.lines import Panel, figure_lines
+from ccd_casadi.drawing.page import number
+from ccd_casadi.drawing.steps import steps_html
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
-from ccd_casadi.reporting.lines import Panel, figure_lines
 from ccd_casadi.reporting.loops import S_panel, synthesised_loop
-from ccd_casadi.reporting.page import number
-from ccd_casadi.reporting.steps import steps_html
 from ccd_casadi.support.units import HZ
 
 MOST = 12  # designs: each is synthesised and drawn

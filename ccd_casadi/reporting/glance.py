@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.drawing.lines import Panel, figure_lines
+from ccd_casadi.drawing.page import Section, figure_html, number
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.lines import Panel, figure_lines
 from ccd_casadi.reporting.loops import S_panel, marked
 from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, surface_modes_html
 from ccd_casadi.reporting.moves import MovePanels
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
-from ccd_casadi.reporting.page import Section, figure_html, number
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.classical_margins import least_margins

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.codesign.formulation import Iterate
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLUE, ORANGE
+from ccd_casadi.drawing.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import BLUE, ORANGE
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

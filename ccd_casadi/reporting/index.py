@@ -6,7 +6,7 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.reporting.page import INDEX, Section, Table, escape, page, table_html
+from ccd_casadi.drawing.page import INDEX, Section, Table, escape, page, table_html
 from ccd_casadi.reporting.sections_page import conclusion_of
 from ccd_casadi.reporting.verdict import refreshed, run_header
 from surrogates.files import write_whole

@@ -6,10 +6,10 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
+from ccd_casadi.drawing.maps import SweepMap
+from ccd_casadi.drawing.page import Table, number
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.lifted_maximum import fields
-from ccd_casadi.reporting.maps import SweepMap
-from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ

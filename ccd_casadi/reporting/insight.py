@@ -7,11 +7,11 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.drawing.lines import Curve, Mark, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.reporting.facts import cost_axis
-from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import CYCLE, GREY
 from ccd_casadi.support.units import HZ, shown_unit
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it

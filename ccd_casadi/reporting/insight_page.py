@@ -7,6 +7,16 @@ from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.drawing.page import (
+    Section,
+    escape,
+    figure_html,
+    header,
+    number,
+    page,
+    paragraph,
+    table_html,
+)
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
@@ -20,16 +30,6 @@ from ccd_casadi.reporting.insight import (
     table_responses,
 )
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
-from ccd_casadi.reporting.page import (
-    Section,
-    escape,
-    figure_html,
-    header,
-    number,
-    page,
-    paragraph,
-    table_html,
-)
 from ccd_casadi.reporting.sections_page import binding_words
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.support.units import HZ

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from ccd_casadi.drawing.maps import Landscape
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
-from ccd_casadi.reporting.maps import Landscape
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.drawing.page import Table, number
 
 PARTS = ("|S|", "|KS|", "|T|")
 

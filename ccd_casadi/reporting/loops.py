@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import NAMES, LoopView
+from ccd_casadi.drawing.lines import Band, Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, figure_html, number
+from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.reporting.bode import phase_deg
-from ccd_casadi.reporting.lines import Band, Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.drawing import svg
+from ccd_casadi.drawing.page import escape, number
+from ccd_casadi.drawing.turntable import still
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.reporting import svg
-from ccd_casadi.reporting.page import escape, number
-from ccd_casadi.reporting.turntable import still
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

@@ -9,14 +9,8 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.fixed_structure.measured_loop import between, controller_response
-from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
-from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.facts import Fact, loop_facts
-from ccd_casadi.reporting.lines import Curve, Level, figure_lines
-from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
-from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.lines import Curve, Level, figure_lines
+from ccd_casadi.drawing.page import (
     Section,
     facts_html,
     figure_html,
@@ -25,8 +19,14 @@ from ccd_casadi.reporting.page import (
     page,
     paragraph,
 )
+from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.fixed_structure.measured_loop import between, controller_response
+from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.reporting.facts import Fact, loop_facts
+from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
+from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
 from ccd_casadi.reporting.sections_page import controller_html
-from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import HZ
 from surrogates.files import write_whole

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
-from ccd_casadi.reporting.page import Table, escape, figure_html, number
-from ccd_casadi.reporting.turntable import REACH, data, legend, still
+from ccd_casadi.drawing.page import Table, escape, figure_html, number
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.turntable import REACH, data, legend, still
 
 SHOWN = 6
 

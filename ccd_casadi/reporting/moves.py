@@ -9,15 +9,15 @@ from ccd_casadi.analysis.loop_figures import force_step
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.drawing.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, figure_html, number
+from ccd_casadi.drawing.svg import GREY
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import GREY
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import counted

@@ -10,16 +10,7 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.modal_fit import ModalFit
-from ccd_casadi.inner_problem.design_loops import design_view
-from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.reporting.facts import theta_table
-from ccd_casadi.reporting.loops import gains_html, view_of
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.page import (
     CSS,
     Table,
     escape,
@@ -29,6 +20,15 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.modal_fit import ModalFit
+from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.inner_problem.sweep import InnerResult
+from ccd_casadi.reporting.facts import theta_table
+from ccd_casadi.reporting.loops import gains_html, view_of
 from ccd_casadi.reporting.sections_page import conclusion_of, controller_html
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.units import HZ, shown_unit

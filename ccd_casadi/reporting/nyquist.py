@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ccd_casadi.reporting.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
-from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
+from ccd_casadi.drawing.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
+from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
 
 SHOWN = (-3.2, 1.6)  # of the real axis
 FAR = 30.0  # |L| beyond which a locus leaves the drawing

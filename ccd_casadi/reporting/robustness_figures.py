@@ -4,10 +4,10 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table
+from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.loops import over_hz
-from ccd_casadi.reporting.page import Table
-from ccd_casadi.reporting.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
 from ccd_casadi.robust.perturbed import Line
 from ccd_casadi.robust.structured import StructuredBound

@@ -6,10 +6,7 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.reporting import robustness_figures as figures
-from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.index import index_of, write_index
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.page import (
     Section,
     Table,
     facts_html,
@@ -20,6 +17,9 @@ from ccd_casadi.reporting.page import (
     paragraph,
     table_html,
 )
+from ccd_casadi.reporting import robustness_figures as figures
+from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.index import index_of, write_index
 from ccd_casadi.reporting.verdict import verdict_html
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line

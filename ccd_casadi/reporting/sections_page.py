@@ -4,6 +4,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.drawing.page import (
+    Table,
+    number,
+    paragraph,
+    table_html,
+)
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
@@ -15,12 +21,6 @@ from ccd_casadi.reporting.facts import (
     cost_words,
     loop_facts,
     theta_words,
-)
-from ccd_casadi.reporting.page import (
-    Table,
-    number,
-    paragraph,
-    table_html,
 )
 from ccd_casadi.support.units import HZ, counted
 from ccd_casadi.synthesis.closed_loop import measure

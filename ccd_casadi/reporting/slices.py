@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.drawing.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import predicted
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, shown_unit

@@ -15,6 +15,18 @@ from ccd_casadi.codesign.surrogate_quality import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
+from ccd_casadi.drawing.maps import ThetaPath, figure_landscape, figure_sweep
+from ccd_casadi.drawing.page import (
+    Section,
+    Table,
+    escape,
+    facts_html,
+    figure_html,
+    page,
+    paragraph,
+    preformatted,
+    table_html,
+)
 from ccd_casadi.inner_problem.design_loops import design_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.reporting.bode import caption_bode, figure_bode, table_bode
@@ -37,20 +49,8 @@ from ccd_casadi.reporting.landscape import (
 )
 from ccd_casadi.reporting.limits import limit_sentences, table_limits
 from ccd_casadi.reporting.loops import gains_html, view_of
-from ccd_casadi.reporting.maps import ThetaPath, figure_landscape, figure_sweep
 from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.moves import MovePanels, force_step_html, move_html, move_panels
-from ccd_casadi.reporting.page import (
-    Section,
-    Table,
-    escape,
-    facts_html,
-    figure_html,
-    page,
-    paragraph,
-    preformatted,
-    table_html,
-)
 from ccd_casadi.reporting.sections_page import (
     bandwidths_html,
     beside_html,

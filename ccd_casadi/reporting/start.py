@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.drawing.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Section, Table, figure_html, number, paragraph, table_html
+from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -15,10 +18,7 @@ from ccd_casadi.inner_problem.problem import (
 )
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.reporting.page import Section, Table, figure_html, number, paragraph, table_html
-from ccd_casadi.reporting.svg import BLUE, GREY, ORANGE
 from ccd_casadi.support.units import HZ, shown_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 

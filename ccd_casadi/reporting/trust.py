@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLUE, GREY
+from ccd_casadi.drawing.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.svg import BLUE, GREY
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 

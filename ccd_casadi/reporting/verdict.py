@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.reporting.page import escape, header, typeset
+from ccd_casadi.drawing.page import escape, header, typeset
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}

@@ -6,12 +6,8 @@ from typing import Any
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.inner_problem.design_loops import design_view
-from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
-from ccd_casadi.reporting.loops import figure_gains, table_gains
-from ccd_casadi.reporting.maps import figure_landscape
-from ccd_casadi.reporting.page import (
+from ccd_casadi.drawing.maps import figure_landscape
+from ccd_casadi.drawing.page import (
     Section,
     Table,
     figure_html,
@@ -22,8 +18,12 @@ from ccd_casadi.reporting.page import (
     preformatted,
     table_html,
 )
+from ccd_casadi.drawing.svg import axis_label
+from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
+from ccd_casadi.reporting.loops import figure_gains, table_gains
 from ccd_casadi.reporting.solve_page import stage_sections
-from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import verdict_html, worst
 from ccd_casadi.studies.baselines import baseline_of

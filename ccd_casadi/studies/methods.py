@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.drawing.lines import Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.maps import ThetaPath
+from ccd_casadi.drawing.page import Table
+from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import cost_axis
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.maps import ThetaPath
-from ccd_casadi.reporting.page import Table
-from ccd_casadi.reporting.svg import CYCLE, axis_label
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Method
 from ccd_casadi.studies.steepest_descent import Descent

@@ -5,7 +5,7 @@ Without the script, and on paper, the one that is shown stands alone.
 
 from collections.abc import Sequence
 
-from ccd_casadi.reporting.page import escape
+from ccd_casadi.drawing.page import escape
 
 
 def steps_html(steps: Sequence[tuple[str, str]], first: int, label: str) -> str:

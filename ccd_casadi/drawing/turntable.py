@@ -9,9 +9,9 @@ from functools import cache
 
 import numpy as np
 
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
-from ccd_casadi.reporting.page import escape
-from ccd_casadi.reporting.svg import COLOUR_MAP
+from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.svg import COLOUR_MAP
 from ccd_casadi.support.arrays import Array
 
 AZIMUTH, ELEVATION = -62.0, 44.0  # degrees, of the camera as seen from the object

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ccd_casadi.reporting.labels import Labels, inside
-from ccd_casadi.reporting.svg import (
+from ccd_casadi.drawing.labels import Labels, inside
+from ccd_casadi.drawing.svg import (
     BLACK,
     BLUE,
     GREY,

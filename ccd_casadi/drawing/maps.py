@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.reporting.svg import (
+from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
     CYCLE,

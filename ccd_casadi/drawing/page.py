@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from html import escape as _escape
 from typing import Any
 
-from ccd_casadi.reporting.svg import THEME
+from ccd_casadi.drawing.svg import THEME
 from ccd_casadi.support.package_text import package_text
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
@@ -32,7 +32,7 @@ def theme(which: int) -> str:
 
 CSS = (
     f":root {{ {theme(0)} }}\n@media screen and (prefers-color-scheme: dark) {{"
-    f" :root {{ {theme(1)} }} }}\n{package_text('reporting/assets/page.css')}"
+    f" :root {{ {theme(1)} }} }}\n{package_text('drawing/assets/page.css')}"
 )
 
 
@@ -185,8 +185,8 @@ def page(title: str, sections: Sequence[Section], head: str = "", index: str = I
     )
     up = f'<nav><a href="{escape(index)}">All pages of this run</a></nav>\n' if index else ""
     own = [name for name, mark in SCRIPTS.items() if mark in body]
-    scripts = [package_text(f"reporting/assets/{name}.js") for name in own]
-    css = CSS + "".join(package_text(f"reporting/assets/{n}.css") for n in own if n in STYLED)
+    scripts = [package_text(f"drawing/assets/{name}.js") for name in own]
+    css = CSS + "".join(package_text(f"drawing/assets/{n}.css") for n in own if n in STYLED)
     hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts)
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
     policy = f"{POLICY}; script-src {allowed}" if own else POLICY
