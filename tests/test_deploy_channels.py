@@ -18,10 +18,11 @@ from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import deploy
 from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.drawing.paint import painted
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant
-from ccd_casadi.reporting.deploy_page import write_report
+from ccd_casadi.reporting.deploy_page import deploy_page
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
@@ -141,8 +142,7 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
             figures = sampled_figures(sensitivity_loop(held, found.realisation.system))
             assert figures.stable
             assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
-    write_report(tmp_path / "page.html", run, found)
-    page = (tmp_path / "page.html").read_text()
+    page = painted(deploy_page(run, found))
     assert "Channel sum: gain 3000 N/m" in page
     assert "Channel difference: 3 states, as designed" in page
 

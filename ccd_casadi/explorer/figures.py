@@ -22,11 +22,11 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
+from ccd_casadi.analysis.loop_view import phase_deg
 from ccd_casadi.drawing.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
-from ccd_casadi.reporting.bode import phase_deg
 from ccd_casadi.reporting.nyquist import FAR
 
 HEIGHT = 230

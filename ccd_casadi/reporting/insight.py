@@ -7,20 +7,19 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.drawing.lines import Curve, Mark, Panel, figure_lines
-from ccd_casadi.drawing.page import Table, number
+from ccd_casadi.drawing.content import Curve, Figure, Lines, Mark, Panel, Table
 from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.reporting.facts import cost_axis
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ, number, shown_unit
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
 
 
-def figure_front(
-    problem: CoDesignProblem, front: Front, design: tuple[float, float, str], *, key: str = "front"
-) -> str:
+def front_figure(
+    problem: CoDesignProblem, front: Front, design: tuple[float, float, str]
+) -> Figure:
     """Bandwidth over hardware cost, and where each θ lies in its bounds along the curve.
 
     `design` is (f, ω_b in Hz, words) of the run's own optimum.
@@ -47,10 +46,11 @@ def figure_front(
     )
     bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
     title = "Largest bandwidth at each hardware cost, and the hardware that reaches it"
-    return figure_lines([[top], [bottom]], key=key, title=title, heights=(3.3, 2.8))
+    lines = Lines(((top,), (bottom,)), title, (3.3, 2.8))
+    return Figure(lines, _caption(front), (_table(problem, front),))
 
 
-def caption_front(front: Front) -> str:
+def _caption(front: Front) -> str:
     """How many points, how well they are known, and what the trade-off comes to."""
     points = front.points
     verified = sum(point.verified for point in points)
@@ -77,7 +77,7 @@ def caption_front(front: Front) -> str:
     return words
 
 
-def table_front(problem: CoDesignProblem, front: Front) -> Table:
+def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
     shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     heads = (f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, shown, strict=True))
