@@ -15,9 +15,7 @@ from ccd_casadi.codesign.reach import reach
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, survival
 from ccd_casadi.codesign.verdict import State, survives
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-)
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.lti.closed_loop import closed_loop

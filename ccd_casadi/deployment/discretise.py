@@ -6,10 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ccd_casadi.deployment.sampled import (
-    SampledFigures,
-    sampled_figures,
-)
+from ccd_casadi.deployment.sampled import SampledFigures, sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled, tustin

@@ -21,9 +21,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-)
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import Sampling, sampled, tustin
 from ccd_casadi.lti.loop import Loop

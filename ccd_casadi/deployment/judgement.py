@@ -11,9 +11,7 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-)
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled

@@ -1,6 +1,5 @@
 """report.html of a deployment: full, reduced and sampled loop, orders, sections."""
 
-
 import numpy as np
 
 from ccd_casadi.analysis.signals import step_response

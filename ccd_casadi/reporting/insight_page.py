@@ -1,6 +1,5 @@
 """insight.html: the trade-off around a design, and what it answers to."""
 
-
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.pareto import Front

@@ -1,6 +1,5 @@
 """The first flexible modes of a plant as pictures to turn, whatever builder has its surface."""
 
-
 import numpy as np
 
 from ccd_casadi.drawing.content import Figure, Modes, Table

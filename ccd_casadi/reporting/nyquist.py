@@ -1,6 +1,5 @@
 """The Nyquist plot of L = GK with the disk that S_max keeps it out of: |1 + L| >= 1/S_max."""
 
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,6 +1,5 @@
 """robustness.html: what the design survives, in figures with the numbers behind them."""
 
-
 import numpy as np
 
 from ccd_casadi.analysis.move import Move

@@ -9,12 +9,7 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Section, Table, Words
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    plant_of,
-    scaled_plant,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel

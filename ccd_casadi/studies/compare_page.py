@@ -18,12 +18,7 @@ from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.methods import (
-    LABELS,
-    cost_figure,
-    descent_figure,
-    theta_paths,
-)
+from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
 from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import number, shown_unit
 
