@@ -53,7 +53,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")
         print(f"written       {folder / 'insight.html'}")
     from ccd_casadi.reporting.index import index_of, publish
-    from ccd_casadi.reporting.insight_page import insight_page
+    from ccd_casadi.reporting.insight import insight_page
 
     page = insight_page(done, front, responses, index_of(folder))
     publish(folder, folder / "insight.html", page)
