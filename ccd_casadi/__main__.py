@@ -24,6 +24,7 @@ COMMANDS = {
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
+    "report": ("ccd_casadi.report", "draws the pages of a finished folder again"),
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
     "imported": ("ccd_casadi.imported", "a modal table from result files; also: ccd import"),
 }

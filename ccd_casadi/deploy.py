@@ -95,10 +95,12 @@ def command(options: argparse.Namespace) -> ExitCode:
         if moved is not None:
             print(f"{'a move':13s} {_move_words(moved)}")
         print(f"report        {folder / 'report.html'}")
-    from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
+    from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
+    from ccd_casadi.reporting.index import index_above, publish
 
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
-    write_report(folder / "report.html", finished, found, moved)
+    page = deploy_page(finished, found, moved, index_above(folder, finished.folder))
+    publish(finished.folder, folder / "report.html", page)
     if found.passed:
         return ExitCode.DONE
     print(one_line(f"not verified: {_shortfall(finished, found)}"), file=sys.stderr)

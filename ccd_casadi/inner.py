@@ -66,10 +66,12 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
     found, made = measured_answer(case, seed=options.seed, progress=_progress(options))
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
-        from ccd_casadi.reporting.measured_page import write_measured
+        from ccd_casadi.drawing.stored import write_page
+        from ccd_casadi.reporting.measured_page import measured_page
 
         folder = run_folder(options.case, options.out)
-        write_measured(folder, case, made.controller, {"status": found.status, **found.figures})
+        answer = {"status": found.status, **found.figures}
+        write_page(folder / "report.html", measured_page(case, made.controller, answer))
     return _print(found, options, began)
 
 

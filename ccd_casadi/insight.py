@@ -52,9 +52,11 @@ def command(options: argparse.Namespace) -> ExitCode:
         print(f"front         {len(verified)} of {len(front.points)} points verified, ", end="")
         print(f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")
         print(f"written       {folder / 'insight.html'}")
-    from ccd_casadi.reporting.insight_page import write_insight  # matplotlib is slow to import
+    from ccd_casadi.reporting.index import index_of, publish
+    from ccd_casadi.reporting.insight import insight_page
 
-    write_insight(folder, done, front, responses)
+    page = insight_page(done, front, responses, index_of(folder))
+    publish(folder, folder / "insight.html", page)
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
 
 

@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,6 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.units import counted
-from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -213,36 +211,29 @@ def command(options: argparse.Namespace) -> ExitCode:
         slow = slow_words(formulation, len(problem.names))
         if slow:
             print(f"warning: {slow}", file=sys.stderr)
-    with ExitStack() as stack:
-        helper = None
-        if not options.no_report and options.workers > 1 and not options.quiet:
-            # Where somebody waits, a process gets ready to draw half of the report meanwhile.
-            from ccd_casadi.reporting.solve_page import ready
+    given = None
+    if options.surrogate is not None:
+        given = named_surrogate(folder, options.surrogate, name, problem)
+    store = folder / "samples.sqlite"
+    with (
+        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        SampleStore(store) as samples,
+    ):
+        if options.resume and not options.quiet:
+            held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+            print(f"resuming      {store} holds {held}", file=sys.stderr)
+        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+        write_run(folder, case, solution)
+    code = ExitCode.of(solution.result["status"])
+    if not options.quiet:
+        print(summary(solution))
+        print(f"run folder    {folder}")
+    if not options.no_report:
+        from ccd_casadi.reporting.solve_page import write_report
 
-            helper = stack.enter_context(Ahead(ready))
-        given = None
-        if options.surrogate is not None:
-            given = named_surrogate(folder, options.surrogate, name, problem)
-        store = folder / "samples.sqlite"
-        with (
-            pool(options.scheduler, options.workers, PATIENCE) as workers,
-            SampleStore(store) as samples,
-        ):
-            if options.resume and not options.quiet:
-                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-                print(f"resuming      {store} holds {held}", file=sys.stderr)
-            sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-            solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
-            write_run(folder, case, solution)
-        code = ExitCode.of(solution.result["status"])
-        if not options.quiet:
-            print(summary(solution))
-            print(f"run folder    {folder}")
-        if not options.no_report:
-            from ccd_casadi.reporting.solve_page import write_report
-
-            plant_case, solved = resolved(case, solution), solution.problem or problem
-            write_report(folder, plant_case, solved, solution, quiet=options.quiet, helper=helper)
+        plant_case, solved = resolved(case, solution), solution.problem or problem
+        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
     if options.quiet and code is not ExitCode.DONE:
         print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
     return code
@@ -269,7 +260,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--no-report",
         action="store_true",
-        help="write no report.html: for jobs whose result.json is read by a program",
+        help="write no report: for jobs whose result.json is read by a program",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

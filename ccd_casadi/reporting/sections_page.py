@@ -1,13 +1,15 @@
 """The run report of a controller of fixed structure: its sections, and every plant's loop."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.reporting.facts import (
     Fact,
     binding,
@@ -16,18 +18,9 @@ from ccd_casadi.reporting.facts import (
     loop_facts,
     theta_words,
 )
-from ccd_casadi.reporting.page import (
-    Table,
-    number,
-    paragraph,
-    table_html,
-)
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
-
-if TYPE_CHECKING:
-    pass
 
 
 def conclusion_of(result: Mapping[str, Any]) -> str:
@@ -51,7 +44,7 @@ def _plants(result: Mapping[str, Any]) -> str:
     return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
-def bandwidths_html(verified: "VerifiedSections") -> str:
+def bandwidths_table(verified: VerifiedSections) -> Table:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
@@ -68,8 +61,7 @@ def bandwidths_html(verified: "VerifiedSections") -> str:
         )  # fmt: skip
         rows.append(("the model", "continuous", found.bandwidth))
     head = ("-3 dB of S with this controller, on", "loop", "Hz")
-    table = Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
-    return table_html(table)
+    return Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
 
 
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
@@ -95,7 +87,7 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     return [*over_theta, *over_kappa, *ends]
 
 
-def beside_html(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
+def beside_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[Block, ...]:
     """What the structure, robustness, hold and delay cost, by mixed sensitivity at the same θ."""
     found, sections = result["full_order"], sections_of_problem(problem)
     model, on_set, sampled = found["on_model"], found["on_set"], sections.sampling is not None
@@ -134,7 +126,7 @@ def beside_html(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
             f"the sections, which were not designed for it, have {number(found['stacked_norm'])}, "
             f"{number(ratio, 3)} times that (continuous loop)."
         )
-    return table_html(Table(head, tuple(rows))) + "".join(paragraph(text) for text in words)
+    return (Table(head, tuple(rows)), *map(Words, words))
 
 
 def _judged_words(full: Mapping[str, Any]) -> str:
@@ -151,7 +143,7 @@ def _judged_words(full: Mapping[str, Any]) -> str:
     return f"{words}; largest figures over the sections' bounds where it is stable: {worst}."
 
 
-def sections_facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
+def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
     certificate, robust, inner = r["certificate"], r["robust"], problem.inner
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
     sampling = sections_of_problem(problem).sampling
@@ -219,14 +211,10 @@ def _over(kkt: Mapping[str, Any]) -> str:
     return f"θ and controller together, at a kink of J ({alone} with one side's gradient)"
 
 
-def controller_html(result: Mapping[str, Any]) -> str:
+def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
-    rows = tuple(
-        (s["kind"], s["zero_hz"], s["zero_damping"], s["pole_hz"], s["pole_damping"])
-        for s in controller["sections"]
-    )
-    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    found = [SectionWords(**item) for item in controller["sections"]]
     gains = (
         f"Gain {number(controller['gain'], 6)} N/m"
         if "gain" in controller
@@ -239,4 +227,11 @@ def controller_html(result: Mapping[str, Any]) -> str:
         f"{gains}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
-    return paragraph(words) + table_html(Table(head, rows))
+    return Words(words), sections_table(found)
+
+
+def sections_table(found: Sequence[SectionWords]) -> Table:
+    """Zeros and poles of a controller's sections."""
+    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    rows = ((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in found)
+    return Table(head, tuple(rows))
