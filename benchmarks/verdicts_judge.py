@@ -82,7 +82,8 @@ class Loop:
         grid = [np.geomspace(1e-4 * HZ, top, 2500)]
         grid += [np.abs(p.imag) + np.abs(p.real) * steps for p in near]
         w = np.unique(np.concatenate(grid))
-        self.grid = w[(w > 1e-4 * HZ) & (w <= top)]
+        w = w[(w > 1e-4 * HZ) & (w <= top)]
+        self.grid = w[np.append(True, np.diff(w) > 1e-6 * w[1:])]  # apart by more than rounding
 
     def responses(self, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """G and K at these frequencies, in rad/s."""
