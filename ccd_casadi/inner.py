@@ -33,11 +33,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     measured = measured_case(options.case)
     if measured is not None:
         return _measured(measured, options, began)
-    if options.theta is None:
-        raise CaseError(
-            f"{options.case}: --theta is missing; give the hardware, --theta m1=60,m2=60"
-        )
     case = load_case(options.case)
+    if options.theta is None:
+        start = ",".join(f"{each.name}={each.start:g}" for each in case.theta)
+        raise CaseError(f"{case.path}: --theta is missing; give the hardware, --theta {start}")
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
     omega_S_hz, omega_T_hz = options.omega_S_hz, options.omega_T_hz
