@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--begin-at",
         metavar="FOLDER",
         type=Path,
-        help="sections: search from the controller.json of a run alone, not from a race",
+        help="sections: search from the controller.json of a run alone, not from many starts",
     )
     for name in ("S", "T"):
         arguments.add_argument(

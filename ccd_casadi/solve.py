@@ -98,7 +98,7 @@ def _optimality(result: Mapping[str, Any]) -> str:
     if "race" in result:
         ends = ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"])
         off = result["controller"]["kkt_residual"]
-        words += f", {off:.1e} over the controller; a full race there: {ends}"
+        words += f", {off:.1e} over the controller; a multi-start search there: {ends}"
     return words
 
 

@@ -66,7 +66,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
 def test_a_part_is_not_empty_because_no_step_from_nearby_ends_in_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Then the part is searched on its own, with races."""
+    """Then the part is searched on its own, with multi-start searches."""
     case = listed(w2=-0.995)
     with Workers(1) as pool, SampleStore(tmp_path / "s.sqlite") as store:
         search = ListedSections(Direct(starts=1), 0, lambda _: pytest.fail("no judge here"))

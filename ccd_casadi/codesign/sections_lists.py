@@ -1,9 +1,9 @@
 """Searches over lists of values with a controller of fixed structure, each near another's end.
 
-The first is a whole one, with races. From then on a search begins at the nearest θ and controller
-that are known and takes local steps on the true function. Where these find nothing a whole one is
-made: a part is not empty for that. What is found so is good for its J; the best combination is then
-designed as any other case, from that controller.
+The first is a whole one, from many starts. From then on a search begins at the nearest θ and
+controller that are known and takes local steps on the true function. Where these find nothing a
+whole one is made: a part is not empty for that. What is found so is good for its J; the best
+combination is then designed as any other case, from that controller.
 """
 
 from collections.abc import Callable

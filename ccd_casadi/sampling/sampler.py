@@ -86,7 +86,7 @@ class Sampler:
         return self.spent.total
 
     def raced(self, key: str) -> None:
-        """Count a race once, as one synthesis."""
+        """Count a multi-start search once, as one synthesis."""
         with self.spent.on("races"):
             self.spent.once(f"race {key}", 1)
 
