@@ -11,6 +11,7 @@ from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.interrupts import begun
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.terminal import say
 
 # word -> the module of its `main`, and what it does
 COMMANDS = {
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         wrong = f"{words[0]} takes nothing more, as in: ccd {words[0]}"
     else:
         wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, *OWN))}"
-    print(one_line(wrong), file=sys.stderr)
+    say(one_line(wrong), sys.stderr)
     return ExitCode.BAD_INPUT
 
 
@@ -82,7 +83,7 @@ def new(folder: Path) -> int:
     there = [name for name in TEMPLATE if (folder / name).exists()]
     if there:
         words = f"{folder}: {' and '.join(there)} would be overwritten; choose another name"
-        print(one_line(words), file=sys.stderr)
+        say(one_line(words), sys.stderr)
         return ExitCode.BAD_INPUT
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +93,7 @@ def new(folder: Path) -> int:
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:
         words = f"{folder}: cannot be written: {error.strerror}; choose another name"
-        print(one_line(words), file=sys.stderr)
+        say(one_line(words), sys.stderr)
         return ExitCode.BAD_INPUT
     case = folder / "case.toml"
     print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted")

@@ -8,6 +8,7 @@ from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.options import number, one_line, positive, whole
+from ccd_casadi.support.terminal import say
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -34,7 +35,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = tune(
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
-            progress=None if options.quiet else lambda words: print(words, file=sys.stderr),
+            progress=None if options.quiet else lambda words: say(words, sys.stderr),
             workers=workers,
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
@@ -57,12 +58,12 @@ def command(options: argparse.Namespace) -> ExitCode:
             f"{result['sensitivity_peak']:.4g} at {result['sensitivity_peak_hz']:.4g} Hz",
             *loop_lines(result),
             *(f"{'':14s}{SectionWords(**item).text}" for item in result["controller"]["sections"]),
-            f"{'report':14s}{folder / 'report.html'}",
+            f"{'page':14s}{folder / 'report.html'}",
         ]
         if not options.quiet:
-            print("\n".join([f"{'status':14s}{answer.status}", *lines]))
+            say("\n".join([f"{'status':14s}{answer.status}", *lines]))
     if answer.status != "verified":
-        print(one_line(f"{case.file}: {answer.status}: {result['reason']}"), file=sys.stderr)
+        say(one_line(f"{case.file}: {answer.status}: {result['reason']}"), sys.stderr)
     return ExitCode.of(answer.status)
 
 

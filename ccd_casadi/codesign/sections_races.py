@@ -27,6 +27,7 @@ from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.terminal import say
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,6 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
     def tell(words: str) -> None:
         if not quiet:
             with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                print(f"{label}: {words}", file=sys.stderr, flush=True)
+                say(f"{label}: {words}", sys.stderr)
 
     return tell

@@ -81,9 +81,8 @@ def run_race(
         field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
-        tell(f"{len(running)} searches, {sum(runner.evaluations for runner in field)} loops, "
-             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
-             f"{lead.assessment.violation:.1g}")  # fmt: skip
+        tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
+             f"{lead.assessment.violation:.1g}; {going} of {len(running)} go on")  # fmt: skip
     return field
 
 

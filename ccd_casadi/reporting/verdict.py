@@ -1,12 +1,13 @@
 """The verdict of a run as every command and page shows it: five lines, each with sign and words."""
 
 import re
-import textwrap
+import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.reporting.page import escape, header, typeset
+from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}
@@ -18,7 +19,6 @@ STATUS = {
 }
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
-WIDTH = 100  # of a terminal line
 
 
 class Shown(NamedTuple):
@@ -52,9 +52,8 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     found = []
     for line in lines_of(result):
-        head = f"{line.name:14s}{line.state.value:9s}"
-        found += textwrap.wrap(
-            line.words, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)
+        found.append(
+            wrapped(f"{line.name:14s}{line.state.value:9s}{line.words}", columns(sys.stdout))
         )
     return found
 
