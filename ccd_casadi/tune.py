@@ -1,4 +1,4 @@
-"""`python -m ccd_casadi.tune DATA...`: a controller for a plant that was measured."""
+"""`python -m ccd_casadi.tune DATA...`: a controller for a plant that exists."""
 
 import argparse
 import sys
@@ -70,13 +70,13 @@ def command(options: argparse.Namespace) -> ExitCode:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.tune", "The fastest PID with notches for a measured plant, with its C code.",
+        "ccd_casadi.tune", "The fastest PID with notches for a plant that exists, with its C code.",
         metavar="DATA", nargs="+",
-        about="measured responses, .csv, .mat or .npz; several are one set",
+        about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip
     for name, metavar, kind, default, words in (
-        ("--rate-hz", "X", positive, None, "of the controller; the hold is in DATA"),
-        ("--delay", "SECONDS", number(), 0.0, "on top of what is in DATA"),
+        ("--rate-hz", "X", positive, None, "of the controller; a response has the hold in it"),
+        ("--delay", "SECONDS", number(), 0.0, "in s, on top of what is in DATA"),
         ("--s-max", "X", number(1.0, strict=True), 1.8, "the largest |S|"),
         ("--shape", "X", number(1.0), 1.1, "|S| over ω/(√2 ω_b) at most"),
         ("--effort", "X", positive, 20.0, "|KS| at most, over 1/|G| about ω_b"),
