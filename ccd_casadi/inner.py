@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.options import positive
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -78,7 +79,7 @@ def _progress(options: argparse.Namespace) -> Callable[[str], None] | None:
     """Progress on stderr, as stdout is for the answer."""
     if options.quiet:
         return None
-    return lambda words: print(words, file=sys.stderr, flush=True)
+    return lambda words: say(words, sys.stderr)
 
 
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
@@ -116,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--begin-at",
         metavar="FOLDER",
         type=Path,
-        help="sections: search from the controller.json of a run alone, not from a race",
+        help="sections: search from the controller.json of a run alone, not from many starts",
     )
     for name in ("S", "T"):
         arguments.add_argument(

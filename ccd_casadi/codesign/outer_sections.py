@@ -1,8 +1,8 @@
 """The outer problem with controllers of fixed structure, over θ alone.
 
 A formulation works on v(θ) of the problem's anchors and plant set, with envelope gradients. At its
-end a full race and a search for worse plants ask whether these were good enough at that θ; if not,
-what they find joins, and the outer problem is solved again.
+end a multi-start search and a search for worse plants ask whether these were good enough at that
+θ; if not, what they find joins, and the outer problem is solved again.
 """
 
 from dataclasses import dataclass, replace
@@ -40,13 +40,13 @@ from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 
-BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
+BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
 
 
 @dataclass(frozen=True)
 class SectionsEnd(End):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
-    a race there, the worst plant, and those to add."""
+    a multi-start search there, the worst plant, and those to add."""
 
     asked: Sampler
     best: BandwidthSample
@@ -57,7 +57,7 @@ class SectionsEnd(End):
 
 
 class SectionsOuter(ThetaOuter):
-    """See the module; `words` say why a race at the start found no anchors."""
+    """See the module; `words` say why the search at the start found no anchors."""
 
     kkt_level = VerifiedSections.kkt_level
 
@@ -66,7 +66,7 @@ class SectionsOuter(ThetaOuter):
         self.words = words
 
     def prepared(self, seed: int) -> "SectionsOuter":
-        """Raced at the start for anchors and the plant set, where there are none."""
+        """Searched at the start for anchors and the plant set, where there are none."""
         sampler = self.sampler
         if sections_of_problem(sampler.problem).anchors:
             return self
@@ -78,7 +78,7 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem), words if lost else "")
 
     def continued(self, folder: Path, seed: int) -> "SectionsOuter":
-        """With the anchors and the plant set of a run, or those of a race where it has none."""
+        """With the anchors and the plant set of a run, or those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
@@ -86,7 +86,7 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem)).prepared(seed)
 
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """None: every θ has had its own race. Why, in words."""
+        """None: every θ has had its own multi-start search. Why, in words."""
         nearest = self.sampler.nearest
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)

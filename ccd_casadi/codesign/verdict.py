@@ -164,13 +164,13 @@ def _sides(kink: Kink) -> str:
 
 
 def look_words(starts: int, optima: int, look: BoxLook | None) -> tuple[str, dict[str, Any]]:
-    """What IPOPT's starts and the look over the box say, in words and figures."""
+    """What IPOPT's starts and the global check over the box say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     known = f"best of {_count(starts, 'start')}" if starts else ""
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        said = "gap not known: no look at the box"
+        said = "gap not known: no global check over the box"
         return ", ".join(part for part in (known, said) if part), figures
     figures |= {
         "box_points": look.points,
@@ -186,7 +186,7 @@ def look_words(starts: int, optima: int, look: BoxLook | None) -> tuple[str, dic
         how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
     said = f"none better at {how}"
     if look.moved:
-        said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
+        said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
     return ", ".join(part for part in (known, said, "gap not known") if part), figures
 
 

@@ -36,8 +36,8 @@ class VerifiedSections(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
-    the whole of it; `worst` the worst plant that was found. `raced` is a full race at θ, and
-    `beside` what controllers of full order reach there.
+    the whole of it; `worst` the worst plant that was found. `raced` is a multi-start search
+    at θ, and `beside` what controllers of full order reach there.
     """
 
     design: SectionsDesign
@@ -181,7 +181,8 @@ class VerifiedSections(Verified):
     def gap_words(self) -> str:
         figure = self.problem.figure
         here, there = figure.shown(self.value), figure.shown(self.raced.value)
-        return f"a race at this theta found a controller with {there} in place of {here}"
+        found = f"found a controller with {there} instead of {here}"
+        return f"a multi-start search at this theta {found}"
 
     def no_gradient_words(self) -> str:
         off = self.design.kkt_residual
@@ -198,5 +199,5 @@ class VerifiedSections(Verified):
         if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"
         raced = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a full race at this theta ended at {raced} Hz{of}; {known}"
+        words = f"a multi-start search at this theta ended at {raced} Hz{of}; {known}"
         return words, {**figures, "local_optima_hz": found}

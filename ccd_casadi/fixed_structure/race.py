@@ -1,4 +1,4 @@
-"""A race of local searches: from many starts, by successive halving, to distinct local optima.
+"""A multi-start search: local searches, by successive halving, to distinct local optima.
 
 All climb some steps, the better half goes on, and so forth. A search stops early where its steps no
 longer help, where it has come to a controller that a better one has already been at, and where it
@@ -66,7 +66,7 @@ def run_race(
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
-    Those of races `before` are in the field too: they climb no more, but have to be overtaken.
+    Those of searches `before` are in the field too: they climb no more, but have to be overtaken.
     """
     field = [replace(runner, running=False) for runner in before]
     field += [Runner(started(problem, kappa)) for kappa in pool]
@@ -81,9 +81,8 @@ def run_race(
         field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
-        tell(f"{len(running)} searches, {sum(runner.evaluations for runner in field)} loops, "
-             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
-             f"{lead.assessment.violation:.1g}")  # fmt: skip
+        tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
+             f"{lead.assessment.violation:.1g}; {going} of {len(running)} go on")  # fmt: skip
     return field
 
 

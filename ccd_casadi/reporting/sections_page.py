@@ -115,8 +115,8 @@ def beside_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
         words.append(f"On the set (resonance shifts and damping): {_judged_words(on_set)}")
     words.append(
         "Full order keeps S_max and |S| at ω_low as the sections do, and no bound on KS, T, GS or "
-        "the shape. The sections' other rows are ends of climbs from the design, no races: at "
-        "least that is reached."
+        "the shape. The sections' other rows are ends of climbs from the design, without other "
+        "starts: at least that is reached."
     )
     if found["stacked_norm"] is not None and found["gamma_opt"] is not None:
         ratio = found["stacked_norm"] / found["gamma_opt"]
@@ -186,7 +186,7 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),
-        ("A full race at this θ", optima or "–",
+        ("A multi-start search at this θ", optima or "–",
          f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
