@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.full_order import Beside
 from ccd_casadi.codesign.sections_entries import (
@@ -36,7 +37,8 @@ class VerifiedSections(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
-    the whole of it; `worst` the worst plant that was found. `raced` is a full race at θ, and
+    the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
+    `worst` the worst plant that was found. `raced` is a full race at θ, and
     `beside` what controllers of full order reach there.
     """
 
@@ -45,6 +47,7 @@ class VerifiedSections(Verified):
     wide: Certificate
     checked: int
     proof: Proof
+    drawn: Yield | None
     worst: Excess
     rounds: int
     beside: Beside
@@ -69,10 +72,15 @@ class VerifiedSections(Verified):
 
     @property
     def kept(self) -> bool:
-        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
+        """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
         found, ends = self.survival, kind_of(self.problem).common_shifts()
         along = found is None or found.within(*ends)
-        return self.wide.passed and not self.proof.refuted and along
+        return self.wide.passed and not self.proof.refuted and self.all_drawn and along
+
+    @property
+    def all_drawn(self) -> bool:
+        """Whether none of the plants that were drawn fails."""
+        return self.drawn is None or self.drawn.survived == self.drawn.draws
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -123,6 +131,7 @@ class VerifiedSections(Verified):
             "worst_plant": {"option": self.worst.option, "point": self.worst.point.tolist()},
             "set": [{"option": option, "point": list(point)} for option, point in members],
             "words": self.wide.words,
+            "yield": None if self.drawn is None else self.drawn.entry,
             **({} if self.damping is None else self.damping.entry),
         }
 
@@ -146,6 +155,7 @@ class VerifiedSections(Verified):
 
     def survives_line(self) -> Line:
         excess, proof = math.expm1(self.worst.value), self.proof
+        drawn = "" if self.drawn is None else self.drawn.words
         figures = {
             "plants": self.checked,
             "worst_excess": excess,
@@ -163,8 +173,10 @@ class VerifiedSections(Verified):
             words = f"within every bound on {where}, but {proof.words}"
         elif self.checked <= 1:
             robust, words = None, "[robust] names no plant but the model"
+        elif not self.all_drawn:
+            words = f"within every bound on {where}, but of the whole box {drawn}"
         elif robust:
-            words = f"{words}; {proof.words}"
+            words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:
             words = f"within every bound on {where}, but not all along its common resonance shift"
         line = survives(
