@@ -1,0 +1,163 @@
+"""The largest ω_b that any controller of any order has on one plant: from outside and inside.
+
+A larger ω_b only shrinks the discs of `limits`, so both searches are for the ω_b at which the least
+scaling of the discs is one. Outside only what `certificate` has shown counts.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ccd_casadi.gap.basis import Basis
+from ccd_casadi.gap.certificate import forbids
+from ccd_casadi.gap.conic import greatest_multiplier, least_scaling
+from ccd_casadi.gap.limits import Limits
+from ccd_casadi.support.arrays import Array
+
+REALS = (*[2.0] * 60, 10.0, 30.0, 100.0)  # of the basis, over ω_b
+CORNERS = {-1: 100.0, 1: 5.0}  # of its roll-off, for h and for T
+GRID, FINE = 120, 1500  # frequencies in a decade: of a programme, of what is made of it
+OVER = 0.002  # by how much the scaling is above one where the certificate is tried
+TRIES = 5
+BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a grid of their own
+BEGIN = 0.65  # of what one frequency alone forbids
+WITHIN = 1e-3  # relative: by how much T may pass a bound on the fine grid
+
+
+@dataclass(frozen=True)
+class Reach:
+    """ω_b in rad/s: no controller reaches `outside`; one of `order` functions reaches `inside`.
+
+    `outside` is infinite where nothing forbids any bandwidth, `inside` 0 where none was found.
+    """
+
+    name: str
+    outside: float
+    inside: float
+
+
+def reach(limits: Limits, inside: bool = True) -> Reach:
+    """Both bounds on the bandwidth of one loop, in terms of the whole's ω_b."""
+    most = _pointwise(limits)
+    if not np.isfinite(most):
+        return Reach(limits.name, np.inf, 0.0)
+    begin = BEGIN * most
+    outside = _Search(limits, begin, -1).outside(begin, most)
+    within = _Search(limits, outside, 1).inside(outside) if inside else 0.0
+    return Reach(limits.name, outside, within)
+
+
+def _pointwise(limits: Limits) -> float:
+    """The least ω_b at which some frequency alone forbids it: m_S + m_T < 1."""
+
+    def slack(log_omega: float) -> float:
+        v = _grid(limits, float(np.exp(log_omega)), 400)
+        m_S, m_T = limits.radii(v, v, float(np.exp(log_omega)))
+        return float((m_S + m_T).min()) - 1.0
+
+    low = np.log(limits.bounds.omega_low)
+    high = low + np.log(1e6) if not limits.period else np.log(np.pi / limits.period) - 1e-3
+    if slack(high) >= 0.0:
+        return np.inf if not limits.period else float(np.exp(high))
+    if slack(low) < 0.0:
+        return float(np.exp(low))
+    return float(np.exp(brentq(slack, low, high, xtol=1e-4))) * (1.0 + 1e-3)
+
+
+def _roots(limits: Limits, omega_b: float) -> list[complex]:
+    """Poles and zeros, with positive imaginary parts, that matter at ω_b."""
+    v = limits.variable(omega_b)
+    found = [r for r in limits.roots.tolist() if BAND[0] * v < abs(r) < BAND[1] * v]
+    return [r for r in found if r.imag > 0.0]
+
+
+def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
+    """Frequencies v: fine around ω_b and at every lightly damped root, both sides of a step."""
+    v = limits.variable(omega_b)
+    parts = [
+        np.geomspace(0.02 * v, 40.0 * v, int(3.3 * per_decade)),
+        np.geomspace(1e-4 * v, 0.02 * v, per_decade),
+        np.geomspace(40.0 * v, 1e4 * v, per_decade),
+    ]
+    for r in _roots(limits, omega_b):
+        spread = np.sinh(np.linspace(-5.0, 5.0, max(per_decade // 3, 21)))
+        parts.append(abs(r.imag) + max(abs(r.real), 1e-4 * abs(r)) * spread)
+    for step in (omega_b, limits.ratio * omega_b):
+        parts.append(limits.variable(step) * np.array([1.0 - 1e-9, 1.0 + 1e-9]))
+    grid = np.unique(np.concatenate(parts))
+    return grid[(grid > 0.0) & np.isfinite(grid)]
+
+
+class _Search:
+    """ω_b with a basis that stays; `turned` -1: of multipliers h, 1: of T."""
+
+    def __init__(self, limits: Limits, omega_b: float, turned: int) -> None:
+        self.limits, self.unit = limits, limits.variable(omega_b)
+        pairs = {complex(abs(r.real), r.imag) for r in _roots(limits, omega_b)}
+        excess = len(limits.row[0].poles) - len(limits.row[0].zeros)
+        self.basis = Basis(
+            reals=tuple(self.unit * a for a in REALS),
+            pairs=tuple(sorted(pairs, key=abs)),
+            corner=CORNERS[turned] * self.unit,
+            order=1 if turned < 0 else max(excess - 1, 0),
+            zeros=limits.beyond,
+            turned=turned,
+            constant=turned > 0 and excess == 0,
+        )
+
+    def multiplier(self, omega_b: float) -> tuple[float, Array]:
+        """The scaling that some h shows, on a grid, and the coefficients of h."""
+        v = _grid(self.limits, omega_b, GRID)
+        width = np.gradient(v)
+        width[0] += v[0]
+        values = self.basis.values(v) * np.sqrt(self.unit)
+        radii = self.limits.radii(v, v, omega_b)
+        return greatest_multiplier(values, width / self.unit, *radii)
+
+    def controller(self, omega_b: float) -> tuple[float, Array]:
+        """The scaling that some T needs, on a finer grid, and its coefficients."""
+        v = _grid(self.limits, omega_b, GRID)
+        g, weight = least_scaling(self.basis.values(v), *self.limits.radii(v, v, omega_b))
+        v = _grid(self.limits, omega_b, FINE)
+        m_S, m_T = self.limits.radii(v, v, omega_b)
+        T = self.basis.values(v) @ weight
+        shares = np.maximum(np.abs(T) / m_T, np.abs(1.0 - T) / m_S)
+        return max(g, float(shares.max())), weight
+
+    def outside(self, begin: float, most: float) -> float:
+        """An ω_b that a certificate forbids, near the least; `most` where none is found."""
+        omega_b, weight = _where(self.multiplier, begin, most, 1.0 + OVER)
+        for _ in range(TRIES):
+            if omega_b >= most:
+                break
+            start = _grid(self.limits, omega_b, GRID)
+            if forbids(self.limits, self.basis, weight, omega_b, start):
+                return omega_b
+            omega_b *= 1.0 + 2.0 * OVER
+            weight = self.multiplier(omega_b)[1]
+        return most
+
+    def inside(self, most: float) -> float:
+        """The ω_b of a T that keeps every bound on a fine grid; 0 where none is found."""
+        found = _where(self.controller, 0.98 * most, most, 1.0)[0]
+        return found if self.controller(found)[0] <= 1.0 + WITHIN else 0.0
+
+
+def _where(
+    scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
+) -> tuple[float, Array]:
+    """The ω_b at which the scaling is as aimed at, to half a thousandth; secants in ln."""
+    x, slope = np.log(begin), 0.6
+    known: list[tuple[float, float]] = []
+    for _ in range(8):
+        g, weight = scaling(float(np.exp(x)))
+        error = np.log(g / aim)
+        if abs(error) < 5e-4:
+            break
+        if known and x != known[-1][0]:
+            slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))
+        known.append((x, error))
+        x = min(x - error / slope, float(np.log(most)))
+    return float(np.exp(x)), weight
