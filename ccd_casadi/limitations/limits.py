@@ -82,8 +82,8 @@ def magnitude(system: StateSpace) -> Magnitude:
 class Limits:
     """The loop in one direction of outputs: ‖uᵀG‖ as held, |G| without hold (one channel), bounds.
 
-    `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low. `beyond`: zeros of G in the right half plane, in v, which T has
-    for every controller.
+    `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low.
+    `beyond`: zeros of G in the right half plane, in v, which T has for every controller.
     """
 
     name: str
@@ -157,9 +157,7 @@ def limits_of(
         held, period = sampled(plant, sampling.period, sampling.delay), sampling.period
     u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
     row = tuple(
-        magnitude(
-            StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period)
-        )
+        magnitude(StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period))
         for j in range(held.B.shape[1])
         if np.abs(held.B[:, j]).any()
     )

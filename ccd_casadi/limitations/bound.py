@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from ccd_casadi.gap.basis import Basis
-from ccd_casadi.gap.certificate import forbids
-from ccd_casadi.gap.conic import greatest_multiplier, least_scaling
-from ccd_casadi.gap.limits import Limits
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.certificate import forbids
+from ccd_casadi.limitations.conic import greatest_multiplier, least_scaling
+from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
 REALS = (*[2.0] * 60, 10.0, 30.0, 100.0)  # of the basis, over ω_b
@@ -41,12 +41,13 @@ class Reach:
 def reach(limits: Limits, inside: bool = True) -> Reach:
     """Both bounds on the bandwidth of one loop, in terms of the whole's ω_b."""
     most = _pointwise(limits)
-    if not np.isfinite(most):
+    zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
+    begin = min([BEGIN * most, *zeros])
+    if not np.isfinite(begin):
         return Reach(limits.name, np.inf, 0.0)
-    begin = BEGIN * most
     outside = _Search(limits, begin, -1).outside(begin, most)
-    within = _Search(limits, outside, 1).inside(outside) if inside else 0.0
-    return Reach(limits.name, outside, within)
+    found = _Search(limits, outside, 1).inside(outside) if inside and outside < np.inf else 0.0
+    return Reach(limits.name, outside, found)
 
 
 def _pointwise(limits: Limits) -> float:
@@ -159,5 +160,5 @@ def _where(
         if known and x != known[-1][0]:
             slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))
         known.append((x, error))
-        x = min(x - error / slope, float(np.log(most)))
+        x = float(min(x - error / slope, np.log(most)))
     return float(np.exp(x)), weight

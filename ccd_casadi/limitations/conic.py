@@ -1,13 +1,12 @@
 """The two cone programmes on a grid: the least scaling of both discs by a T, and its dual by an h.
 
-    inside:   min g            over T in its basis,  |T| <= g m_T, |1 - T| <= g m_S
+    inside:   min g             over T in its basis,  |T| <= g m_T, |1 - T| <= g m_S
     outside:  max ∫ Re h₂ dv   over h in its basis and h₂,  ∫ m_T|h - h₂| + m_S|h₂| dv <= 1
 
 By Clarabel's interior-point method (Goulart and Chen 2024). Nothing is believed of the answers:
-`youla` looks at T on a finer grid, `certificate` at h on every interval.
+`bound` looks at T on a finer grid, `certificate` at h on every interval.
 """
 
-import clarabel
 import numpy as np
 from scipy import sparse
 
@@ -26,8 +25,7 @@ def least_scaling(functions: np.ndarray, m_S: Array, m_T: Array) -> tuple[float,
         rows[i, :, 2, :n] = sign * functions.imag / m[:, None]
     right[1, :, 1] = 1.0 / m_S
     aim = np.append(np.zeros(n), 1.0)
-    cones = [clarabel.SecondOrderConeT(3)] * (2 * N)
-    x = _solved(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), cones)
+    x = _solved(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), 0)
     return (np.inf, np.zeros(n)) if x is None else (float(x[-1]), x[:n])
 
 
@@ -51,16 +49,18 @@ def greatest_multiplier(
     rows = sparse.vstack([sparse.csr_matrix(budget[None]), stacked[order]]).tocsc()
     right = np.append(1.0, np.zeros(6 * N))
     aim = np.concatenate([np.zeros(n), -width, np.zeros(3 * N)])
-    cones = [clarabel.NonnegativeConeT(1), *[clarabel.SecondOrderConeT(3)] * (2 * N)]
-    x = _solved(aim, rows, right, cones)
+    x = _solved(aim, rows, right, 1)
     return (0.0, np.zeros(n)) if x is None else (float(-aim @ x), x[:n])
 
 
-def _solved(
-    aim: Array, rows: sparse.csc_matrix, right: Array, cones: list[object]
-) -> Array | None:
+def _solved(aim: Array, rows: sparse.csc_matrix, right: Array, linear: int) -> Array | None:
+    """min aim·x where right - rows x is >= 0 in its `linear` first rows, then in cones of three."""
+    import clarabel  # slow to import
+
     settings = clarabel.DefaultSettings()
     settings.verbose = False
+    cones = [clarabel.NonnegativeConeT(linear)] if linear else []
+    cones += [clarabel.SecondOrderConeT(3)] * ((len(right) - linear) // 3)
     none = sparse.csc_matrix((len(aim), len(aim)))
     answer = clarabel.DefaultSolver(none, aim, rows, right, cones, settings).solve()
     return np.array(answer.x) if str(answer.status) in SOLVED else None

@@ -92,7 +92,8 @@ class Basis:
         """∫ |h| dv from `start` on, or more, with a roll-off of order 1: a real pole's function is
         at most √(2a)/v; from twice |p| on one of a pair at most 4√(4 Re p)/v, as |jv + p| >= v/2.
         """
-        assert self.order == 1 and not self.constant
+        assert self.order == 1
+        assert not self.constant
         assert start >= 2.0 * max(map(abs, self.pairs), default=0.0)
         most = [np.sqrt(2.0 * a) for a in self.reals]
         for p in self.pairs:

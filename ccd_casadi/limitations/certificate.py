@@ -19,8 +19,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ccd_casadi.gap.basis import Basis
-from ccd_casadi.gap.limits import Limits
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
 SPLIT = 0.9  # of what is lost to the intervals' widths: by the intervals that are halved
@@ -93,7 +93,8 @@ class _Multiplier:
         curved = self.basis.most_curved(low, high, self.weight) * w**2 / 8.0
         upper, size = w * (line + m_T * curved), w * m_T * np.abs(h)
         value = w * support(h, *self._radii(middle, middle))
-        return _Intervals(low, high, h_low, h_high, h, upper, upper - np.maximum(value, -size), size)
+        loss = upper - np.maximum(value, -size)
+        return _Intervals(low, high, h_low, h_high, h, upper, loss, size)
 
 
 def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: Array) -> bool:
