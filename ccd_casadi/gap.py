@@ -32,14 +32,14 @@ def command(options: argparse.Namespace) -> ExitCode:
         if options.theta is not None:
             theta = parse_theta(case, options.theta)
     found = gap_of(problem, theta)
+    gap = found.entry if bandwidth is None else found.entry_of(HZ * bandwidth)
     answer: dict[str, Any] = {
         "theta": dict(zip(problem.names, theta, strict=True)),
-        "gap": found.entry,
+        "bandwidth_hz": bandwidth,
+        "gap": gap,
         "seconds": perf_counter() - began,
         "versions": versions(),
     }
-    if bandwidth is not None:
-        answer |= {"bandwidth_hz": bandwidth, "relative_gap": found.over(HZ * bandwidth)}
     json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
     print()
     return ExitCode.DONE

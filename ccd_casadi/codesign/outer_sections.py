@@ -39,6 +39,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     proof_of,
     worst_members,
 )
+from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -156,6 +157,7 @@ class SectionsOuter(ThetaOuter):
             worst=worst,
             rounds=rounds,
             beside=beside,
+            gap=known_gap(problem, best.theta),
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -28,6 +28,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ, counted
 
@@ -39,7 +40,7 @@ class VerifiedSections(Verified):
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
     `worst` the worst plant that was found. `raced` is a full race at θ, and
-    `beside` what controllers of full order reach there.
+    `beside` what controllers of full order reach there; `gap`, of ω_b, what none reaches.
     """
 
     design: SectionsDesign
@@ -51,6 +52,7 @@ class VerifiedSections(Verified):
     worst: Excess
     rounds: int
     beside: Beside
+    gap: Gap | None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.
@@ -104,6 +106,7 @@ class VerifiedSections(Verified):
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "full_order": beside_dict(self.beside),
+            "gap": None if self.gap is None else self.gap.entry_of(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
             found |= {
@@ -205,7 +208,8 @@ class VerifiedSections(Verified):
     ) -> tuple[str, Mapping[str, Any]]:
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        known, figures = look_words(starts, optima, look)
+        bound = {} if self.gap is None else {"gap": self.gap.words(self.bandwidth)}
+        known, figures = look_words(starts, optima, look, **bound)
         found, of = [optimum.bandwidth / HZ for optimum in self.raced.design.local_optima], ""
         if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"

@@ -23,6 +23,8 @@ OVER = 0.002  # by how much the scaling is above one where the certificate is tr
 TRIES = 5
 BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a grid of their own
 BEGIN = 0.65  # of what one frequency alone forbids
+NEAR = 0.6  # of the ω_b that a basis is made for: where another one is made
+STEPS = (0.6, 1.6)  # of the scaling that one step goes for: 0 and ∞ are programmes not solved
 WITHIN = 1e-3  # relative: by how much T may pass a bound on the fine grid
 
 
@@ -45,9 +47,27 @@ def reach(limits: Limits, inside: bool = True) -> Reach:
     begin = min([BEGIN * most, *zeros])
     if not np.isfinite(begin):
         return Reach(limits.name, np.inf, 0.0)
-    outside = _Search(limits, begin, -1).outside(begin, most)
+    outside = _outside(limits, begin, most)
     found = _Search(limits, outside, 1).inside(outside) if inside and outside < np.inf else 0.0
     return Reach(limits.name, outside, found)
+
+
+def _outside(limits: Limits, begin: float, most: float) -> float:
+    """An ω_b that a certificate forbids, near the least; `most` where none is found."""
+    for _ in range(2):  # the basis is made for where the search begins
+        search = _Search(limits, begin, -1)
+        omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
+        if NEAR < omega_b / begin < 1.0 / NEAR:
+            break
+        begin = omega_b
+    for _ in range(TRIES):
+        if omega_b >= most:
+            break
+        if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, GRID)):
+            return omega_b
+        omega_b *= 1.0 + 2.0 * OVER
+        weight = search.multiplier(omega_b)[1]
+    return most
 
 
 def _pointwise(limits: Limits) -> float:
@@ -127,19 +147,6 @@ class _Search:
         shares = np.maximum(np.abs(T) / m_T, np.abs(1.0 - T) / m_S)
         return max(g, float(shares.max())), weight
 
-    def outside(self, begin: float, most: float) -> float:
-        """An ω_b that a certificate forbids, near the least; `most` where none is found."""
-        omega_b, weight = _where(self.multiplier, begin, most, 1.0 + OVER)
-        for _ in range(TRIES):
-            if omega_b >= most:
-                break
-            start = _grid(self.limits, omega_b, GRID)
-            if forbids(self.limits, self.basis, weight, omega_b, start):
-                return omega_b
-            omega_b *= 1.0 + 2.0 * OVER
-            weight = self.multiplier(omega_b)[1]
-        return most
-
     def inside(self, most: float) -> float:
         """The ω_b of a T that keeps every bound on a fine grid; 0 where none is found."""
         found = _where(self.controller, 0.98 * most, most, 1.0)[0]
@@ -154,7 +161,7 @@ def _where(
     known: list[tuple[float, float]] = []
     for _ in range(8):
         g, weight = scaling(float(np.exp(x)))
-        error = np.log(g / aim)
+        error = float(np.log(np.clip(g / aim, *STEPS)))
         if abs(error) < 5e-4:
             break
         if known and x != known[-1][0]:

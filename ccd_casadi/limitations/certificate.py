@@ -26,7 +26,7 @@ from ccd_casadi.support.arrays import Array
 SPLIT = 0.9  # of what is lost to the intervals' widths: by the intervals that are halved
 MOST = 300_000  # intervals
 MARGIN = 1e-6  # of ∫ m_T|h|: what rounding may not reach
-TAIL = 1e7  # where the last interval ends, over the largest root of h
+TAIL = 1e13  # where the last interval ends, over the largest root of h
 
 
 def support(h: np.ndarray, m_S: Array, m_T: Array) -> Array:
@@ -106,7 +106,7 @@ def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: 
     top = TAIL * max(basis.corner, *basis.reals, *map(abs, basis.pairs))
     steps = [omega_b, limits.ratio * omega_b, limits.bounds.omega_low]
     parts = [start, [limits.variable(omega) for omega in steps], [0.0]]
-    ends = np.concatenate([*parts, np.geomspace(start.max(), top, 200)])
+    ends = np.concatenate([*parts, np.geomspace(start.max(), top, 400)])
     ends = np.unique(ends[ends <= top])
     h = multiplier.at(ends)
     beyond = (1.0 + limits.bounds.S_max) * basis.tail(top, weight)

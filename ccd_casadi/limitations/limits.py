@@ -18,11 +18,11 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
 from ccd_casadi.lti.hold import Sampling, sampled
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
-FAITHFUL = 1e-5  # relative error of a response by its poles and zeros, up to which they are used
+FAITHFUL = 1e-6  # relative error of a response by its poles and zeros, up to which they are used
 OUTSIDE = 1e-3  # of its size: real part from which on a zero counts as one of the right half plane
 WIDE = 20.0  # m_T where nothing bounds T: more than 1 + S_max
 ROOT_HALF = np.sqrt(0.5)
@@ -59,7 +59,10 @@ def magnitude(system: StateSpace) -> Magnitude:
 
     Raises PlantError where poles and zeros do not give the response.
     """
-    poles, T = system.poles, system.period
+    T = system.period
+    even = balanced(system.A, system.B, system.C)  # or its zeros have errors of 1e-3
+    system = StateSpace(*even, system.D, period=T)
+    poles = system.poles
     size = 1.0 if T else float(np.abs(poles).max())
     zeros = system.zeros(size)
     if T:

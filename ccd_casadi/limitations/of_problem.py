@@ -45,6 +45,20 @@ class Gap:
         """By how much the bound exceeds a design's ω_b (rad/s), relative."""
         return self.outside / bandwidth - 1.0
 
+    def words(self, bandwidth: float) -> str:
+        """Of the verdict, with a design's ω_b in rad/s."""
+        if not np.isfinite(self.outside):
+            return "no bound on every controller, gap not known"
+        return (
+            f"no controller of any order exceeds {self.outside / HZ:.2f} Hz on the model here "
+            f"(gap at most {100.0 * self.over(bandwidth):.0f} %), gap over theta not known"
+        )
+
+    def entry_of(self, bandwidth: float) -> dict[str, Any]:
+        """`entry` beside a design's ω_b in rad/s."""
+        known = np.isfinite(self.outside)
+        return self.entry | {"relative": self.over(bandwidth) if known else None}
+
     @property
     def entry(self) -> dict[str, Any]:
         """Of result.json, in Hz; null where nothing bounds ω_b."""
@@ -65,6 +79,14 @@ def gap_of(problem: CoDesignProblem, theta: Sequence[float], inside: bool = True
     They hold for every set that holds the model. Raises UserError for a problem of another kind.
     """
     return Gap(tuple(reach(limits, inside) for limits in limits_of_problem(problem, theta)))
+
+
+def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
+    """From outside, which takes seconds; None where there is none to know."""
+    try:
+        return gap_of(problem, theta, inside=False)
+    except UserError:
+        return None
 
 
 def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[Limits]:
