@@ -32,11 +32,10 @@ def command(options: argparse.Namespace) -> ExitCode:
         if options.theta is not None:
             theta = parse_theta(case, options.theta)
     found = gap_of(problem, theta)
-    gap = found.entry if bandwidth is None else found.entry_of(HZ * bandwidth)
     answer: dict[str, Any] = {
         "theta": dict(zip(problem.names, theta, strict=True)),
         "bandwidth_hz": bandwidth,
-        "gap": gap,
+        "gap": found.entry(HZ * (bandwidth or float("nan"))),
         "seconds": perf_counter() - began,
         "versions": versions(),
     }

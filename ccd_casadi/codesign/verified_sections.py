@@ -106,7 +106,7 @@ class VerifiedSections(Verified):
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
             "full_order": beside_dict(self.beside),
-            "gap": None if self.gap is None else self.gap.entry_of(self.bandwidth),
+            "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
             found |= {

@@ -5,7 +5,6 @@ scaling of the discs is one. Outside only what `certificate` has shown counts.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -22,38 +21,25 @@ GRID, FINE = 120, 1500  # frequencies in a decade: of a programme, of what is ma
 OVER = 0.002  # by how much the scaling is above one where the certificate is tried
 TRIES = 5
 BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a grid of their own
+MOST_PAIRS, SAME = 16, 1e-3  # how many of them, and how near two are that count as one
 BEGIN = 0.65  # of what one frequency alone forbids
 NEAR = 0.6  # of the ω_b that a basis is made for: where another one is made
 STEPS = (0.6, 1.6)  # of the scaling that one step goes for: 0 and ∞ are programmes not solved
-WITHIN = 1e-3  # relative: by how much T may pass a bound on the fine grid
+CLOSE = 1e-3  # of the scaling: to what aims are met, and by how much T may pass a bound
 
 
-@dataclass(frozen=True)
-class Reach:
-    """ω_b in rad/s: no controller reaches `outside`; one of `order` functions reaches `inside`.
+def outside(limits: Limits, known: float = np.inf) -> float:
+    """An ω_b (rad/s) that no controller reaches, near the least; `known` where that is less.
 
-    `outside` is infinite where nothing forbids any bandwidth, `inside` 0 where none was found.
+    Infinite where nothing forbids any bandwidth.
     """
-
-    name: str
-    outside: float
-    inside: float
-
-
-def reach(limits: Limits, inside: bool = True) -> Reach:
-    """Both bounds on the bandwidth of one loop, in terms of the whole's ω_b."""
-    most = _pointwise(limits)
+    if known < np.inf and _Search(limits, known, -1).multiplier(known)[0] <= 1.0 + OVER:
+        return known
+    most = pointwise(limits)
     zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
-    begin = min([BEGIN * most, *zeros])
+    begin = min([BEGIN * most, known, *zeros])
     if not np.isfinite(begin):
-        return Reach(limits.name, np.inf, 0.0)
-    outside = _outside(limits, begin, most)
-    found = _Search(limits, outside, 1).inside(outside) if inside and outside < np.inf else 0.0
-    return Reach(limits.name, outside, found)
-
-
-def _outside(limits: Limits, begin: float, most: float) -> float:
-    """An ω_b that a certificate forbids, near the least; `most` where none is found."""
+        return np.inf
     for _ in range(2):  # the basis is made for where the search begins
         search = _Search(limits, begin, -1)
         omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
@@ -64,13 +50,22 @@ def _outside(limits: Limits, begin: float, most: float) -> float:
         if omega_b >= most:
             break
         if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, GRID)):
-            return omega_b
+            return min(omega_b, known)
         omega_b *= 1.0 + 2.0 * OVER
         weight = search.multiplier(omega_b)[1]
-    return most
+    return min(most, known)
 
 
-def _pointwise(limits: Limits) -> float:
+def inside(limits: Limits, most: float) -> float:
+    """The ω_b (rad/s) of a T that keeps every bound on a fine grid, near `most`; 0: none found."""
+    if not most < np.inf:
+        return 0.0
+    search = _Search(limits, most, 1)
+    found = _where(search.controller, 0.98 * most, most, 1.0 - CLOSE)[0]
+    return found if search.controller(found)[0] <= 1.0 + CLOSE else 0.0
+
+
+def pointwise(limits: Limits) -> float:
     """The least ω_b at which some frequency alone forbids it: m_S + m_T < 1."""
 
     def slack(log_omega: float) -> float:
@@ -84,14 +79,22 @@ def _pointwise(limits: Limits) -> float:
         return np.inf if not limits.period else float(np.exp(high))
     if slack(low) < 0.0:
         return float(np.exp(low))
-    return float(np.exp(brentq(slack, low, high, xtol=1e-4))) * (1.0 + 1e-3)
+    found = brentq(slack, low, high, xtol=1e-4)
+    while slack(found) >= 0.0:
+        found += 1e-3
+    return float(np.exp(found))
 
 
 def _roots(limits: Limits, omega_b: float) -> list[complex]:
-    """Poles and zeros, with positive imaginary parts, that matter at ω_b."""
+    """-p̄ of the oscillating poles and zeros p next to ω_b, each once."""
     v = limits.variable(omega_b)
-    found = [r for r in limits.roots.tolist() if BAND[0] * v < abs(r) < BAND[1] * v]
-    return [r for r in found if r.imag > 0.0]
+    found: list[complex] = []
+    for r in sorted(limits.roots.tolist(), key=lambda r: abs(np.log(abs(r) / v))):
+        p = complex(abs(r.real), r.imag)
+        known = any(abs(p - other) < SAME * abs(p) for other in found)
+        if r.imag > 0.0 and BAND[0] * v < abs(r) < BAND[1] * v and not known:
+            found.append(p)
+    return found[:MOST_PAIRS]
 
 
 def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
@@ -104,7 +107,7 @@ def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
     ]
     for r in _roots(limits, omega_b):
         spread = np.sinh(np.linspace(-5.0, 5.0, max(per_decade // 3, 21)))
-        parts.append(abs(r.imag) + max(abs(r.real), 1e-4 * abs(r)) * spread)
+        parts.append(r.imag + max(r.real, 1e-4 * abs(r)) * spread)
     for step in (omega_b, limits.ratio * omega_b):
         parts.append(limits.variable(step) * np.array([1.0 - 1e-9, 1.0 + 1e-9]))
     grid = np.unique(np.concatenate(parts))
@@ -116,11 +119,10 @@ class _Search:
 
     def __init__(self, limits: Limits, omega_b: float, turned: int) -> None:
         self.limits, self.unit = limits, limits.variable(omega_b)
-        pairs = {complex(abs(r.real), r.imag) for r in _roots(limits, omega_b)}
         excess = len(limits.row[0].poles) - len(limits.row[0].zeros)
         self.basis = Basis(
             reals=tuple(self.unit * a for a in REALS),
-            pairs=tuple(sorted(pairs, key=abs)),
+            pairs=tuple(_roots(limits, omega_b)),
             corner=CORNERS[turned] * self.unit,
             order=1 if turned < 0 else max(excess - 1, 0),
             zeros=limits.beyond,
@@ -147,22 +149,17 @@ class _Search:
         shares = np.maximum(np.abs(T) / m_T, np.abs(1.0 - T) / m_S)
         return max(g, float(shares.max())), weight
 
-    def inside(self, most: float) -> float:
-        """The ω_b of a T that keeps every bound on a fine grid; 0 where none is found."""
-        found = _where(self.controller, 0.98 * most, most, 1.0)[0]
-        return found if self.controller(found)[0] <= 1.0 + WITHIN else 0.0
-
 
 def _where(
     scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
 ) -> tuple[float, Array]:
-    """The ω_b at which the scaling is as aimed at, to half a thousandth; secants in ln."""
+    """The ω_b at which the scaling is as aimed at; secants in ln."""
     x, slope = np.log(begin), 0.6
     known: list[tuple[float, float]] = []
     for _ in range(8):
         g, weight = scaling(float(np.exp(x)))
         error = float(np.log(np.clip(g / aim, *STEPS)))
-        if abs(error) < 5e-4:
+        if abs(error) < CLOSE:
             break
         if known and x != known[-1][0]:
             slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))

@@ -75,7 +75,7 @@ def magnitude(system: StateSpace) -> Magnitude:
     response = np.abs(system.response(omega)[:, 0, 0])
     found = Magnitude(zeros, poles, float(v[12]), float(response[12]))
     error = np.abs(found.range(v, v)[1] / response - 1.0).max()
-    if not error <= 3.0 * FAITHFUL:
+    if not error <= 1.5 * FAITHFUL:
         words = "its poles and zeros do not give its response"
         raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
     return found

@@ -1,7 +1,7 @@
 """The bound on every controller for a problem with sections, at one θ."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,34 +16,21 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
-from ccd_casadi.limitations.bound import Reach, reach
+from ccd_casadi.limitations.bound import inside, outside, pointwise
 from ccd_casadi.limitations.limits import Limits, limits_of
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Bounds on the ω_b of every controller on the model at a θ, channel by channel."""
+    """ω_b in rad/s: no controller that keeps the bounds on the model has `outside` (infinite:
+    nothing bounds it), some controller has `inside` (0: none was looked for); `channel` binds."""
 
-    loops: tuple[Reach, ...]
-
-    @property
-    def outside(self) -> float:
-        """No controller that keeps the bounds on the model has more, in rad/s."""
-        return min(loop.outside for loop in self.loops)
-
-    @property
-    def inside(self) -> float:
-        """What some controller reaches on the model, in rad/s; 0 where none was looked for.
-
-        Of several channels nothing: each alone does not make a controller of the whole.
-        """
-        return self.loops[0].inside if len(self.loops) == 1 else 0.0
-
-    def over(self, bandwidth: float) -> float:
-        """By how much the bound exceeds a design's ω_b (rad/s), relative."""
-        return self.outside / bandwidth - 1.0
+    outside: float
+    inside: float
+    channel: str = ""
 
     def words(self, bandwidth: float) -> str:
         """Of the verdict, with a design's ω_b in rad/s."""
@@ -51,40 +38,34 @@ class Gap:
             return "no bound on every controller, gap not known"
         return (
             f"no controller of any order exceeds {self.outside / HZ:.2f} Hz on the model here "
-            f"(gap at most {100.0 * self.over(bandwidth):.0f} %), gap over theta not known"
+            f"(gap at most {100.0 * (self.outside / bandwidth - 1.0):.0f} %), gap over theta not "
+            "known"
         )
 
-    def entry_of(self, bandwidth: float) -> dict[str, Any]:
-        """`entry` beside a design's ω_b in rad/s."""
-        known = np.isfinite(self.outside)
-        return self.entry | {"relative": self.over(bandwidth) if known else None}
-
-    @property
-    def entry(self) -> dict[str, Any]:
-        """Of result.json, in Hz; null where nothing bounds ω_b."""
-
-        def hz(omega: float) -> float | None:
-            return omega / HZ if 0.0 < omega < np.inf else None
-
-        return {
-            "outside_hz": hz(self.outside),
-            "inside_hz": hz(self.inside),
-            "channels": {loop.name: hz(loop.outside) for loop in self.loops if loop.name},
-        }
+    def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
+        """Of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1; null: not known."""
+        hz = {"outside_hz": self.outside / HZ, "inside_hz": self.inside / HZ or np.nan}
+        return clean(hz | {"relative": self.outside / bandwidth - 1.0, "channel": self.channel})
 
 
-def gap_of(problem: CoDesignProblem, theta: Sequence[float], inside: bool = True) -> Gap:
-    """Bounds from outside, and with `inside` from inside, on the model at θ.
+def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:
+    """The bound from outside on the model at θ; `within`, of one channel, from inside besides.
 
-    They hold for every set that holds the model. Raises UserError for a problem of another kind.
+    It holds for every set that holds the model. Raises UserError for a problem of another kind.
     """
-    return Gap(tuple(reach(limits, inside) for limits in limits_of_problem(problem, theta)))
+    found, channel = np.inf, ""
+    loops = sorted(limits_of_problem(problem, theta), key=pointwise)
+    for limits in loops:
+        bound = outside(limits, found)
+        if bound < found:
+            found, channel = bound, limits.name
+    return Gap(found, inside(loops[0], found) if within and len(loops) == 1 else 0.0, channel)
 
 
 def known_gap(problem: CoDesignProblem, theta: Sequence[float]) -> Gap | None:
     """From outside, which takes seconds; None where there is none to know."""
     try:
-        return gap_of(problem, theta, inside=False)
+        return gap_of(problem, theta, within=False)
     except UserError:
         return None
 
@@ -100,10 +81,12 @@ def limits_of_problem(problem: CoDesignProblem, theta: Sequence[float]) -> list[
     bounds, sampling = bounds_of(problem), sections_of_problem(problem).sampling
     if not isinstance(structure, ChannelStructure):
         return [limits_of(plant, bounds, sampling, integrator=structure.integrator)]
+    whole = bounds.weights  # a channel's own M_K bounds one direction of its forces alone
     return [
         limits_of(
-            plant, bounds.of_channel(i), sampling, name, structure.decoupling.outputs[:, i],
-            ratio=float(np.exp(bounds.lead(i))), integrator=structure.integrator,
+            plant, replace(bounds.of_channel(i), weights=whole), sampling, name,
+            structure.decoupling.outputs[:, i], ratio=float(np.exp(bounds.lead(i))),
+            integrator=structure.integrator,
         )
         for i, name in enumerate(structure.decoupling.names)
     ]  # fmt: skip
