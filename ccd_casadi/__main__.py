@@ -17,6 +17,7 @@ from ccd_casadi.support.terminal import say
 COMMANDS = {
     "check": ("ccd_casadi.check", "looks at a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
+    "gap": ("ccd_casadi.gap", "what no controller at one theta can reach, as JSON"),
     "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),

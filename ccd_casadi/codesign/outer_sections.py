@@ -33,7 +33,13 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, joined
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.sections_robustness import (
+    fresh_yield,
+    judged_widely,
+    proof_of,
+    worst_members,
+)
+from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -125,6 +131,8 @@ class SectionsOuter(ThetaOuter):
         loops = loops_of(problem, best.theta, made.controller)
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
+        proof = proof_of(problem, best.theta, made)
+        drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
             make = partial(full_order_beside, problem, best.theta, made)
             beside = asked.kept("full order", best.theta, Beside, make)
@@ -144,10 +152,12 @@ class SectionsOuter(ThetaOuter):
             raced=end.raced,
             wide=wide,
             checked=checked,
-            proof=proof_of(problem, best.theta, made),
+            proof=proof,
+            drawn=drawn,
             worst=worst,
             rounds=rounds,
             beside=beside,
+            gap=known_gap(problem, best.theta),
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -51,8 +51,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         f"{found.box.place[1]:.3g}, {_outcome(found.box)}.",
         f"Hardware within ±{100 * hard.tolerance:g} %: {sum(not j.stable for j in hard.judged)} of "
         f"{len(hard.judged)} random plants unstable, "
-        f"{sum(j.stable and j.peak > S_max for j in hard.judged)} others above S_max; worst found: "
-        f"{_outcome(hard.worst)}.",
+        f"{sum(j.stable and j.peak > S_max for j in hard.judged)} others above S_max; "
+        f"{hard.within(S_max).words}. Worst found: {_outcome(hard.worst)}.",
     ]
     words += _bandwidth_lost(run, found)
     if hard.failed:
