@@ -13,8 +13,8 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.codesign.costs import Costs, costs_of
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
@@ -133,9 +133,10 @@ class SectionsOuter(ThetaOuter):
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
         drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
-        with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
-            make = partial(full_order_beside, problem, best.theta, made)
-            beside = asked.kept("full order", best.theta, Beside, make)
+        with Progress(1, "what limits it", quiet=asked.quiet) as bar:
+            make = partial(costs_of, problem, best.theta, made.kappa)
+            costs = asked.kept("costs", best.theta, Costs, make)
+            gap = known_gap(problem, best.theta)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -156,8 +157,8 @@ class SectionsOuter(ThetaOuter):
             drawn=drawn,
             worst=worst,
             rounds=rounds,
-            beside=beside,
-            gap=known_gap(problem, best.theta),
+            costs=costs,
+            gap=gap,
         )
 
     def responses(self, x: Array) -> PostOptimal:
