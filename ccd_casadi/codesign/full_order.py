@@ -21,7 +21,7 @@ from ccd_casadi.inner_problem.problem import (
     true_inner,
 )
 from ccd_casadi.inner_problem.robust_set import RobustSet
-from ccd_casadi.inner_problem.sections_bandwidth import joined, sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     plants_of,
@@ -29,6 +29,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     uncertain_plant,
 )
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -12,17 +12,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import (
-    SectionsValue,
-    prepared,
-    race,
-    sections_value,
-    valued,
-    with_range,
-)
-from ccd_casadi.inner_problem.sections_error import least_from
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value, valued
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_search import least_from, prepared, race, with_range
 from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

@@ -21,8 +21,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, variable
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.modal_sum import ModalSum
 from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.uncertainty import ModalSum
 from ccd_casadi.lti.hold import INSTANT
 from ccd_casadi.support.arrays import Array
 

@@ -128,11 +128,10 @@ def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) 
         return out
     loop = problem.loop(kappa, tau)
     out[:, :n, :n] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
-    (_, slope, *_), up, down = (
-        evaluate_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v * np.exp(step))
-        for step in (0.0, STEP, -STEP)
-    )
-    c_xx, c_xk = ((up[i] - down[i]) / (2.0 * STEP) for i in (1, 2))
+    v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
+    found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
+    (slope, *slopes), (_, *to_kappa) = (np.split(part, 3) for part in found[1:3])
+    c_xx, c_xk = ((up - down) / (2.0 * STEP) for up, down in (slopes, to_kappa))
     end = rows.curve == Curve.CROSSING
     fixed = end | (rows.curve == Curve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
