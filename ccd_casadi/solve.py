@@ -11,7 +11,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.units import counted
-from ccd_casadi.support.worker_process import Ahead
+from ccd_casadi.support.worker_process import WorkerProcess
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -219,7 +219,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             # Where somebody waits, a process gets ready to draw half of the report meanwhile.
             from ccd_casadi.reporting.solve_page import ready
 
-            helper = stack.enter_context(Ahead(ready))
+            helper = stack.enter_context(WorkerProcess(ready))
         given = None
         if options.surrogate is not None:
             given = named_surrogate(folder, options.surrogate, name, problem)

@@ -13,7 +13,7 @@ from busy import HANGS
 
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import THREADS, Ahead, WorkerLost
+from ccd_casadi.support.worker_process import THREADS, WorkerLost, WorkerProcess
 
 HERE = Path(__file__).parent
 
@@ -154,7 +154,7 @@ def test_a_task_that_kills_twice_is_told() -> None:
 
 
 def test_a_process_ahead_gives_its_result_or_what_went_wrong() -> None:
-    with Ahead(usable_cores) as helper:
+    with WorkerProcess(usable_cores) as helper:
         helper.begin(square, 3)
         assert helper.result() == 9
         helper.begin(failing, 3)

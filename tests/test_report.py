@@ -34,7 +34,7 @@ from ccd_casadi.reporting.solve_page import report_html, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import Ahead
+from ccd_casadi.support.worker_process import WorkerProcess
 from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
@@ -287,7 +287,7 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_helper_draws_the_same_report_and_may_die(lost: bool) -> None:
     folder, case, problem, solution, alone = run("one")
-    with Ahead(int) as helper:
+    with WorkerProcess(int) as helper:
         if lost:
             helper.begin(os._exit, 1)
         helped = report_html(folder, case, problem, solution, helper=helper)

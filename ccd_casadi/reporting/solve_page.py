@@ -71,7 +71,7 @@ from ccd_casadi.reporting.trust import caption_trust, data_trust, figure_trust, 
 from ccd_casadi.reporting.verdict import run_header
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.worker_process import Ahead, WorkerLost
+from ccd_casadi.support.worker_process import WorkerLost, WorkerProcess
 from surrogates.files import write_whole
 
 if TYPE_CHECKING:  # solve imports this module
@@ -91,7 +91,7 @@ def write_report(
     solution: "Solution",
     *,
     quiet: bool = True,
-    helper: Ahead | None = None,
+    helper: WorkerProcess | None = None,
 ) -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
@@ -107,7 +107,7 @@ def report_html(
     solution: "Solution",
     *,
     quiet: bool = True,
-    helper: Ahead | None = None,
+    helper: WorkerProcess | None = None,
 ) -> str:
     """The report's text; the bar counts its sections. A `helper` draws about half of them."""
     result = solution.result

@@ -30,9 +30,9 @@ from ccd_casadi.robust.perturbed import (
 from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.statics import Statics, statics
 
 NYQUIST = 0.999  # of half the sampling rate: where a grid ends
