@@ -16,7 +16,6 @@ constraints with positive multipliers stay the ones that bind.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-import casadi as ca
 import numpy as np
 from scipy.linalg import null_space
 
@@ -26,6 +25,7 @@ from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import ACTIVE, KktCertificate
+from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -110,7 +110,8 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
         determined &= bool(np.isfinite(H).all() and np.linalg.eigvalsh(reduced).min() > 0.0)
     lower, upper = lifted_bounds(problem)
     slope_b = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
-    slope_f = _hardware_slope(problem, x) * (upper - lower)
+    to_theta = hardware_slopes(plant_of(problem), x[:-2])[0]
+    slope_f = np.append(to_theta, [0.0, 0.0]) * (upper - lower)  # ω_S and ω_T cost nothing
     system = np.block([[H, A.T], [A, np.zeros((len(A), len(A)))]])
     responses = []
     for parameter in _parameters(problem, x, design.values[0], slope_f, slope_b):
@@ -146,7 +147,7 @@ def _parameters(
 ) -> Iterator[_Parameter]:
     """w1, w2, the inner problem's bounds, the level of each λ, and the bounds of θ, ω_S, ω_T."""
     none = np.zeros(x.size)
-    cost = float(plant_of(problem).hardware(x[: len(problem.names)])[0])
+    cost = hardware_cost(plant_of(problem), x[:-2])
     yield _Parameter("w1", problem.w1, slope_f, cost=cost)
     yield _Parameter("w2", problem.w2, slope_b, cost=float(bandwidth))
     for name, (_, bound) in problem.inner.bounds.items():
@@ -169,12 +170,3 @@ def _bound_rows(problem: CoDesignProblem) -> dict[str, Array]:
     return {f"{n} lower": -unit[i] for i, n in enumerate(names)} | {
         f"{n} upper": unit[i] for i, n in enumerate(names)
     }
-
-
-def _hardware_slope(problem: CoDesignProblem, x: Array) -> Array:
-    """∇f over x; ω_S and ω_T have no part in it."""
-    count = len(problem.names)
-    theta = ca.SX.sym("theta", count)
-    f, _ = plant_of(problem).hardware(theta)
-    slope = ca.Function("slope", [theta], [ca.jacobian(f, theta)])
-    return np.append(np.array(slope(x[:count])).ravel(), [0.0, 0.0])

@@ -3,7 +3,6 @@
 
 from collections.abc import Mapping
 
-import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.post_optimal import WEAK, PostOptimal, Response
@@ -12,7 +11,7 @@ from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
-from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
 from ccd_casadi.sampling.samples import BandwidthSample
 
 
@@ -35,9 +34,7 @@ def sections_responses(
     strong = [name for name in kkt.active if kkt.multipliers.get(name, 0.0) > WEAK * size]
     bound = [name for name in strong if name not in plant.constraint_names]
     vertex = len(bound) == len(names) == len(strong)
-    symbol = ca.MX.sym("theta", len(names))
-    f = plant.hardware(symbol)[0]
-    slope_f = np.array(ca.Function("f", [symbol], [ca.jacobian(f, symbol)])(theta)).ravel()
+    slope_f = hardware_slopes(plant, theta)[0]
     still = (0.0,) * len(names)
     unknown = (float("nan"),) * len(names)
 

@@ -215,6 +215,15 @@ def true_design(
     )
 
 
+def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
+    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
+    inner = problem.inner
+    return (
+        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
+        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
+    )
+
+
 def _require_mixed(problem: CoDesignProblem) -> None:
     if not isinstance(problem.controller, MixedSensitivityProblem):
         words = "the problem is not one of mixed sensitivity; use sections_value(problem, theta)"

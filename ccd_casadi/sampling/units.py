@@ -3,21 +3,25 @@
 One θ's inner problem, or a chunk of single designs at (θ, ω_S, ω_T).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.envelope import bandwidth_gradient
-from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    frequencies,
+    true_design,
+    true_inner,
+)
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
 from ccd_casadi.sampling.keys import sample_key
 from ccd_casadi.sampling.rows import Sample
 from ccd_casadi.sampling.samples import sample_of
-from ccd_casadi.support.arrays import Array
 
 # Rows of the store; key, θ and payload of the inner problem.
 Unit = tuple[list[Sample], tuple[str, tuple[float, ...], dict]]
@@ -128,15 +132,6 @@ def design_unit(
         design = true_design(problem, x[:-2], *frequencies(problem, x))
         samples.append(sample_of(key, x[:-2], design.figures, perf_counter() - began, design))
     return samples, None
-
-
-def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
-    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
-    inner = problem.inner
-    return (
-        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
-        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
-    )
 
 
 def _number(value: float) -> float | None:
