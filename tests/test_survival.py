@@ -20,7 +20,7 @@ from ccd_casadi.deployment.sampled import (
     sensitivity_loop,
 )
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.robust_set import RobustSet
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant

@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure import Bounds, SectionsDesign, certify
-from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     design_choices,
     scaled_plant,
     true_inner,
 )
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,

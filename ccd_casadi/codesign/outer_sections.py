@@ -16,7 +16,6 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
@@ -91,12 +90,6 @@ class SectionsOuter(ThetaOuter):
             return self.prepared(seed)
         problem = with_function(path, sampler.problem, read_json(path))
         return SectionsOuter(sampler.of(problem)).prepared(seed)
-
-    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """None: every θ has had its own race. Why, in words."""
-        nearest = self.sampler.nearest
-        words = self.words if nearest is None else nearest.shortfall
-        return replace(outcome, message=words or outcome.message)
 
     def ended(self, x: Array) -> SectionsEnd:
         with self.sampler.spent.on("polish"):

@@ -16,7 +16,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_search import least_from, prepared, race, with_range
-from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool

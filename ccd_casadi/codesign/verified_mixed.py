@@ -1,6 +1,5 @@
 """A verified design with a mixed-sensitivity controller: its figures, checks and lines."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
@@ -11,9 +10,8 @@ from ccd_casadi.codesign.design_entries import (
     figures_dict,
     loop_of_design,
 )
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import CloserModel, Line, State, look_words, survives
+from ccd_casadi.codesign.verdict import CloserModel, Line, State, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -141,10 +139,3 @@ class VerifiedDesign(Verified):
 
     def gap_words(self) -> str:
         return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"
-
-    def searched(
-        self, outcome: FormulationResult, look: BoxLook | None
-    ) -> tuple[str, Mapping[str, Any]]:
-        solved = outcome.outer
-        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return look_words(starts, optima, look)

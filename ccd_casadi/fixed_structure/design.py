@@ -6,7 +6,7 @@ design.
 
 from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import overload
+from typing import cast
 
 import numpy as np
 
@@ -42,26 +42,6 @@ RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
 Progress = Callable[[str], None]
-
-
-@overload
-def problem_for(
-    plants: Sequence[ScaledPlant],
-    structure: Structure,
-    bounds: Bounds,
-    sampling: Sampling | None = None,
-    frequencies: tuple[float, float] | None = None,
-) -> Problem: ...
-
-
-@overload
-def problem_for(
-    plants: Sequence[ScaledPlant],
-    structure: Structure | ChannelStructure,
-    bounds: Bounds,
-    sampling: Sampling | None = None,
-    frequencies: tuple[float, float] | None = None,
-) -> LoopProblem: ...
 
 
 def problem_for(
@@ -112,7 +92,7 @@ def synthesise_sections(
     cannot be in a set.
     """
     begun = perf_counter()
-    problem = problem_for(plants, structure, bounds, sampling, frequencies)
+    problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
     rng = np.random.default_rng(seed)
     pool = _initial(problem, initial, rng)
     if not only_initial:

@@ -11,10 +11,13 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.controller_problem import (
+    ControllerProblem,
+    MixedSensitivityProblem,
+    RobustSet,
+)
 from ccd_casadi.inner_problem.figure import Figure
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping

@@ -13,9 +13,8 @@ import numpy as np
 
 from ccd_casadi.kernels.closed_loop import loop_matrices
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.frequency import response, responses
+from ccd_casadi.kernels.frequency import narrow, next_trial, promised, response, responses
 from ccd_casadi.kernels.generalized_plant import first_order_weights, squared_weights
-from ccd_casadi.kernels.refine import narrow, next_trial, promised
 from ccd_casadi.kernels.sensitivity import axis_frequencies
 from ccd_casadi.kernels.small import add_gram, add_real, invert, largest_eigenvalue, multiply
 

@@ -16,8 +16,7 @@ from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.keys import problem_hash, sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
     QuantitySample,

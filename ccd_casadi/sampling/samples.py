@@ -37,6 +37,11 @@ class BandwidthSample:
         return self.theta
 
     @property
+    def joint(self) -> Array:
+        """(θ, ln ω_S, ln ω_T)."""
+        return np.array([*self.theta, np.log(self.omega_S), np.log(self.omega_T)])
+
+    @property
     def value(self) -> float:
         """What J counts: the error where the inner problem is of that, else ω_b*."""
         return self.bandwidth if self.error is None else self.error

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.envelope import bandwidth_gradient
+from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
     frequencies,
@@ -19,8 +19,7 @@ from ccd_casadi.inner_problem.problem import (
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
-from ccd_casadi.sampling.keys import sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
 
 # Rows of the store; key, θ and payload of the inner problem.
