@@ -11,7 +11,7 @@ from scipy.signal import tf2ss
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.outer_sections import polish_sections
-from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.post_optimal import sections_responses
 from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure import ShapeEnd

@@ -20,10 +20,9 @@ from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.outer_theta import ThetaOuter
-from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
-from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt

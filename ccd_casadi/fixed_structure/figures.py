@@ -37,13 +37,11 @@ def assess(
     kappa: Array,
     tau: float,
     *,
-    within: float | None = None,
     depth: float | None = None,
     each: bool = False,
 ) -> Assessment:
     """Stability by the eigenvalues of every loop, then the constraints with c > `depth`.
 
-    `within`: how far below 0 a value on the base grid may be to be among `near`.
     `each`: the constraints of unstable loops are given too, where some are stable.
     """
     plants = problem.plants
@@ -52,7 +50,7 @@ def assess(
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     several = len(plants.out) > 1
-    within = (WITHIN_OF_SEVERAL if several else WITHIN) if within is None else within
+    within = WITHIN_OF_SEVERAL if several else WITHIN
     depth = (RELEVANT_OF_SEVERAL if several else RELEVANT) if depth is None else depth
     v, regular = frequency_grid(problem, problem.roots(kappa), poles)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)

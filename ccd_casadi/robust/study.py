@@ -9,7 +9,7 @@ from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.later_lines import at_solve
+from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.kinds import kind_of

@@ -30,18 +30,18 @@ class Sample:
     omega_T: float
     outcome: str
     reason: str
-    gamma_opt: float
-    gamma_lower_bound: float
-    gamma: float
-    bandwidth: float
-    sensitivity_peak: float
-    sensitivity_peak_frequency: float
-    sensitivity_low: float
-    max_real_pole: float
-    norm: float
-    norm_bound: float
-    certified: bool
-    seconds: float
+    gamma_opt: float = math.nan
+    gamma_lower_bound: float = math.nan
+    gamma: float = math.nan
+    bandwidth: float = math.nan
+    sensitivity_peak: float = math.nan
+    sensitivity_peak_frequency: float = math.nan
+    sensitivity_low: float = math.nan
+    max_real_pole: float = math.nan
+    norm: float = math.nan
+    norm_bound: float = math.nan
+    certified: bool = False
+    seconds: float = 0.0
     gradients: tuple[float, ...] | None = None
     compliance: float = math.nan
 

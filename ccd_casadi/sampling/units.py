@@ -57,14 +57,14 @@ def unit_of(
     for figures in result.rows:
         row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
         rows[row_key] = sample_of(row_key, theta, figures, each)
-    optimum = result.optimum
+    optimum, slope = result.optimum, None
+    names = ("bandwidth", "omega_S", "omega_T")
+    if optimum is not None:
+        gradient = bandwidth_gradient(optimum, result.active, tuple(inner.bounds))
+        slope = [_number(v) for v in gradient]
     payload = {
-        "bandwidth": None if optimum is None else optimum.figures.bandwidth,
-        "gradient": None
-        if optimum is None
-        else [_number(v) for v in bandwidth_gradient(optimum, result.active, tuple(inner.bounds))],
-        "omega_S": None if optimum is None else optimum.figures.omega_S,
-        "omega_T": None if optimum is None else optimum.figures.omega_T,
+        **{name: None if optimum is None else getattr(optimum.figures, name) for name in names},
+        "gradient": slope,
         "active": list(result.active),
         "shortfall": result.shortfall,
         "violation": _number(result.violation),
@@ -89,14 +89,10 @@ def sections_unit(
         omega_T=0.0,
         outcome=design.outcome.name.lower(),
         reason=design.words,
-        gamma_opt=np.nan,
-        gamma_lower_bound=np.nan,
-        gamma=np.nan,
         bandwidth=value.bandwidth,
         sensitivity_peak=np.nan if highest is None else highest.S_peak,
         sensitivity_peak_frequency=np.nan if highest is None else highest.S_peak_frequency,
         sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
-        max_real_pole=np.nan,
         norm=np.nan if worst is None else worst,
         norm_bound=1.0,
         certified=value.feasible,
