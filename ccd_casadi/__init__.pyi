@@ -17,7 +17,6 @@ from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.existing_plants import synthesise_sections as synthesise_sections
 from ccd_casadi.fixed_structure.measured import read_frequency_response as read_frequency_response
-from ccd_casadi.fixed_structure.modal_fit import fit_modes as fit_modes
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure as Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.options import positive
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -73,7 +74,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         names = ", ".join(f"{k} = {v:.6g}" for k, v in zip(problem.names, theta, strict=True))
         print(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
         print(_table(found))
-        print(_conclusion(found))
+        say(_conclusion(found))
     if options.out is not None:
         folder = run_folder(options.case, options.out)
         write_json(folder / "cross_check.json", _json(problem, theta, point, found))

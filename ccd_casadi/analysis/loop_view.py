@@ -148,3 +148,9 @@ def _unit(loop: Loop) -> float:
 def _hz(roots: np.ndarray) -> tuple[float, ...]:
     """Frequencies in Hz of lightly damped pairs, ascending."""
     return tuple(float(value) for value in np.abs(light(roots)) / HZ)
+
+
+def phase_deg(response: np.ndarray) -> Array:
+    """Without jumps along the first axis, from within ±180° on."""
+    phase = np.degrees(np.unwrap(np.angle(response), axis=0))
+    return phase - 360.0 * np.round(phase[0] / 360.0)

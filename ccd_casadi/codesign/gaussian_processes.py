@@ -24,6 +24,7 @@ BOUNDED = (
     ("compliance", "%", 100.0, True),
 )
 ROUGH = (Roughness.KINKED, Roughness.JUMPS)  # as `Quality.samples_look` has it
+SAME = 1e-6  # of the box: samples that are closer are of one place
 
 
 def kernels_of(kind: str) -> tuple[Kernel, ...]:
@@ -43,16 +44,18 @@ def best_left_out(processes: Iterable[GaussianProcess]) -> GaussianProcess:
 def with_sample(process: GaussianProcess, x: Array, value: float, slope: Array) -> GaussianProcess:
     """The process with one more sample (d,), its slope (d,) too where it has those of the others.
 
-    As it is where it has the sample already or cannot take it, or would say no better there.
+    It takes the place of samples at the same x. The process as it is where it cannot take it, or
+    would say no better there.
     """
     n = len(process.X)
     sloped = process.targets.size > n
     width = process.upper - process.lower
     if sloped and not np.isfinite(slope).all():
         return process
-    targets = process.output_scale * process.targets.reshape(-1, n)
+    others = np.abs(process.X - (x - process.lower) / width).max(axis=1) > SAME
+    targets = process.output_scale * process.targets.reshape(-1, n)[:, others]
     dY = np.vstack([targets[1:].T / width, slope]) if sloped else None
-    X = np.vstack([process.lower + width * process.X, x])
+    X = np.vstack([process.lower + width * process.X[others], x])
     Y = np.append(process.output_mean + targets[0], value)
     box, best = {"lower": process.lower, "upper": process.upper}, process
 

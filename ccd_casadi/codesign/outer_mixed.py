@@ -101,7 +101,7 @@ class MixedOuter(Outer):
         lower, upper = box(self.problem)
         points = design("sobol", lower, upper, 8, seed)
         with self.sampler.spent.on("rescue"):
-            samples = self.sampler.bandwidths(points, "looking for a feasible design")
+            samples = self.sampler.bandwidths(points, "search for a feasible design")
         feasible = [sample for sample in samples if sample.feasible]
         if not feasible:
             assert self.sampler.nearest is not None
@@ -115,10 +115,12 @@ class MixedOuter(Outer):
         problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
         gap, made = np.inf, None
         for _ in range(POLISH_ROUNDS):
+            before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
                 x, made, _ = polish(sampler, x)
                 progress.advance()
+            sampler.report(before)
             at_bounds = _snapped(problem, x)
             if acceptable(problem, at_bounds, truth.at(at_bounds)):
                 x, made = at_bounds, truth.at(at_bounds)

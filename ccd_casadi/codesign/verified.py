@@ -111,7 +111,12 @@ class Verified(ABC):
         """Where something better was looked for and not found, in words and figures."""
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return look_words(starts, optima, look)
+        return look_words(starts, optima, look, self.bound_words)
+
+    @property
+    def bound_words(self) -> str:
+        """What no controller exceeds at θ."""
+        return "gap not known"
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """ω_b*(θ) of a fixed structure: one reproducible function of θ with its envelope gradient.
 
-A full race at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of the climbs
-from all anchors, and from nothing else: it depends neither on the order in which θ are asked for
-nor on the number of workers. Where no anchor climbs to a certified design a race of a few seeded
-starts is run at that θ, which is a function of θ too.
+A multi-start search at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of
+the climbs from all anchors, and from nothing else: it depends neither on the order in which θ are
+asked for nor on the number of workers. Where no anchor climbs to a certified design a
+search of a few seeded starts is run at that θ, which is a function of θ too; not
+with `starts` = 0.
 """
 
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ DISTINCT = 0.1  # relative: local optima further below the best are no anchors
 ROUNDS = 6  # of a design on the set and a search for plants that are worse
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding
-FEW = 8  # starts of the race at a θ where no anchor ends certified
+FEW = 8  # starts of the search at a θ where no anchor ends certified
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
 
@@ -48,7 +49,7 @@ class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
     Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
-    that of the design. `syntheses`: climbs from anchors and races that it took. At a kink of the
+    that of the design. `syntheses`: climbs and multi-start searches that it took. At a kink of the
     value the gradient is that of one side, and `envelope` has the others.
     """
 
@@ -75,15 +76,15 @@ def searched(
     problem: CoDesignProblem,
     plants: Sequence[ScaledPlant],
     initial: Sequence[Array],
-    starts: int = 0,
+    starts: int | None = None,
     progress: Progress | None = None,
     workers: Pool | None = None,
 ) -> SectionsDesign:
-    """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
+    """The largest bandwidth on plants, from controllers κ in SI, and `starts` others beside them."""
     sections = sections_of_problem(problem)
     return synthesise(
         plants, structure_of(problem), bounds_of(problem), sampling=sections.sampling,
-        starts=starts, seed=sections.seed, initial=initial, only_initial=starts == 0,
+        starts=starts or 0, seed=sections.seed, initial=initial, only_initial=starts is None,
         frequencies=sections.frequencies, progress=progress, workers=workers,
     )  # fmt: skip
 
@@ -98,7 +99,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     if initial:
         made = searched(problem, plants, initial)
         spent += 1
-    if made is None or not made.certified:
+    if made is None or (sections.starts and not made.certified):
         made = searched(problem, plants, initial, min(FEW, sections.starts))
         spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:

@@ -1,7 +1,7 @@
-"""The search of a controller of fixed structure at a θ: races, their anchors, and the worst plants.
+"""The search of a controller of fixed structure at a θ, its anchors, and the worst plants.
 
-A full race gives anchors, the distinct best controllers; plants of the box on which these exceed a
-bound join the set, and the design is made anew from the anchors, until none is found.
+A multi-start search gives anchors, the distinct best controllers; plants of the box on which these
+exceed a bound join the set, and the design is made anew from the anchors, until none is found.
 """
 
 from collections.abc import Sequence
@@ -41,10 +41,10 @@ def race(
     workers: Pool | None = None,
     only_anchors: bool = False,
 ) -> SectionsDesign:
-    """A full race at θ: the problem's starts, and its anchors beside them or alone."""
+    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone."""
     sections = sections_of_problem(problem)
     anchors = [np.array(kappa) for kappa in sections.anchors]
-    starts = 0 if only_anchors else sections.starts
+    starts = None if only_anchors else sections.starts
     return searched(problem, plants_of(problem, theta), anchors, starts, progress, workers)
 
 
@@ -74,11 +74,11 @@ def prepared(
     workers: Pool | None = None,
     only_anchors: bool = False,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
-    """The problem with anchors and members: a full race at its start θ, worst plants added.
+    """The problem with anchors and members: searched at its start θ, worst plants added.
 
     With `only_anchors` the anchors that it has alone are where searches start. The design is the
-    race's last; where it is not certified the problem has no anchors, and each θ is raced on its
-    own. All of it is of the largest bandwidth, whatever the problem minimises.
+    search's last; where it is not certified the problem has no anchors, and each θ is searched on
+    its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
     asked = sections_of_problem(problem).minimise
     problem = with_range(with_sections(problem, minimise="bandwidth"))

@@ -70,8 +70,8 @@ def compare(
     """Run every method, each with a store and a count of its own.
 
     With a controller of fixed structure the descents and the sequential designs climb from the
-    anchors of the best formulation, and its race is not counted as theirs; the descent with K held
-    fixed sweeps weights, which sections do not have, and is left out.
+    anchors of the best formulation, and its search is not counted as theirs; the descent with K
+    held fixed sweeps weights, which sections do not have, and is left out.
     """
     began = perf_counter()
     methods = [

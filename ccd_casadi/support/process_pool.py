@@ -159,5 +159,5 @@ class Workers:
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():
             for worker in [worker for worker in workers if worker in self._workers]:
-                worker.__exit__()
+                worker.end()
                 self._workers.remove(worker)

@@ -36,18 +36,10 @@ class Overrun(RuntimeError):
     """The call did not return within its time, or its process died."""
 
 
-def called(function: Callable[[], object]) -> None:
-    """A task of a call without arguments whose result is of no use."""
-    function()
-
-
 class WorkerProcess:
-    """One spawned process and the parent's end of its pipe; a context manager that ends it.
+    """One spawned process and the parent's end of its pipe."""
 
-    It begins with `ready()`, imports as a rule, while this process is at work.
-    """
-
-    def __init__(self, ready: Callable[[], object] | None = None) -> None:
+    def __init__(self) -> None:
         track_resources()
         with interrupts_held(), _one_thread_each():
             self.pipe, theirs = _SPAWN.Pipe()
@@ -55,30 +47,15 @@ class WorkerProcess:
             self.process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
             self.process.start()
         theirs.close()  # the process holds it alone: its death is an end of file here
-        self._waiting = 0
-        if ready is not None:
-            self.begin(called, ready)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Kill it, whatever it is doing."""
-        with interrupts_held():
-            self.process.kill()
-            self.process.join()
-            self.process.close()
-            self.pipe.close()
 
     def begin(self, function: Callable[[T], object], task: T) -> None:
         """Let it go on with this task."""
         message = pickle.dumps((function, task))
         with suppress(OSError):  # it is dead: its answer will say so
             self.pipe.send_bytes(message)
-        self._waiting += 1
 
     def answer(self, seconds: float | None = None) -> tuple[bool, Any]:
-        """(True, what the next task came to) or (False, what it raised).
+        """(True, what the task came to) or (False, what it raised).
 
         Raises WorkerLost if the process died, and Overrun after so many seconds.
         """
@@ -90,18 +67,16 @@ class WorkerProcess:
             self.process.join(1.0)
             code = self.process.exitcode
             raise WorkerLost(f"a worker process died (exit code {code})") from None
-        self._waiting -= 1
         found: tuple[bool, Any] = pickle.loads(answer)  # our own child wrote it, into its pipe
         return found
 
-    def result(self) -> Any:
-        """What the last task came to. Raises WorkerLost if it died, and what the task raised."""
-        value = None
-        while self._waiting:
-            done, value = self.answer()
-            if not done:
-                raise value
-        return value
+    def end(self) -> None:
+        """Kill it, whatever it is doing."""
+        with interrupts_held():
+            self.process.kill()
+            self.process.join()
+            self.process.close()
+            self.pipe.close()
 
 
 class Runner:
@@ -118,7 +93,7 @@ class Runner:
 
     def __exit__(self, *_: object) -> None:
         if self._process is not None:
-            self._process.__exit__()
+            self._process.end()
         self._process = None
 
     def call(
@@ -131,7 +106,8 @@ class Runner:
         try:
             if self._process is None or not self._process.process.is_alive():
                 self.__exit__()
-                self._process = WorkerProcess(int)
+                self._process = WorkerProcess()
+                self._process.begin(bool, None)
                 self._process.answer(STARTING)
             self._process.begin(_apply, (seconds, function, args, kwargs))
             done, value = self._process.answer(seconds)
