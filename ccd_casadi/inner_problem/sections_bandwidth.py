@@ -80,7 +80,7 @@ def searched(
     progress: Progress | None = None,
     workers: Pool | None = None,
 ) -> SectionsDesign:
-    """The largest bandwidth on plants, from controllers κ in SI, and `starts` others beside them."""
+    """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
     sections = sections_of_problem(problem)
     return synthesise(
         plants, structure_of(problem), bounds_of(problem), sampling=sections.sampling,
