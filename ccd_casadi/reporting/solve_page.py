@@ -38,7 +38,7 @@ from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_data, history_figure
+from ccd_casadi.reporting.history import history_figure
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.inner_sweep import sweep_data, sweep_figure
 from ccd_casadi.reporting.landscape import (
@@ -270,16 +270,10 @@ def _history(
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
         return Section(heading, (Words(words),))
-    history = history_data(
-        outcome.iterates,
-        theta=verified.theta,
-        predicted_hz=result["surrogate_bandwidth_hz"],
-        true_hz=result["bandwidth_hz"],
-        objective=result["objective"],
-        w2=problem.w2,
-        tolerance=case.outer.tolerance,
-    )
-    figure = history_figure(history, problem.names, lifted=len(outcome.surrogates) > 1)
+    figure = history_figure(
+        outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
+        lifted=len(outcome.surrogates) > 1,
+    )  # fmt: skip
     return Section(heading, (figure,))
 
 

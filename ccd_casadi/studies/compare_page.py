@@ -1,5 +1,6 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -110,40 +111,13 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             empty = ("–",) * (len(head) - 2)
             rows.append((LABELS[name], *empty, figures["status"]))
             continue
-        rows.append(
-            (
-                LABELS[name],
-                *(number(factors[key] * figures["theta"][key], 4) for key in problem.names),
-                number(figures["hardware_cost"], 5),
-                number(figures["bandwidth_hz"], 5),
-                number(figures["objective"], 6),
-                number(figures["first_resonance_hz"], 5),
-                number(figures["sensitivity_peak"], 5),
-                str(figures["syntheses_to_optimum"]),
-                str(figures["syntheses"] - figures["syntheses_to_optimum"] or "–"),
-                number(figures["seconds"], 2),
-                "yes" if figures["certificate"]["passed"] else "no",
-            )
-        )
+        spent = figures["syntheses_to_optimum"]
+        own = (str(spent), str(figures["syntheses"] - spent or "–"), number(figures["seconds"], 2),
+               "yes" if figures["certificate"]["passed"] else "no")  # fmt: skip
+        rows.append((LABELS[name], *_row(figures, factors), *own))
     for name, label in (("sequential", "paper: sequential"), ("nested_ccd", "paper: nested CCD")):
-        item = answer["published"].get(name)
-        if item is not None:
-            theta = item.get("theta", {})
-            rows.append(
-                (
-                    label,
-                    *(number(factors[k] * theta[k], 4) if k in theta else "–" for k in factors),
-                    number(item["hardware_cost"], 5),
-                    number(item["bandwidth_hz"], 4),
-                    number(item["objective"], 5),
-                    number(item["first_resonance_hz"], 4),
-                    "–",
-                    "–",
-                    "–",
-                    "–",
-                    "–",
-                )
-            )
+        if name in answer["published"]:
+            rows.append((label, *_row(answer["published"][name], factors), *["–"] * 4))
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
         "Syntheses are those to the optimum; what a formulation then spends on a look over the box "
@@ -158,6 +132,17 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             "fixed and the landscape over the weights' frequencies, which sections do not have."
         )
     return Table(head, tuple(rows)), Words(words)
+
+
+def _row(figures: Mapping[str, Any], factors: Mapping[str, float]) -> tuple[str, ...]:
+    """θ, then what is known of the design; dashes for the rest."""
+    theta = figures.get("theta", {})
+    shown = {"hardware_cost": 5, "bandwidth_hz": 5, "objective": 6, "first_resonance_hz": 5,
+             "sensitivity_peak": 5}  # fmt: skip
+    return (
+        *(number(factors[key] * theta[key], 4) if key in theta else "–" for key in factors),
+        *(number(figures.get(key), digits) for key, digits in shown.items()),
+    )
 
 
 def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
