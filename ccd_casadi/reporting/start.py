@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Section, Table, Words
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
@@ -37,11 +37,7 @@ class _Side:
     @property
     def roots(self) -> tuple[np.ndarray, np.ndarray]:
         """|p| in Hz and -Re p/|p| of the loop's poles, a conjugate pair once, in rising order."""
-        poles = self.loop.loop.poles
-        upper = poles[poles.imag >= 0.0]
-        upper = upper[np.argsort(np.abs(upper))]
-        size = np.abs(upper)
-        return size / HZ, -upper.real / np.maximum(size, np.finfo(float).tiny)
+        return frequency_and_damping(self.loop.loop.poles / HZ)
 
 
 def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Section]:
