@@ -13,9 +13,14 @@ from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.design import problem_for
-from ccd_casadi.fixed_structure.figures import assess, constraints, evaluate_rows, to_theta
+from ccd_casadi.fixed_structure.figures import (
+    assess,
+    constraints,
+    evaluate_rows,
+    hessians,
+    to_theta,
+)
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import Brackets

@@ -7,10 +7,9 @@ import pytest
 
 from ccd_casadi.fixed_structure.certificate import sampled as judged
 from ccd_casadi.lti.closed_loop import closed_loop, responses_of
-from ccd_casadi.lti.grid import around, frequency_grid
+from ccd_casadi.lti.grid import around, climbed, frequency_grid, local_maxima
 from ccd_casadi.lti.hold import Sampling, in_w, sampled, transfer, tustin
 from ccd_casadi.lti.loop import Loop, over
-from ccd_casadi.lti.peaks import climbed, local_maxima
 from ccd_casadi.lti.state_space import StateSpace
 
 OMEGA = np.geomspace(0.1, 50.0, 40)

@@ -20,7 +20,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.deployment.channels import split
 from ccd_casadi.drawing.content import (
     Curve,

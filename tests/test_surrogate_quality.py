@@ -12,10 +12,15 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.gaussian_processes import (
+    best_left_out,
+    kernels_of,
+    quality_dict,
+    recommendation,
+    surrogate_quality,
+)
 from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs
-from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
 from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.reporting.trust import table_trust, trust_figure

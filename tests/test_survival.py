@@ -11,9 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.loops_off_model import Controller, LoopsOffModel, loops_off_model
-from ccd_casadi.codesign.reach import reach
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
-from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, survival
+from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
 from ccd_casadi.codesign.verdict import State, survives
 from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Sampling

@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import largest, responses_of
-from ccd_casadi.lti.grid import around, frequency_grid, light
+from ccd_casadi.lti.grid import around, climbed, frequency_grid, light, local_maxima
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.peaks import climbed, local_maxima
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 

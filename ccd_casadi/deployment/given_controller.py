@@ -148,7 +148,7 @@ def _from_mat(path: Path) -> Given:
     if not path.exists():
         raise UserError(f"{path}: there is no such file; name a controller")
     systems = read_mat(path).systems
-    for name in ("controller_discrete", "controller"):
+    for name in ("controller_discrete", "controller", ""):
         if name in systems:
             found = systems[name]
             delay = found.period

@@ -23,8 +23,7 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     frequency_grid,
     peaks,
 )
-from ccd_casadi.fixed_structure.certificate_norms import norms
-from ccd_casadi.fixed_structure.certificate_responses import Responses
+from ccd_casadi.fixed_structure.certificate_responses import Responses, norms
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant

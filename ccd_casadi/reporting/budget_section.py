@@ -7,7 +7,7 @@ import numpy as np
 from ccd_casadi.budget import BudgetFigures
 from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Section, Table, Words
 from ccd_casadi.drawing.svg import BLACK, CYCLE
-from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.tables import ROWS, over_frequency

@@ -88,13 +88,13 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
             y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
          nyquist_panel(shown, bounds.S_max, HEIGHT)),
-        (over_hz("|G| measured (m/N)", curves["G"], ends),
+        (over_hz("|G| (m/N)", curves["G"], ends),
          over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))),
         (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
          over_hz("|T| (–)", curves["T"], ends, levels=(at,))),
     )  # fmt: skip
     words = (
-        "Every bound is asked for on every line: S out of the shaded area, L out of the disk. "
+        "Every bound is required on every line: S out of the shaded area, L out of the disk. "
         "Grey: what |S| may reach between two lines, if GK bends there as around them. A resonance "
         "that fits between two lines is not seen."
     )

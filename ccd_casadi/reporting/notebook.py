@@ -9,12 +9,11 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
 from ccd_casadi.drawing.page import CSS
 from ccd_casadi.drawing.paint import block_html, head_html
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.modal_fit import ModalFit
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
@@ -125,17 +124,6 @@ def _(item: SectionsDesign) -> str:
     found = Facts((("Bandwidth ω_b", f"{number(item.bandwidth / HZ)} Hz", "on every plant"),))
     made = {"controller": sections_dict(item.structure, item.kappa)}
     return _cell(head, found, *controller_blocks(made))
-
-
-@html_of.register
-def _(item: ModalFit) -> str:
-    n, off = len(item.hz), 100.0 * item.deviations
-    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains[:n], off[2 * n : 3 * n],
-               strict=True)  # fmt: skip
-    head = ("Hz", "± %", "damping ratio", "± %", "gain 1/kg", "± %")
-    words = f"{item.lines} lines; what is not fitted is {100.0 * item.noise:.3g} % of |G|."
-    table = Table(head, tuple(tuple(map(float, row)) for row in rows))
-    return _cell(Heading(f"{n} modes of a measured response"), table, Words(words))
 
 
 def _result_head(result: Mapping[str, Any]) -> Head:

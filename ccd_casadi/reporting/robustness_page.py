@@ -50,8 +50,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         + f" Shift and damping together: worst at {100 * found.box.place[0]:+.2f} % and damping × "
         f"{found.box.place[1]:.3g}, {_outcome(found.box)}.",
         f"Hardware within ±{100 * hard.tolerance:g} %: {hard.unstable} of {len(hard.judged)} "
-        f"random plants unstable, {hard.above(S_max)} others above S_max; worst found: "
-        f"{_outcome(hard.worst)}.",
+        f"random plants unstable, {hard.above(S_max)} others above S_max; "
+        f"{hard.within(S_max).words}. Worst found: {_outcome(hard.worst)}.",
     ]
     words += _bandwidth_lost(run, found)
     if hard.failed:

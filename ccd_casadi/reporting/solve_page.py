@@ -13,7 +13,7 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.surrogate_quality import recommendation
+from ccd_casadi.codesign.gaussian_processes import recommendation
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.deployment.channels import split
@@ -53,10 +53,10 @@ from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.moves import MovePanels, force_step, move_figure, move_panels
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
-    beside_blocks,
     binding_words,
     conclusion_of,
     controller_blocks,
+    limits_blocks,
     sections_facts,
 )
 from ccd_casadi.reporting.slices import slices_data, slices_figure
@@ -67,10 +67,10 @@ from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.support.progress import Progress
 
 if TYPE_CHECKING:  # solve imports this module
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
 
 ORDER = (
-    "glance", "design", "controller", "beside", "start", "theta", "stage", "loop", "move", "force",
+    "glance", "design", "controller", "limits", "start", "theta", "stage", "loop", "move", "force",
     "budget", "history", "trust", "sweep",
 )  # fmt: skip
 
@@ -187,7 +187,9 @@ def design_parts(
         return parts | {"loop": lambda: _loop(own, theta, K, view())}
     return parts | {
         "controller": lambda: [Section("The controller", controller_blocks(result))],
-        "beside": lambda: [Section("Full order beside it", beside_blocks(problem, result))],
+        "limits": lambda: [
+            Section("What limits the bandwidth", limits_blocks(problem, result))
+        ] if "costs" in result else [],
         "loop": lambda: [Section("Closed loop on every plant", (gains(view()),))],
     }
 

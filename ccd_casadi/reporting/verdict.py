@@ -1,13 +1,14 @@
 """The verdict of a run as every command and page shows it: five lines, each with sign and words."""
 
 import re
-import textwrap
+import sys
 from collections.abc import Mapping
 from typing import Any
 
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.drawing.content import Head, VerdictLine
 from ccd_casadi.drawing.paint import head_html
+from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
 STATUS = {
@@ -17,7 +18,6 @@ STATUS = {
 }
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
-WIDTH = 100  # of a terminal line
 
 
 def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
@@ -43,9 +43,8 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     found = []
     for line in lines_of(result):
-        head = f"{line.name:14s}{line.state:9s}"
-        found += textwrap.wrap(
-            line.words, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)
+        found.append(
+            wrapped(f"{line.name:14s}{line.state:9s}{line.words}", columns(sys.stdout))
         )
     return found
 

@@ -211,6 +211,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "reduced_model_difference": hard.difference,
             "unstable": hard.unstable,
             "stable_above_S_max": hard.above(S_max),
+            "yield": hard.within(S_max).entry,
             "peak_quantiles": dict(zip(("50", "95", "100"), quantiles, strict=False)),
             "worst": {"theta": dict(zip(run.problem.names, hard.worst.place, strict=True))}
             | _judged(hard.worst),

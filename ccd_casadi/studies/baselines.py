@@ -131,7 +131,7 @@ class MixedBaseline(Baseline):
 
 
 class SectionsBaseline(Baseline):
-    """Climbs from the anchors; climbs and races are what it spends."""
+    """Climbs from the anchors; climbs and multi-start searches are what it spends."""
 
     gradients = (Gradient.TOTAL,)
     swept = False

@@ -120,16 +120,17 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             rows.append((label, *_row(answer["published"][name], factors), *["–"] * 4))
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
-        "Syntheses are those to the optimum; what a formulation then spends on a look over the box "
-        "for a better one stands beside them. A descent's are those of its best run; all runs are "
+        "Syntheses are those to the optimum; what the global check over the box adds to them "
+        "stands beside them. A descent's are those of its best run; all runs are "
         "in compare.json."
     )
     if not baseline_of(problem).swept:
         words = (
             "Each formulation ends with a polish and a KKT certificate on the true problem. A "
-            "synthesis is a climb from the anchors, or a race; the descent and the sequential "
-            "designs climb from the best formulation's anchors. Left out: the descent with K held "
-            "fixed and the landscape over the weights' frequencies, which sections do not have."
+            "synthesis is a climb from the anchors, or a multi-start search; the descent and the "
+            "sequential designs climb from the best formulation's anchors. Left out: the descent "
+            "with K held fixed and the landscape over the weights' frequencies, which sections "
+            "do not have."
         )
     return Table(head, tuple(rows)), Words(words)
 

@@ -16,8 +16,7 @@ from ccd_casadi.plants.ordered import Ordered
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import PlantError, require
 
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
 
