@@ -4,7 +4,7 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Facts, Figure, Heading, Page, Section, Table, Words
+from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.verdict import head_of
@@ -192,9 +192,9 @@ def _gains(run: FinishedRun, found: Study) -> Section:
     )  # fmt: skip
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
-    drawn = Figure(
-        figures.gains(found), "Sensitivity, complementary sensitivity, position by a force at the "
-        "actuators (GS), and force by sensor noise (KS).", (figures.gains_table(found),),
+    drawn = figures.gains(
+        found, "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), "
+        "and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
     body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
@@ -207,9 +207,7 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
         "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
         f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
-    tables = (figures.line_table("shift", found.shift),
-              figures.line_table("damping ×", found.damping))  # fmt: skip
-    drawn = Figure(figures.perturbed(run, found), caption, tables)
+    drawn = figures.perturbed(run, found, caption)
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
@@ -239,7 +237,7 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
     words = (
         f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
     )
-    drawn = Figure(figures.tolerances(run, found), caption, (figures.tolerance_table(found),))
+    drawn = figures.tolerances(run, found, caption)
     return Section("Hardware tolerances", (drawn, Words(words)))
 
 
@@ -256,8 +254,7 @@ def _structured(found: Study) -> list[Section]:
         "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
         f"shown, {bound.stiffness:.4g}."
     )
-    drawn = Figure(figures.structured(bound), caption, (figures.structured_table(bound),))
-    return [Section("Structured singular value", (drawn,))]
+    return [Section("Structured singular value", (figures.structured(bound, caption),))]
 
 
 def _move(found: Study) -> Section:
@@ -267,8 +264,7 @@ def _move(found: Study) -> Section:
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [
-        Figure(figures.move(move), f"{_moved(found, i)}{_cut(move)}", (figures.move_table(move),))
-        for i, move in enumerate(found.moves)
+        figures.move(move, f"{_moved(found, i)}{_cut(move)}") for i, move in enumerate(found.moves)
     ]
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "
