@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from ccd_casadi.drawing.content import Modes
-from ccd_casadi.drawing.paint import block_html
+from ccd_casadi.drawing.paint import block_html, drawing_html
 from ccd_casadi.drawing.turntable import modes_html
 from ccd_casadi.explorer.designs import Look
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
@@ -15,7 +15,8 @@ def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
     plant = plant_of(look.problem)
     if plant.drawing is not None:
         drawn = plant.drawing({"this design": look.theta, "the start": start})
-        return f'<div style="background:#fff;color:#1a1a1a">{drawn.svg}</div>'
+        picture = drawing_html(drawn.drawing, "machine")
+        return f'<div style="background:#fff;color:#1a1a1a">{picture}</div>'
     return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
 
 

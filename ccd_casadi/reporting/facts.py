@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Table
+from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ, number, shown_unit
 
-Fact = tuple[str, str, str]
 _FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
 
 
@@ -54,6 +53,12 @@ def cost_axis(problem: CoDesignProblem) -> str:
     return f"hardware cost f ({problem.cost_unit})" if problem.cost_unit else "hardware cost f"
 
 
+def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
+    """Name, unit for the eye and the factor to it of every parameter."""
+    ends = zip(problem.names, problem.units, problem.upper, strict=True)
+    return [(name, *shown_unit(unit, upper)) for name, unit, upper in ends]
+
+
 def theta_words(result: Mapping[str, Any]) -> str:
     """`m1 = 55 kg, m2 = 55 kg`."""
     units = result.get("units", {})
@@ -67,11 +72,10 @@ def theta_words(result: Mapping[str, Any]) -> str:
 def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
     """Every parameter with its bounds, and where it lies between them."""
     rows = []
-    for i, name in enumerate(problem.names):
+    for i, (name, unit, factor) in enumerate(theta_axes(problem)):
         value, low, high = result["theta"][name], problem.lower[i], problem.upper[i]
         share = (value - low) / (high - low)
         place = "at lower" if share <= 1e-6 else "at upper" if share >= 1 - 1e-6 else "inside"
-        unit, factor = shown_unit(problem.units[i], high)
         numbers = (factor * float(v) for v in (value, low, high, problem.start[i]))
         rows.append((name, unit or "–", *numbers, place))
     lists = result.get("listed", {}).get("values", {})

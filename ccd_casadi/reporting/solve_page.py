@@ -1,6 +1,7 @@
 """The run report: `report.html` about a finished run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import cache, partial
@@ -24,7 +25,6 @@ from ccd_casadi.drawing.content import (
     Head,
     Heading,
     Page,
-    Picture,
     Section,
     Source,
     Table,
@@ -114,7 +114,10 @@ def page_of_run(run: FinishedRun) -> Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
     view = cache(partial(run_view, run))
     parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
-    sections = [section for name in ORDER if name in parts for section in parts[name]()]
+    sections = []
+    for name in (name for name in ORDER if name in parts):
+        with suppress(KeyError):  # a result.json of an earlier version knows less
+            sections += parts[name]()
     words = (
         "Drawn from case.toml, controller.json and result.json alone: how the design was found was "
         "not kept."
@@ -239,9 +242,7 @@ def stage_sections(
     """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
-        drawn = plant.drawing(thetas)
-        figure = Figure(Picture(drawn.svg), drawn.caption, (Table(drawn.head, drawn.rows),))
-        found.append(Section("The stage, before and after", (figure,)))
+        found.append(Section("The stage, before and after", (plant.drawing(thetas),)))
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))

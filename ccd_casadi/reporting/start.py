@@ -12,8 +12,9 @@ from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -112,10 +113,10 @@ def _caption(sides: tuple[_Side, ...]) -> str:
 
 
 def _table(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Table:
-    rows = []
-    for i, name in enumerate(problem.names):
-        unit, factor = shown_unit(problem.units[i], problem.upper[i])
-        rows.append((name, unit or "–", *(factor * s.theta[i] for s in sides)))
+    rows = [
+        (name, unit or "–", *(factor * s.theta[i] for s in sides))
+        for i, (name, unit, factor) in enumerate(theta_axes(problem))
+    ]
     J = (problem.w1 * s.cost + problem.w2 * HZ * s.loop.bandwidth_hz for s in sides)
     rows += [
         ("hardware cost f", problem.cost_unit or "–", *(s.cost for s in sides)),

@@ -12,6 +12,7 @@ from ccd_casadi.drawing.content import Figure, Head, Page, Section, Source, Tabl
 from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, table_gains
 from ccd_casadi.reporting.solve_page import stage_sections
@@ -21,7 +22,7 @@ from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import number, shown_unit
+from ccd_casadi.support.units import number
 
 
 def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Page:
@@ -97,9 +98,8 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:
     """All methods in one table, the paper's figures below them."""
-    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
-    factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
-    names = [axis_label(n, unit) for n, (unit, _) in zip(problem.names, shown, strict=True)]
+    factors = {name: factor for name, _, factor in theta_axes(problem)}
+    names = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
     cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
     head = (
         "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "box look",
