@@ -114,11 +114,11 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     near = np.abs(1.0 + c.loci[:, 0])
     known = np.isfinite(near)
     assert near[known] * c.view.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
-    assert abs(c.signals.step[-1] - 1.0) < 0.05
-    assert c.signals.move.feedforward
+    assert abs(c.step[-1] - 1.0) < 0.05
+    assert c.move.feedforward
     assert (
-        np.abs(c.signals.move.error[c.signals.move.time > 1.5 * c.signals.move.duration]).max()
-        < 1e-2 * np.abs(c.signals.move.error).max()
+        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
+        < 1e-2 * np.abs(c.move.error).max()
     )
 
 
@@ -197,8 +197,8 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
         assert not stable(gain / inwards)
     assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
     assert "feedforward" in move_words(c)
-    alone = replace(c.signals, move=replace(c.signals.move, feedforward=False))
-    assert "without feedforward" in move_words(replace(c, signals=alone))
+    alone = replace(c, move=replace(c.move, feedforward=False))
+    assert "without feedforward" in move_words(alone)
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

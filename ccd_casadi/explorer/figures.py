@@ -273,7 +273,7 @@ class Figures:
             _data(self.gains, **columns), _data(self.loci, xs=list(xs), ys=list(ys)),
             _data(self.loop, hz=list(hz), size=list(size), phase=list(phase)),
             _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
-            (self.end, {"location": 1e3 * c.signals.move.duration}),
+            (self.end, {"location": 1e3 * c.move.duration}),
         ]  # fmt: skip
         at_poles = []
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
@@ -336,15 +336,15 @@ def _spanned(axis: Range1d, values: Sequence[np.ndarray], log: bool) -> Change:
 
 def _lines(c: Curves) -> dict[str, list[tuple[Any, Any]]]:
     """x and y of every line of a design, by the name of its figure."""
-    hz, signals = c.view.hz, c.signals
+    hz = c.view.hz
     near = np.where(np.abs(c.loci) <= FAR, c.loci, np.nan)
     found = {name: [(hz, gain)] for (name, _), gain in zip(GAINS, c.view.gains, strict=True)}
     return found | {
         "nyquist": [(line.real, line.imag) for line in near.T],
         "size": [(hz, line) for line in np.abs(c.loci).T],
         "phase": [(hz, line) for line in phase_deg(c.loci).T],
-        "step": [(1e3 * signals.step_time, signals.step)],
-        "move": [(1e3 * signals.move.time, 1e6 * signals.move.error)],
+        "step": [(1e3 * c.step_time, c.step)],
+        "move": [(1e3 * c.move.time, 1e6 * c.move.error)],
     }
 
 

@@ -67,7 +67,7 @@ def move_words(curves: Curves | None) -> str:
     """What the figure of the move shows."""
     if curves is None or curves.unstable:
         return ""
-    return f"the default one of robustness, {curves.signals.move.words}; dashed: its end"
+    return f"the default one of robustness, {curves.move.words}; dashed: its end"
 
 
 def sampled_words(sampled: AsSampled, S_max: float) -> str:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccd_casadi.analysis.signals import step_response
+from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.on_hardware import OnHardware
