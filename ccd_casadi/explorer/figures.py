@@ -28,6 +28,7 @@ from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.nyquist import FAR
+from ccd_casadi.support.package_text import package_text
 
 HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there
@@ -37,17 +38,6 @@ BODE = ("size", "phase")
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
 DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.NEAR: [2, 3], Standing.REFUSED: [6]}
 PADDING = 0.1  # of the data, that an axis reaches beyond them
-# After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
-FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
-  range.have_updated_interactively = false"""
-# At any width of the page both axes have one scale, so that a circle is round: ±`half` fits in.
-ROUND = """const {inner_width: wide, inner_height: tall, x_range, y_range} = figure
-if (!(wide > 0 && tall > 0)) return
-const scale = Math.max(2 * half[0] / wide, 2 * half[1] / tall)
-for (const [range, middle, size] of [[x_range, centre, wide], [y_range, 0, tall]]) {
-  const start = middle - scale * size / 2, end = middle + scale * size / 2
-  range.setv({start, end, reset_start: start, reset_end: end}, {sync: false})
-}"""
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of the Nyquist plot, and what it shows at least to both sides
 
 
@@ -109,7 +99,7 @@ class Figures:
             min_border_left=58, tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above",
             **options,
         )  # fmt: skip
-        made.js_on_event(Reset, CustomJS(code=FOLLOW))
+        made.js_on_event(Reset, CustomJS(code=package_text("explorer/assets/follow.js")))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
@@ -171,7 +161,8 @@ class Figures:
                 tool.match_aspect = True
             if isinstance(tool, WheelZoomTool):
                 tool.zoom_on_axis = False
-        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)}, code=ROUND)
+        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)},
+                       code=package_text("explorer/assets/round.js"))  # fmt: skip
         for size in ("inner_width", "inner_height"):
             made.js_on_change(size, fit)
         # ellipses: true in both axes, whatever these do, where a circle would take that across
