@@ -3,6 +3,7 @@
 Made where the figures are known, kept in `report.json` (`stored`) and painted by `paint`.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Literal
@@ -107,6 +108,11 @@ class Table:
     def __post_init__(self) -> None:
         rows = tuple(tuple(_cell(value) for value in row) for row in self.rows)
         object.__setattr__(self, "rows", rows)
+
+    @staticmethod
+    def of(head: Sequence[str], *columns: Iterable[Any]) -> "Table":
+        """From columns of equal length."""
+        return Table(tuple(head), tuple(zip(*columns, strict=True)))
 
 
 def _cell(value: Any) -> Any:

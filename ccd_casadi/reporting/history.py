@@ -41,7 +41,7 @@ def history_figure(
     )  # fmt: skip
     names = [*(str(i + 1) for i in range(len(iterates))), "verified"]
     table = Table(head, tuple(
-        (name, *item.theta, *map(float, row))
+        (name, *item.theta, *row)
         for name, item, row in zip(names, (*iterates, last), known, strict=True)
     ))  # fmt: skip
     *_, objective, error = known.T

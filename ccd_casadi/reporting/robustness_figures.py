@@ -48,8 +48,8 @@ def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:
         peak = np.array([item.peak if item.stable else np.nan for item in judged])
         bandwidth = np.array([item.bandwidth / HZ for item in judged])
         stable = ("yes" if item.stable else "NO" for item in judged)
-        numbers = zip(x, stable, bandwidth, (item.peak for item in judged), strict=True)
-        tables.append(Table((name, "stable", "ω_b Hz", "‖S‖∞"), tuple(numbers)))
+        peaks = (item.peak for item in judged)
+        tables.append(Table.of((name, "stable", "ω_b Hz", "‖S‖∞"), x, stable, bandwidth, peaks))
         # the axis shows what matters about S_max; a loop near instability has any peak
         top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
         limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
@@ -105,8 +105,7 @@ def tolerances(run: FinishedRun, found: Study, caption: str) -> Figure:
     bands = np.sort([item.bandwidth / HZ if item.stable else 0.0 for item in judged])
     shares = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
     at = [round(share * (len(judged) - 1)) for share in shares]
-    rows = tuple(zip(shares, peaks[at], bands[at], strict=True))
-    table = Table(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), rows)
+    table = Table.of(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), shares, peaks[at], bands[at])
     return Figure(Lines((panels,), "Peak and bandwidth of random hardware"), caption, (table,))
 
 
@@ -124,8 +123,7 @@ def structured(bound: StructuredBound, caption: str) -> Figure:
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
     )  # fmt: skip
     best = np.sort(np.argsort(-bound.mu)[:ROWS])
-    table = Table(("Hz", "μ, complex errors"), tuple(zip(bound.hz[best], bound.mu[best],
-                                                         strict=True)))  # fmt: skip
+    table = Table.of(("Hz", "μ, complex errors"), bound.hz[best], bound.mu[best])
     return Figure(Lines(((panel,),), "Structured singular value"), caption, (table,))
 
 

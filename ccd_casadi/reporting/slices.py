@@ -139,5 +139,5 @@ def _tables(slices: list[Slice]) -> tuple[Table, ...]:
         if np.isfinite(s.bandwidth_hz).any():
             head = (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)")
             columns = np.array([s.theta, s.bandwidth_hz, 1.96 * s.deviation_hz])[:, ::TABLE_STEP]
-        found.append(Table(head, tuple(tuple(map(float, row)) for row in columns.T)))
+        found.append(Table.of(head, *columns))
     return tuple(found)
