@@ -211,11 +211,14 @@ class SweepMap:
     others: str = "S_low"
 
 
+Drawing = Lines | Landscape | SweepMap | Modes | Picture
+
+
 @dataclass(frozen=True)
 class Figure:
     """A figure with its caption, and the numbers behind it, which a page folds away."""
 
-    drawing: Lines | Landscape | SweepMap | Modes | Picture
+    drawing: Drawing
     caption: str
     tables: tuple[Table, ...]
 

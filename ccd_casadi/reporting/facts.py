@@ -175,33 +175,29 @@ def _robust(r: Mapping[str, Any]) -> list[Fact]:
         return []
     words = number(found["worst_sensitivity_peak"], 6) if found["stable"] else "unstable"
     where = f"{100.0 * found['worst_shift']:+.2f} %, damping × {found['worst_damping']:g}"
-    return [
-        (
-            "Peak of S on the perturbed plants",
-            words,
-            f"largest of {found['plants']} plants, at a resonance shift of {where}; "
-            f"on the nominal plant {number(found['nominal_sensitivity_peak'], 5)}",
-        )
-    ]
+    remark = (
+        f"largest of {found['plants']} plants, at a resonance shift of {where}; "
+        f"on the nominal plant {number(found['nominal_sensitivity_peak'], 5)}"
+    )
+    return [("Peak of S on the perturbed plants", words, remark)]
 
 
 def _without_suspension(r: Mapping[str, Any]) -> list[Fact]:
     free = r.get("without_suspension")
     if not free:
         return []
-    if free["bandwidth_hz"] is None:
-        words = "unstable" if not free["stable"] else "no bandwidth"
-        return [("Without the soft suspension", words, "same controller, rigid-body modes free")]
-    change = 100.0 * (free["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
-    stable = "stable" if free["stable"] else "UNSTABLE"
-    return [
-        (
-            "Without the soft suspension",
-            f"{number(free['bandwidth_hz'], 5)} Hz ({change:+.2f} %)",
-            f"same controller, rigid-body modes free: {stable}, peak of S "
-            f"{number(free['sensitivity_peak'], 5)}",
-        )
-    ]
+    words = "unstable" if not free["stable"] else "no bandwidth"
+    remark = "same controller, rigid-body modes free"
+    if free["bandwidth_hz"] is not None:
+        words = _changed(free, r)
+        stable = "stable" if free["stable"] else "UNSTABLE"
+        remark += f": {stable}, peak of S {number(free['sensitivity_peak'], 5)}"
+    return [("Without the soft suspension", words, remark)]
+
+
+def _changed(found: Mapping[str, Any], r: Mapping[str, Any]) -> str:
+    change = 100.0 * (found["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
+    return f"{number(found['bandwidth_hz'], 5)} Hz ({change:+.2f} %)"
 
 
 def _references(r: Mapping[str, Any]) -> list[Fact]:
@@ -211,12 +207,8 @@ def _references(r: Mapping[str, Any]) -> list[Fact]:
         value = "NOT robust to it"
         remark = f"same controller, same bound on the norm: {found['reason']}"
         if found["bandwidth_hz"] is not None:
-            change = 100.0 * (found["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
-            value = f"{number(found['bandwidth_hz'], 5)} Hz ({change:+.2f} %)"
-            remark += (
-                f"; peak of S {number(found['sensitivity_peak'], 5)}, norm "
-                f"{number(found['gamma'], 6)}"
-            )
+            value, peak = _changed(found, r), number(found["sensitivity_peak"], 5)
+            remark += f"; peak of S {peak}, norm {number(found['gamma'], 6)}"
         facts.append((f"On the plant with {name}", value, remark))
     return facts
 

@@ -1,7 +1,6 @@
 """A move and a step of force of a design on every plant of its set."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,23 +26,15 @@ SETTLED = 4.0  # time constants of the slowest pole that the force step is shown
 STEPS = 200  # points of it
 
 
-@dataclass(frozen=True)
-class MovePanels:
-    """Error of a move, without and with mass feedforward (the last one), its words and numbers."""
-
-    panels: tuple[Panel, ...]
-    caption: str
-    table: Table
-
-
-def move_panels(
+def move_parts(
     problem: CoDesignProblem,
     theta: Sequence[float],
     controller: StateSpace,
     loops: Sequence[Loop],
     bandwidth_hz: float,
-) -> MovePanels:
-    """The default move of `robustness` on the plants of `loops`, their rigid bodies free."""
+) -> tuple[Lines, str, Table]:
+    """Error of the default move of `robustness` on the plants of `loops`, their rigid bodies free:
+    without and with mass feedforward (the last panel), its words and numbers."""
     profile = setpoint(LIMITS)
     modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
     ahead = mass_feedforward(modal, 0)
@@ -71,12 +62,8 @@ def move_panels(
         f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; for other moves "
         f"the options of robustness). {' '.join(words)}"
     )
-    return MovePanels(tuple(panels), caption, over_time(heads, *columns))
-
-
-def move_figure(found: MovePanels) -> Figure:
-    """What `move_panels` found."""
-    return Figure(Lines((found.panels,), "Error of a move", (3.2,)), found.caption, (found.table,))
+    lines = Lines((tuple(panels),), "Error of a move", (3.2,))
+    return lines, caption, over_time(heads, *columns)
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:

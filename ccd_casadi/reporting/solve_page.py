@@ -24,6 +24,7 @@ from ccd_casadi.drawing.content import (
     Figure,
     Head,
     Heading,
+    Lines,
     Page,
     Section,
     Source,
@@ -50,7 +51,7 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import MovePanels, force_step, move_figure, move_panels
+from ccd_casadi.reporting.moves import force_step, move_parts
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
@@ -173,13 +174,17 @@ def design_parts(
     loops = cache(lambda: design_loops(own, theta, K))
 
     @cache
-    def move() -> MovePanels:
-        return move_panels(own, theta, K, loops(), view().bandwidth_hz)
+    def move() -> tuple[Lines, str, Table]:
+        return move_parts(own, theta, K, loops(), view().bandwidth_hz)
+
+    def move_section() -> list[Section]:
+        lines, caption, table = move()
+        return [Section("A move", (Figure(lines, caption, (table,)),))]
 
     parts: dict[str, Part] = {
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
-        "move": lambda: [Section("A move", (move_figure(move()),))],
+        "move": move_section,
         "force": lambda: [
             Section("A step of force", (force_step(loops(), view().bandwidth_hz),))
         ],

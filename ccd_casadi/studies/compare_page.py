@@ -83,12 +83,10 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
             continue
         label = LABELS[method.name]
         own = [
-            descent
-            for descent in comparison.descents
-            if descent.gradient is method.descent.gradient
-            and descent.start == comparison.problem.start
-            and descent.iterates
-        ]
+            d for d in comparison.descents
+            if d.gradient is method.descent.gradient and d.iterates
+            and d.start == comparison.problem.start
+        ]  # fmt: skip
         if own:
             found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
         if method.descent.start != comparison.problem.start:
