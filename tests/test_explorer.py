@@ -16,10 +16,15 @@ from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_s
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.landscape import field_of
-from ccd_casadi.explorer.machine import machine_html
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import end_words, move_words, standing_html, survival_words
+from ccd_casadi.explorer.words import (
+    end_words,
+    machine_html,
+    move_words,
+    standing_html,
+    survival_words,
+)
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.machine import lumped, lumped_svg

@@ -29,7 +29,7 @@ from ccd_casadi.drawing.turntable import (
     data,
     still,
 )
-from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
+from ccd_casadi.reporting.machine import mode_shape_figure, table_modes
 
 Array = np.ndarray
 A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)

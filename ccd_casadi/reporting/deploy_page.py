@@ -30,9 +30,9 @@ from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.deploy_move import move_blocks
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
+from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.sections_page import sections_table
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import head_of

@@ -245,41 +245,33 @@ def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
 
 
 def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> str:
-    inner = problem.inner
-    if name == "S_max":
-        words = f"The peak of S is at S_max = {inner.S_max:g}"
-        gain = _gain(multiplier, 0.01, "raising S_max by 1 %")
-    elif name == "S_low":
-        words = f"|S| at ω_low is at S_low = {inner.S_low:g}"
-        gain = _gain(multiplier, 0.01, "raising S_low by 1 %")
-    elif name == "compliance_max" and inner.compliance_max is not None:
-        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
-        gain = _gain(multiplier, 0.01, "raising it by 1 %")
-    else:
-        variable, _, end = name.rpartition(" ")
-        side = "widening the range there by 1 %"
-        if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
-            ends = inner.omega_S if variable == "omega_S" else inner.omega_T
-            value = ends[0 if end == "lower" else 1] / HZ
-            sign = variable.replace("omega", "ω")
-            words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
-            gain = _gain(multiplier, 0.01 / float(np.log(ends[1] / ends[0])), side)
-        elif end in ("lower", "upper") and variable in problem.names:
-            i = problem.names.index(variable)
-            value = (problem.lower if end == "lower" else problem.upper)[i]
-            unit, factor = shown_unit(problem.units[i], problem.upper[i])
-            width = factor * (problem.upper[i] - problem.lower[i])
-            words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
-            step = 0.01 * width
-            side = f"moving the bound outwards by {number(step, 3)} {unit}".rstrip()
-            gain = _gain(multiplier, 0.01, side)
-        else:
-            words = f"The constraint {name} binds"
-            gain = _gain(multiplier, 1.0, "loosening it by one unit")
-    return words + gain
-
-
-def _gain(multiplier: float | None, step: float, what: str) -> str:
+    words, step, loosened = _held(problem, name)
     if multiplier is None:
-        return "."
-    return f"; {what} would lower J by {number(multiplier * step, 3)}, to first order."
+        return f"{words}."
+    gain = number(multiplier * step, 3)
+    return f"{words}; {loosened} would lower J by {gain}, to first order."
+
+
+def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
+    """What holds the design, a step that loosens it (in the multiplier's unit), that in words."""
+    inner, (variable, _, end) = problem.inner, name.rpartition(" ")
+    if name == "S_max":
+        return f"The peak of S is at S_max = {inner.S_max:g}", 0.01, "raising S_max by 1 %"
+    if name == "S_low":
+        return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "raising S_low by 1 %"
+    if name == "compliance_max" and inner.compliance_max is not None:
+        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
+        return words, 0.01, "raising it by 1 %"
+    if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
+        ends = inner.omega_S if variable == "omega_S" else inner.omega_T
+        value, sign = ends[0 if end == "lower" else 1] / HZ, variable.replace("omega", "ω")
+        words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
+        return words, 0.01 / float(np.log(ends[1] / ends[0])), "widening the range there by 1 %"
+    if end in ("lower", "upper") and variable in problem.names:
+        i = problem.names.index(variable)
+        value = (problem.lower if end == "lower" else problem.upper)[i]
+        _, unit, factor = theta_axes(problem)[i]
+        step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
+        words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
+        return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
+    return f"The constraint {name} binds", 1.0, "loosening it by one unit"

@@ -50,7 +50,7 @@ from ccd_casadi.reporting.landscape import (
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
-from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
+from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
 from ccd_casadi.reporting.moves import force_step, move_parts
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
