@@ -141,17 +141,12 @@ def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
     axes = theta_axes(problem)
     rows = tuple(
-        (
-            point.hardware_cost,
-            point.bandwidth / HZ,
-            point.predicted / HZ,
-            *(factor * v for (*_, factor), v in zip(axes, point.theta, strict=True)),
-            ", ".join(point.active),
-            "efficient" if point.efficient else "",
-            "verified" if point.verified else point.reason,
-        )
+        (point.hardware_cost, point.bandwidth / HZ, point.predicted / HZ,
+         *(factor * v for (*_, factor), v in zip(axes, point.theta, strict=True)),
+         ", ".join(point.active), "efficient" if point.efficient else "",
+         "verified" if point.verified else point.reason)
         for point in front.points
-    )
+    )  # fmt: skip
     heads = (axis_label(name, unit) for name, unit, _ in axes)
     head = ("f", "ω_b (Hz)", "predicted (Hz)", *heads, "what binds", "", "status")
     return Table(head, rows)

@@ -30,12 +30,9 @@ COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 
 
 def move_parts(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    controller: StateSpace,
-    loops: Sequence[Loop],
-    bandwidth_hz: float,
-) -> tuple[Lines, str, Table]:
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
+    loops: Sequence[Loop], bandwidth_hz: float,
+) -> tuple[Lines, str, Table]:  # fmt: skip
     """Error of the default move of `robustness` on the plants of `loops`, their rigid bodies free:
     without and with mass feedforward (the last panel), its words and numbers."""
     profile = setpoint(LIMITS)
@@ -137,16 +134,10 @@ def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     head = ("way", "settled after, ms", "peak error, µm", "last error, µm", "peak force, N",
             "at the limit")  # fmt: skip
     rows = tuple(
-        (
-            way.words,
-            "not" if np.isinf(way.move.settled) else number(1e3 * way.move.settled),
-            1e6 * way.move.peak_error,
-            1e6 * way.move.last_error(WATCHED),
-            float(way.move.peak_force.max()),
-            f"{100.0 * way.move.saturated:.3g} %",
-        )
-        for way in found.ways
-    )
+        (way.words, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.peak_error,
+         1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
+        for way in found.ways for m in (way.move,)
+    )  # fmt: skip
     caption = (
         "Settled: from the start until the error stays within "
         f"{number(1e6 * found.window)} µm; last error: the largest over the last quarter of "

@@ -80,12 +80,7 @@ Part = Callable[[], list[Section]]
 
 
 def write_report(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    solution: "Solution",
-    *,
-    quiet: bool = True,
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
 ) -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
@@ -94,12 +89,7 @@ def write_report(
 
 
 def solve_page(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    solution: "Solution",
-    *,
-    quiet: bool = True,
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
 ) -> Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)

@@ -10,13 +10,8 @@ from ccd_casadi.support.units import number
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
-WORDS = {
-    "bandwidth": "bandwidth ω_b",
-    "sensitivity_peak": "peak of S",
-    "sensitivity_low": "|S| at ω_low",
-    "compliance": "compliance |GS|",
-    "rms_error": "RMS error",
-}
+WORDS = {"bandwidth": "bandwidth ω_b", "sensitivity_peak": "peak of S", "rms_error": "RMS error",
+         "sensitivity_low": "|S| at ω_low", "compliance": "compliance |GS|"}  # fmt: skip
 AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–", "compliance": "m/N",
         "rms_error": "nm"}  # fmt: skip
 LEAST_BAND = 3.0  # standardised residuals shown at least, either way
