@@ -77,21 +77,18 @@ class Responses:
 
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
-        S, g, k = self._loops(which, omega)
-        free = g if self.period is None else self.free.at(which, 1j * omega)
-        KS = _product(k, S)
-        found = {"S": _gain(S), "KS": _gain(KS)}
-        found |= {"T": _gain(_product(g, KS)), "GS": _gain(_product(S, free))}
+        matrices = self._matrices(which, omega)
+        found = {name: _gain(M) for name, M in matrices.items()}
         weights = self.bounds.weights
         if weights is not None:
             _, W_KS, W_T = np.abs(weights.responses(omega.ravel())).reshape(3, *omega.shape)
             found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
         for own in self.bounds.channels:
             if own.given:
-                found[f"S of {own.name}"] = _length(own.output, S)
+                found[f"S of {own.name}"] = _length(own.output, matrices["S"])
             if own.M_K is not None and weights is not None:
                 W = weights.M_K / own.M_K * W_KS
-                found[f"weighted KS of {own.name}"] = W * _length(own.force, KS)
+                found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
     def sensitivity(
@@ -100,6 +97,17 @@ class Responses:
         """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
         S = self._loops(which, omega)[0]
         return _gain(S) if row is None else _length(row, S)
+
+    def singular(self, which: np.ndarray, omega: Array) -> Array:
+        """(4, N, k, p) all singular values of S, KS, T and GS, the largest first."""
+        return np.stack([np.linalg.svd(M, compute_uv=False)
+                         for M in self._matrices(which, omega).values()])  # fmt: skip
+
+    def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
+        S, g, k = self._loops(which, omega)
+        free = g if self.period is None else self.free.at(which, 1j * omega)
+        KS = _product(k, S)
+        return {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
 
     def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
