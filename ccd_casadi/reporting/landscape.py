@@ -139,7 +139,7 @@ def _steepest(land: Landscape, error_hz: float) -> str:
     steps = [step if np.isfinite(step).any() else np.zeros_like(step) for step in steps]
     k = int(np.nanmax(steps[1]) > np.nanmax(steps[0]))
     largest = float(np.nanmax(steps[k]))
-    if largest <= error_hz:
+    if largest <= 2.0 * error_hz:  # a difference of two values
         return ""
     i, j = (int(v) for v in np.unravel_index(np.nanargmax(steps[k]), steps[k].shape))
     usual = max(float(np.nanmedian(step)) for step in steps)
