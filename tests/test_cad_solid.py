@@ -8,8 +8,7 @@ import pytest
 from ccd_casadi.plants.cad import draw_morph
 from ccd_casadi.plants.cad.boundary import Boundary, Piece, paired
 from ccd_casadi.plants.cad.solid import face_at, kernel, load, meshed, moved, volumes
-from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.optional_packages import MissingPackage, require
+from ccd_casadi.support.errors import MissingPackage, PlantError, require
 
 
 @pytest.fixture

@@ -44,8 +44,8 @@ def test_a_better_value_takes_the_place_of_one_at_the_same_theta(sloped: bool) -
 
 @pytest.mark.parametrize("rounds", [1, 0])
 def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
-    """Where the budget of rounds is spent and no look over the box has moved the design; not
-    where the case allows none."""
+    """Where the budget of rounds is spent and no global check has moved the design; not where the
+    case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
     end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)
