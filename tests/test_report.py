@@ -43,6 +43,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
 from ccd_casadi.reporting.bode import bode
+from ccd_casadi.reporting.landscape import caption_landscape
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.solve_page import solve_page, write_report
 from ccd_casadi.sampling.sampler import Sampler
@@ -423,6 +424,16 @@ def test_landscape_takes_several_paths_and_unknown_letters() -> None:
     svg = figure_landscape(land, "two")
     Document(svg)
     assert all(word in svg for word in ("ours", "theirs", "天", "…"))
+
+
+def test_a_slope_that_the_surrogate_may_err_by_is_not_told() -> None:
+    """It was told as a fact, eight times the true one, at an optimum that the samples missed."""
+    axis = np.linspace(0.0, 1.0, 5)
+    field = axis[:, None] ** 2 + 0.0 * axis  # the steepest step is 7/16 Hz
+    land = Landscape(("a", "b"), ("", ""), axis, axis, field, np.empty((0, 3)), np.empty((0, 2)))
+    for error, told in ((0.2, True), (0.25, False)):
+        words = caption_landscape(land, 1.0, lifted=False, error_hz=error)
+        assert ("steepest" in words) is told
 
 
 def test_tables_round_and_escape() -> None:

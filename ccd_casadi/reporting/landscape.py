@@ -94,8 +94,10 @@ def best_designs(problem: CoDesignProblem, truths: Truths) -> dict[tuple[float, 
     return best
 
 
-def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
-    """Range, steepest place, and how far the surrogate is from the true samples."""
+def caption_landscape(
+    land: Landscape, best_hz: float, *, lifted: bool, error_hz: float = 0.0
+) -> str:
+    """Range, and the steepest place where the surrogate's own error leaves one to be told."""
     if not land.bandwidth_hz.size:
         return (
             "The direct formulation makes no surrogate: the large dots are the θ where a synthesis "
@@ -121,7 +123,7 @@ def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
             "grid), where the last surrogate was not asked to be right; believe the dots there."
         )
     else:
-        words += _steepest(land)
+        words += _steepest(land, error_hz)
     share = np.isnan(field).mean()
     if share > 0.0:
         words += f" Grey: no feasible design ({100.0 * share:.0f} % of the grid)."
@@ -130,13 +132,13 @@ def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
     return words
 
 
-def _steepest(land: Landscape) -> str:
-    """Where the field changes most between neighbours, and how unlike the usual that is."""
+def _steepest(land: Landscape, error_hz: float) -> str:
+    """Where the field changes most between neighbours, if by more than it may err there."""
     steps = [np.abs(np.diff(land.bandwidth_hz, axis=k)) for k in range(2)]
     steps = [step if np.isfinite(step).any() else np.zeros_like(step) for step in steps]
     k = int(np.nanmax(steps[1]) > np.nanmax(steps[0]))
     largest = float(np.nanmax(steps[k]))
-    if largest == 0.0:
+    if largest <= 2.0 * error_hz:  # a difference of two values
         return ""
     i, j = (int(v) for v in np.unravel_index(np.nanargmax(steps[k]), steps[k].shape))
     usual = max(float(np.nanmedian(step)) for step in steps)

@@ -220,7 +220,9 @@ def _theta(
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
         paths = (ThetaPath("iterates", path, numbered=True),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
-        caption = caption_landscape(land, best, lifted=len(processes) > 1) + extra
+        error_hz = 0.0 if missed is None else abs(missed.error)
+        lifted = len(processes) > 1
+        caption = caption_landscape(land, best, lifted=lifted, error_hz=error_hz) + extra
         figure = Figure(land, caption, tables_landscape(land))
         return Section("Bandwidth over the hardware", (figure,))
     slices = slices_data(problem, processes, truths, verified.theta)
