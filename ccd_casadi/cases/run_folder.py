@@ -99,7 +99,7 @@ def read_run(folder: str | Path) -> FinishedRun:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+        raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
     result = read_json(folder / "result.json")
     if result.get("status") == "infeasible":
         words = "the run found no feasible design; there is nothing to work on"
@@ -148,7 +148,7 @@ def _read_sections(
     """
     path = folder / "controller.json"
     table = read_json(path).get("sections")
-    words = "is no list of parameters of the case's structure; solve the case again"
+    words = "is not a list of parameters of the case's structure; solve the case again"
     try:
         kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -268,7 +268,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 def _number(path: Path, table: Mapping[str, Any], key: str) -> float:
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: {key}: is no number; solve the case again")
+        raise UserError(f"{path}: {key}: is not a number; solve the case again")
     if value <= 0.0:
         raise UserError(f"{path}: {key}: is not positive; solve the case again")
     return float(value)
@@ -311,7 +311,7 @@ def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:
     try:
         matrix = np.array(table[key], dtype=float)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: {key}: is no matrix; solve the case again") from None
+        raise UserError(f"{path}: {key}: is not a matrix; solve the case again") from None
     if matrix.ndim != 2 or matrix.size == 0 or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {key}: is no finite matrix; solve the case again")
+        raise UserError(f"{path}: {key}: is not a finite matrix; solve the case again")
     return matrix
