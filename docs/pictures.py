@@ -6,8 +6,10 @@ is of runs/two_mass_built.toml, TUNED what `ccd tune` writes for the response or
 
 import shutil
 import sys
+from io import BytesIO
 from pathlib import Path
 
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -27,10 +29,12 @@ def main(runs: list[Path]) -> None:
         browser = tool.chromium.launch(executable_path=place, args=["--no-sandbox"])
         view = browser.new_page(viewport={"width": 1280, "height": 1000}, color_scheme="light")
         for name, (run, file, top, height) in PAGES.items():
-            if run < len(runs):
+            if (runs[run] / file).exists():
                 view.goto((runs[run] / file).resolve().as_uri())
-                view.screenshot(path=HERE / f"{name}.png", full_page=True, clip={
-                    "x": 0, "y": top, "width": 1280, "height": height})  # fmt: skip
+                taken = view.screenshot(full_page=True, clip={
+                    "x": 120, "y": top, "width": 1040, "height": height})  # fmt: skip
+                picture = Image.open(BytesIO(taken)).convert("RGB").quantize(200)
+                picture.save(HERE / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

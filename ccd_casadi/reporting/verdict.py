@@ -78,7 +78,8 @@ def run_header(title: str, result: Mapping[str, Any], meta: str, lead: str) -> s
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
     reason = head_words(result) if good else str(result.get("reason") or "")
-    reason = " ".join(filter(None, (advice(result), f"{reason[:1].upper()}{reason[1:]}")))
+    reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
+    reason = f"{advice(result)} {reason}".strip()
     return header(
         title, good, STATUS.get(result["status"], "not verified"), reason, meta, lead,
         warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
