@@ -9,9 +9,9 @@ from ccd_casadi.codesign.lifted import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
 from ccd_casadi.codesign.run import solve as solve
 from ccd_casadi.codesign.run import verify as verify
-from ccd_casadi.codesign.solution import Solution as Solution
 from ccd_casadi.codesign.tuning import Tuned as Tuned
 from ccd_casadi.codesign.tuning import tune as tune
+from ccd_casadi.codesign.verified import Solution as Solution
 from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify

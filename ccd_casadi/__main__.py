@@ -17,6 +17,7 @@ from ccd_casadi.support.terminal import say
 COMMANDS = {
     "check": ("ccd_casadi.check", "looks at a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
+    "gap": ("ccd_casadi.gap", "what no controller at one theta can reach, as JSON"),
     "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
@@ -25,6 +26,7 @@ COMMANDS = {
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
+    "report": ("ccd_casadi.report", "draws the pages of a finished folder again"),
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
     "imported": ("ccd_casadi.imported", "a modal table from result files; also: ccd import"),
 }

@@ -61,11 +61,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     if not options.quiet:
         print(table(comparison))
         say("\n".join(answer["conclusions"]["sentences"]))
-    from ccd_casadi.studies.compare_page import (
-        write_comparison_report,  # matplotlib is slow to import
-    )
+    from ccd_casadi.drawing.stored import write_page  # matplotlib is slow to import
+    from ccd_casadi.studies.compare_page import comparison_page
 
-    write_comparison_report(folder, comparison, answer)
+    write_page(folder / "report.html", comparison_page(folder, comparison, answer))
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")
     statuses = {method.figures["status"] for method in comparison.methods if method.solution}

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import UserError, require
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
@@ -96,10 +95,12 @@ def command(options: argparse.Namespace) -> ExitCode:
         say(_summary(finished, found))
         if moved is not None:
             say(f"{'a move':13s} {_move_words(moved)}")
-    from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
+    from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
+    from ccd_casadi.reporting.index import index_above, publish
 
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
-    write_report(folder / "report.html", finished, found, moved)
+    page = deploy_page(finished, found, moved, index_above(folder, finished.folder))
+    publish(finished.folder, folder / "report.html", page)
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")
     if found.passed:

@@ -52,9 +52,11 @@ def command(options: argparse.Namespace) -> ExitCode:
         efficient = sum(point.efficient for point in verified)
         say(f"front         {len(verified)} of {len(front.points)} points verified, "
             f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
-    from ccd_casadi.reporting.insight_page import write_insight  # matplotlib is slow to import
+    from ccd_casadi.reporting.index import index_of, publish
+    from ccd_casadi.reporting.insight import insight_page
 
-    write_insight(folder, done, front, responses)
+    page = insight_page(done, front, responses, index_of(folder))
+    publish(folder, folder / "insight.html", page)
     if not options.quiet:
         say(f"page          {folder / 'insight.html'}")
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED

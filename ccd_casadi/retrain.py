@@ -15,7 +15,7 @@ from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
 
 
 def command(options: argparse.Namespace) -> ExitCode:

@@ -67,14 +67,13 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = with_structured_bound(finished, found, options.limit)
         bar.advance()
     write()
-    from ccd_casadi.reporting.robustness_page import (  # matplotlib is slow
-        conclusion,
-        write_robustness,
-    )
+    from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
+    from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
 
     if options.controller is None:
         finished = told(finished, folder, "survives", survival_line(finished, found))
-    write_robustness(folder, finished, found, options.seed)
+    page = robustness_page(finished, found, options.seed, index_of(folder))
+    publish(folder, folder / "robustness.html", page)
     if not options.quiet:
         say("\n".join(conclusion(finished, found)))
         say(f"page          {folder / 'robustness.html'}")

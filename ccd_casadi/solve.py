@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +11,10 @@ from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import counted
-from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 
@@ -152,9 +150,8 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.diagnosis import diagnose, first_seen
-    from ccd_casadi.cases.findings import Severity, Topic
+    from ccd_casadi.cases.findings import Severity, Topic, peak_words
     from ccd_casadi.cases.plant_report import size_words
-    from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import model_named
 
@@ -175,7 +172,7 @@ def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
 
 def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit."""
-    from ccd_casadi.cases.unit_findings import unit_findings
+    from ccd_casadi.cases.findings import unit_findings
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.facts import facts_of
     from ccd_casadi.plants.modal import modal_plant
@@ -216,38 +213,31 @@ def command(options: argparse.Namespace) -> ExitCode:
         slow = slow_words(formulation, len(problem.names))
         if slow:
             say(f"warning: {slow}", sys.stderr)
-    with ExitStack() as stack:
-        helper = None
-        if not options.no_report and options.workers > 1 and not options.quiet:
-            # Where somebody waits, a process gets ready to draw half of the report meanwhile.
-            from ccd_casadi.reporting.solve_page import ready
+    given = None
+    if options.surrogate is not None:
+        given = named_surrogate(folder, options.surrogate, name, problem)
+    store = folder / "samples.sqlite"
+    with (
+        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        SampleStore(store) as samples,
+    ):
+        if options.resume and not options.quiet:
+            held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+            say(f"resuming      {store} holds {held}", sys.stderr)
+        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+        write_run(folder, case, solution)
+    code = ExitCode.of(solution.result["status"])
+    if not options.quiet:
+        say(summary(solution))
+        say(f"run folder    {folder}")
+    if not options.no_report:
+        from ccd_casadi.reporting.solve_page import write_report
 
-            helper = stack.enter_context(Ahead(ready))
-        given = None
-        if options.surrogate is not None:
-            given = named_surrogate(folder, options.surrogate, name, problem)
-        store = folder / "samples.sqlite"
-        with (
-            pool(options.scheduler, options.workers, PATIENCE) as workers,
-            SampleStore(store) as samples,
-        ):
-            if options.resume and not options.quiet:
-                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-                say(f"resuming      {store} holds {held}", sys.stderr)
-            sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-            solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
-            write_run(folder, case, solution)
-        code = ExitCode.of(solution.result["status"])
+        plant_case, solved = resolved(case, solution), solution.problem or problem
+        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
         if not options.quiet:
-            say(summary(solution))
-            say(f"run folder    {folder}")
-        if not options.no_report:
-            from ccd_casadi.reporting.solve_page import write_report
-
-            plant_case, solved = resolved(case, solution), solution.problem or problem
-            write_report(folder, plant_case, solved, solution, quiet=options.quiet, helper=helper)
-            if not options.quiet:
-                say(f"page          {folder / 'index.html'}")
+            say(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:
         say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code
@@ -274,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--no-report",
         action="store_true",
-        help="write no report.html: for jobs whose result.json is read by a program",
+        help="write no report: for jobs whose result.json is read by a program",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

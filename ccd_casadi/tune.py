@@ -14,14 +14,15 @@ from ccd_casadi.support.terminal import say
 def command(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.analysis.loop_figures import loop_lines
-    from ccd_casadi.codesign.measured_answer import answer_of
+    from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.realisation import Realisation, block_diagonal
+    from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
-    from ccd_casadi.reporting.measured_page import write_measured
+    from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
@@ -48,7 +49,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     K = found.controller
     if K is not None and "phase_margin_deg" in result:
         write_json(folder / "controller.json", answer.controller)
-        write_measured(folder, case, K, result)
+        write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
             system, blocks = block_diagonal(tustin(K, case.period))
             whole = Realisation(replace(system, period=case.period), tuple(blocks))

@@ -10,9 +10,15 @@ from itertools import product
 
 import numpy as np
 
-from ccd_casadi.cases.findings import Finding, Severity, Topic
-from ccd_casadi.cases.unit_findings import entry_findings, unit_findings
-from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
+from ccd_casadi.cases.findings import (
+    Finding,
+    Severity,
+    Topic,
+    entry_findings,
+    most_limiting,
+    unit_findings,
+    zero_findings,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping

@@ -13,8 +13,8 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.codesign.costs import Costs, costs_of
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
@@ -23,8 +23,8 @@ from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
@@ -33,7 +33,13 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, joined
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.sections_robustness import (
+    fresh_yield,
+    judged_widely,
+    proof_of,
+    worst_members,
+)
+from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -125,9 +131,12 @@ class SectionsOuter(ThetaOuter):
         loops = loops_of(problem, best.theta, made.controller)
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
-        with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
-            make = partial(full_order_beside, problem, best.theta, made)
-            beside = asked.kept("full order", best.theta, Beside, make)
+        proof = proof_of(problem, best.theta, made)
+        drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
+        with Progress(1, "what limits it", quiet=asked.quiet) as bar:
+            make = partial(costs_of, problem, best.theta, made.kappa)
+            costs = asked.kept("costs", best.theta, Costs, make)
+            gap = known_gap(problem, best.theta)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -144,10 +153,12 @@ class SectionsOuter(ThetaOuter):
             raced=end.raced,
             wide=wide,
             checked=checked,
-            proof=proof_of(problem, best.theta, made),
+            proof=proof,
+            drawn=drawn,
             worst=worst,
             rounds=rounds,
-            beside=beside,
+            costs=costs,
+            gap=gap,
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -14,11 +14,11 @@ from ccd_casadi.codesign.box_look import look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
-from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.surrogate_quality import surrogate_quality
+from ccd_casadi.codesign.verified import Solution
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for

@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
+from ccd_casadi.codesign.costs import Costs
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
-from ccd_casadi.codesign.full_order import Beside
 from ccd_casadi.codesign.sections_entries import (
     active_of,
-    beside_dict,
     design_dict,
     proof_dict,
     sections_controller,
@@ -27,7 +27,9 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ, counted
 
 
@@ -36,8 +38,9 @@ class VerifiedSections(Verified):
     """The design of a run, judged on its set and on the whole box of plants.
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
-    the whole of it; `worst` the worst plant that was found. `raced` is a multi-start search
-    at θ, and `beside` what controllers of full order reach there.
+    the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
+    `worst` the worst plant that was found. `raced` is a multi-start search at θ,
+    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches.
     """
 
     design: SectionsDesign
@@ -45,9 +48,11 @@ class VerifiedSections(Verified):
     wide: Certificate
     checked: int
     proof: Proof
+    drawn: Yield | None
     worst: Excess
     rounds: int
-    beside: Beside
+    costs: Costs
+    gap: Gap | None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.
@@ -69,10 +74,15 @@ class VerifiedSections(Verified):
 
     @property
     def kept(self) -> bool:
-        """Whether the whole set is: by the judge, the proof, and all along its common shift."""
+        """Whether the whole set is: by the judge, proof, draws, and along its common shift."""
         found, ends = self.survival, kind_of(self.problem).common_shifts()
         along = found is None or found.within(*ends)
-        return self.wide.passed and not self.proof.refuted and along
+        return self.wide.passed and not self.proof.refuted and self.all_drawn and along
+
+    @property
+    def all_drawn(self) -> bool:
+        """Whether none of the plants that were drawn fails."""
+        return self.drawn is None or self.drawn.survived == self.drawn.draws
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -95,7 +105,8 @@ class VerifiedSections(Verified):
             "anchors": [list(kappa) for kappa in sections.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
-            "full_order": beside_dict(self.beside),
+            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()}),
+            "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
             found |= {
@@ -123,6 +134,7 @@ class VerifiedSections(Verified):
             "worst_plant": {"option": self.worst.option, "point": self.worst.point.tolist()},
             "set": [{"option": option, "point": list(point)} for option, point in members],
             "words": self.wide.words,
+            "yield": None if self.drawn is None else self.drawn.entry,
             **({} if self.damping is None else self.damping.entry),
         }
 
@@ -146,6 +158,7 @@ class VerifiedSections(Verified):
 
     def survives_line(self) -> Line:
         excess, proof = math.expm1(self.worst.value), self.proof
+        drawn = "" if self.drawn is None else self.drawn.words
         figures = {
             "plants": self.checked,
             "worst_excess": excess,
@@ -163,8 +176,10 @@ class VerifiedSections(Verified):
             words = f"within every bound on {where}, but {proof.words}"
         elif self.checked <= 1:
             robust, words = None, "[robust] names no plant but the model"
+        elif not self.all_drawn:
+            words = f"within every bound on {where}, but of the whole box {drawn}"
         elif robust:
-            words = f"{words}; {proof.words}"
+            words = "; ".join(part for part in (words, drawn, proof.words) if part)
         else:
             words = f"within every bound on {where}, but not all along its common resonance shift"
         line = survives(
@@ -194,7 +209,8 @@ class VerifiedSections(Verified):
     ) -> tuple[str, Mapping[str, Any]]:
         solved = outcome.outer
         starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        known, figures = look_words(starts, optima, look)
+        bound = {} if self.gap is None else {"gap": self.gap.words(self.bandwidth)}
+        known, figures = look_words(starts, optima, look, **bound)
         found, of = [optimum.bandwidth / HZ for optimum in self.raced.design.local_optima], ""
         if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"

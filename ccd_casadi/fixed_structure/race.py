@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, Ascent, Point, ascend
+from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, PENALTY, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -160,7 +160,7 @@ def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
 
 
 def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
-    """The field, best first, with those stopped that have lost."""
+    """The field, best first, with those stopped that lost, or will not meet the bounds."""
     running = [i for i, runner in enumerate(field) if runner.running]
     most = max(LAST, len(running) // 2) if turn < HALVINGS else len(running)
     lead, found = field[0].merit, list(field)
@@ -169,6 +169,8 @@ def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
         behind = lead - runner.merit
         lost = place >= most or behind > OVERTAKING * runner.gained
         lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
-        if lost and i:
+        missing = PENALTY * runner.point.assessment.violation
+        hopeless = turn >= HALVINGS - 1 and missing > OVERTAKING * runner.gained
+        if hopeless or (lost and i):
             found[i] = replace(runner, running=False)
     return found

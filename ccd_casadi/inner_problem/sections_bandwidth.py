@@ -3,7 +3,8 @@
 A multi-start search at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of
 the climbs from all anchors, and from nothing else: it depends neither on the order in which θ are
 asked for nor on the number of workers. Where no anchor climbs to a certified design a
-search of a few seeded starts is run at that θ, which is a function of θ too.
+search of a few seeded starts is run at that θ, which is a function of θ too; not
+with `starts` = 0.
 """
 
 from collections.abc import Sequence
@@ -26,12 +27,12 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     sections_of_problem,
     structure_of,
     uncertain_plant,
+    warm_starts,
     with_channels,
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import worst_members
-from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -88,7 +89,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
             initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
-    if made is None or not made.certified:
+    if made is None or (sections.starts and not made.certified):
         made = synthesise(
             plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign, certify
 from ccd_casadi.fixed_structure.box_proof import Proof, prove
+from ccd_casadi.fixed_structure.certificate import TOLERANCE
 from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.fixed_structure.worst_plant import WITHIN, Excess, lattice, worst_plants
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     sections_of_problem,
@@ -28,6 +30,10 @@ AT_ONCE = 3  # plants added in a round
 APART = 1e-4  # of the box: members that are closer are the same plant
 CHECKED = 200  # plants that the judge looks at in the end
 LOOSE = 2.0 * WITHIN  # relative: by how much they may pass a bound
+# Plants drawn for the yield, by their cost (2 ms, and 120 ms with four channels): where none fails
+# they prove 99.54 % and 95.5 % at confidence 1 - 1e-6.
+FRESH, FRESH_OF_SEVERAL = 3000, 300
+FRESH_SEED = 2000  # apart from those of the search and of the lattice
 
 
 def worst_members(
@@ -75,6 +81,35 @@ def judged_widely(
     if not uncertain.names:
         points = uncertain.corners()[: 1 + len(sections.uncertainty.options)]
     return _judged(problem, uncertain.plants(points), controller, workers), len(points)
+
+
+def fresh_yield(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    workers: Pool | None = None,
+) -> Yield | None:
+    """How many of so many plants drawn uniformly from the box keep every bound and ω_b, judged.
+
+    The options are drawn alike often. None where there is no box to draw from.
+    """
+    sections, uncertain = sections_of_problem(problem), uncertain_plant(problem, theta)
+    if not uncertain.names or made.controller is None:
+        return None
+    count = FRESH if plant_of(problem).outputs == 1 else FRESH_OF_SEVERAL
+    rng, (low, high) = np.random.default_rng((sections.seed, FRESH_SEED)), uncertain.box
+    option = rng.integers(len(uncertain.options), size=count).tolist()
+    point = rng.uniform(low, high, (count, len(low)))
+    plants = uncertain.plants(list(zip(option, point, strict=True)))
+    found = _judged(problem, plants, made.controller, workers).plants
+    bounds, least = bounds_of(problem).looser(LOOSE), made.bandwidth * (1.0 - LOOSE)
+    kept = [
+        one.stable and one.confirmed and one.bandwidth >= least
+        and max((bounds.shares(one) | bounds.channel_shares(one.channels)).values())
+        <= 1.0 + TOLERANCE
+        for one in found
+    ]  # fmt: skip
+    return Yield(sum(kept), count)
 
 
 def proof_of(problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign) -> Proof:

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ, number, shown_unit
 
 Fact = tuple[str, str, str]
 _FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")

@@ -6,6 +6,7 @@ from typing import Self, TypeVar
 
 import numpy as np
 
+from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.plants.modal import modal_plant
@@ -39,6 +40,10 @@ class Tolerances:
     failed: int
     worst: Judged
     difference: float | None = None
+
+    def within(self, S_max: float) -> Yield:
+        """How many of the random plants are stable with a peak of S up to S_max."""
+        return Yield(sum(one.stable and one.peak <= S_max for one in self.judged), len(self.judged))
 
 
 def tolerances(

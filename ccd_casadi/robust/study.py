@@ -215,6 +215,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "stable_above_S_max": sum(
                 item.stable and item.peak > run.problem.inner.S_max for item in hard.judged
             ),
+            "yield": hard.within(run.problem.inner.S_max).entry,
             "peak_quantiles": dict(
                 zip(("50", "95", "100"), np.quantile(peaks, [0.5, 0.95, 1.0]), strict=True)
             )

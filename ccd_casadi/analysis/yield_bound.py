@@ -1,0 +1,59 @@
+"""What random plants that no search has seen prove of all of them."""
+
+from dataclasses import dataclass
+
+from scipy.special import betaincinv
+
+CONFIDENCE, CONFIDENCE_WORDS = 1.0 - 1e-6, "1 - 1e-6"
+
+
+def yield_bound(survived: int, draws: int, confidence: float = CONFIDENCE) -> float:
+    """The least share of all plants that survive, by independent draws: exact for the binomial.
+
+    The q with P(at least `survived` of `draws` | q) = 1 - confidence (Clopper and Pearson 1934):
+
+        I_q(survived, draws - survived + 1) = 1 - confidence
+
+    Of none that fails it is (1 - confidence)^(1/draws). The draws must not have been chosen, and
+    the design must not have been changed by them.
+
+    >>> round(yield_bound(13_809, 13_809), 5), round(yield_bound(199, 200, 0.95), 4)
+    (0.999, 0.9765)
+    """
+    if not 0 <= survived <= draws:
+        raise ValueError(f"{survived} of {draws} draws survived; give 0 up to all of them")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence is {confidence}; give more than 0 and less than 1")
+    if survived == 0:
+        return 0.0
+    return float(betaincinv(survived, draws - survived + 1, 1.0 - confidence))
+
+
+@dataclass(frozen=True)
+class Yield:
+    """How many of so many fresh draws survived."""
+
+    survived: int
+    draws: int
+
+    @property
+    def least(self) -> float:
+        """The share of all that survives, at least, at `CONFIDENCE`."""
+        return yield_bound(self.survived, self.draws)
+
+    @property
+    def words(self) -> str:
+        """With the share rounded down."""
+        percent = int(1e4 * self.least) / 100.0
+        return (
+            f"{self.survived} of {self.draws} fresh random plants survive: at least {percent:g} % "
+            f"of all, at confidence {CONFIDENCE_WORDS}"
+        )
+
+    @property
+    def entry(self) -> dict[str, float]:
+        """Of result.json."""
+        return {
+            "survived": self.survived, "draws": self.draws, "least": self.least,
+            "confidence": CONFIDENCE,
+        }  # fmt: skip

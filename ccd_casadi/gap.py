@@ -1,0 +1,62 @@
+"""`python -m ccd_casadi.gap CASE.toml [--theta m1=60,m2=60]`: what no controller can reach."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+from ccd_casadi.support.command_line import ExitCode, parser, run
+from ccd_casadi.support.units import HZ
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Print one JSON object; of a run's folder at its θ, beside its own bandwidth."""
+    from ccd_casadi.cases.case import load_case, parse_theta
+    from ccd_casadi.cases.case_problem import problem_of
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.limitations.of_problem import gap_of
+    from ccd_casadi.support.json_files import clean
+    from ccd_casadi.support.versions import versions
+
+    began, bandwidth = perf_counter(), None
+    if options.case.is_dir():
+        finished = read_run(options.case)
+        problem, theta = finished.problem, finished.theta
+        bandwidth = finished.result.get("bandwidth_hz")
+    else:
+        case = load_case(options.case)
+        problem = problem_of(case)
+        theta = problem.start
+        if options.theta is not None:
+            theta = parse_theta(case, options.theta)
+    found = gap_of(problem, theta)
+    answer: dict[str, Any] = {
+        "theta": dict(zip(problem.names, theta, strict=True)),
+        "bandwidth_hz": bandwidth,
+        "gap": found.entry(HZ * (bandwidth or float("nan"))),
+        "seconds": perf_counter() - began,
+        "versions": versions(),
+    }
+    json.dump(clean(answer), sys.stdout, indent=2, allow_nan=False)
+    print()
+    return ExitCode.DONE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = parser(
+        "ccd_casadi.gap",
+        "Bounds on the bandwidth of every controller on the model at one theta, as JSON on stdout; "
+        "CASE.toml may be the folder of a finished solve.",
+        without_effect=("--out", "--workers", "--seed", "--quiet"),
+    )
+    arguments.add_argument(
+        "--theta", metavar="m1=60,m2=60", help="the hardware (default: the case's start)"
+    )
+    return run(command, arguments, argv, needs=["ccd_casadi.limitations.of_problem"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

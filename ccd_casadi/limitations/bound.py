@@ -1,0 +1,168 @@
+"""The largest ω_b that any controller of any order has on one plant: from outside and inside.
+
+A larger ω_b only shrinks the discs of `limits`, so both searches are for the ω_b at which the least
+scaling of the discs is one. Outside only what `certificate` has shown counts.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.certificate import forbids
+from ccd_casadi.limitations.conic import greatest_multiplier, least_scaling
+from ccd_casadi.limitations.limits import Limits
+from ccd_casadi.support.arrays import Array
+
+REALS = (*[2.0] * 60, 10.0, 30.0, 100.0)  # of the basis, over ω_b
+CORNERS = {-1: 100.0, 1: 5.0}  # of its roll-off, for h and for T
+GRID, FINE = 120, 1500  # frequencies in a decade: of a programme, of what is made of it
+OVER = 0.002  # by how much the scaling is above one where the certificate is tried
+TRIES = 5
+BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a grid of their own
+MOST_PAIRS, SAME = 16, 1e-3  # how many of them, and how near two are that count as one
+BEGIN = 0.65  # of what one frequency alone forbids
+NEAR = 0.6  # of the ω_b that a basis is made for: where another one is made
+STEPS = (0.6, 1.6)  # of the scaling that one step goes for: 0 and ∞ are programmes not solved
+CLOSE = 1e-3  # of the scaling: to what aims are met, and by how much T may pass a bound
+
+
+def outside(limits: Limits, known: float = np.inf) -> float:
+    """An ω_b (rad/s) that no controller reaches, near the least; `known` where that is less.
+
+    Infinite where nothing forbids any bandwidth.
+    """
+    if known < np.inf and _Search(limits, known, -1).multiplier(known)[0] <= 1.0 + OVER:
+        return known
+    most = pointwise(limits)
+    zeros = [float(limits.omega(np.array(abs(z)))) for z in limits.beyond]
+    begin = min([BEGIN * most, known, *zeros])
+    if not np.isfinite(begin):
+        return np.inf
+    for _ in range(2):  # the basis is made for where the search begins
+        search = _Search(limits, begin, -1)
+        omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
+        if NEAR < omega_b / begin < 1.0 / NEAR:
+            break
+        begin = omega_b
+    for _ in range(TRIES):
+        if omega_b >= most:
+            break
+        if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, GRID)):
+            return min(omega_b, known)
+        omega_b *= 1.0 + 2.0 * OVER
+        weight = search.multiplier(omega_b)[1]
+    return min(most, known)
+
+
+def inside(limits: Limits, most: float) -> float:
+    """The ω_b (rad/s) of a T that keeps every bound on a fine grid, near `most`; 0: none found."""
+    if not most < np.inf:
+        return 0.0
+    search = _Search(limits, most, 1)
+    found = _where(search.controller, 0.98 * most, most, 1.0 - CLOSE)[0]
+    return found if search.controller(found)[0] <= 1.0 + CLOSE else 0.0
+
+
+def pointwise(limits: Limits) -> float:
+    """The least ω_b at which some frequency alone forbids it: m_S + m_T < 1."""
+
+    def slack(log_omega: float) -> float:
+        v = _grid(limits, float(np.exp(log_omega)), 400)
+        m_S, m_T = limits.radii(v, v, float(np.exp(log_omega)))
+        return float((m_S + m_T).min()) - 1.0
+
+    low = np.log(limits.bounds.omega_low)
+    high = low + np.log(1e6) if not limits.period else np.log(np.pi / limits.period) - 1e-3
+    if slack(high) >= 0.0:
+        return np.inf if not limits.period else float(np.exp(high))
+    if slack(low) < 0.0:
+        return float(np.exp(low))
+    found = brentq(slack, low, high, xtol=1e-4)
+    while slack(found) >= 0.0:
+        found += 1e-3
+    return float(np.exp(found))
+
+
+def _roots(limits: Limits, omega_b: float) -> list[complex]:
+    """-p̄ of the oscillating poles and zeros p next to ω_b, each once."""
+    v = limits.variable(omega_b)
+    found: list[complex] = []
+    for r in sorted(limits.roots.tolist(), key=lambda r: abs(np.log(abs(r) / v))):
+        p = complex(abs(r.real), r.imag)
+        known = any(abs(p - other) < SAME * abs(p) for other in found)
+        if r.imag > 0.0 and BAND[0] * v < abs(r) < BAND[1] * v and not known:
+            found.append(p)
+    return found[:MOST_PAIRS]
+
+
+def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
+    """Frequencies v: fine around ω_b and at every lightly damped root, both sides of a step."""
+    v = limits.variable(omega_b)
+    parts = [
+        np.geomspace(0.02 * v, 40.0 * v, int(3.3 * per_decade)),
+        np.geomspace(1e-4 * v, 0.02 * v, per_decade),
+        np.geomspace(40.0 * v, 1e4 * v, per_decade),
+    ]
+    for r in _roots(limits, omega_b):
+        spread = np.sinh(np.linspace(-5.0, 5.0, max(per_decade // 3, 21)))
+        parts.append(r.imag + max(r.real, 1e-4 * abs(r)) * spread)
+    for step in (omega_b, limits.ratio * omega_b):
+        parts.append(limits.variable(step) * np.array([1.0 - 1e-9, 1.0 + 1e-9]))
+    grid = np.unique(np.concatenate(parts))
+    return grid[(grid > 0.0) & np.isfinite(grid)]
+
+
+class _Search:
+    """ω_b with a basis that stays; `turned` -1: of multipliers h, 1: of T."""
+
+    def __init__(self, limits: Limits, omega_b: float, turned: int) -> None:
+        self.limits, self.unit = limits, limits.variable(omega_b)
+        excess = len(limits.row[0].poles) - len(limits.row[0].zeros)
+        self.basis = Basis(
+            reals=tuple(self.unit * a for a in REALS),
+            pairs=tuple(_roots(limits, omega_b)),
+            corner=CORNERS[turned] * self.unit,
+            order=1 if turned < 0 else max(excess - 1, 0),
+            zeros=limits.beyond,
+            turned=turned,
+            constant=turned > 0 and excess == 0,
+        )
+
+    def multiplier(self, omega_b: float) -> tuple[float, Array]:
+        """The scaling that some h shows, on a grid, and the coefficients of h."""
+        v = _grid(self.limits, omega_b, GRID)
+        width = np.gradient(v)
+        width[0] += v[0]
+        values = self.basis.values(v) * np.sqrt(self.unit)
+        radii = self.limits.radii(v, v, omega_b)
+        return greatest_multiplier(values, width / self.unit, *radii)
+
+    def controller(self, omega_b: float) -> tuple[float, Array]:
+        """The scaling that some T needs, on a finer grid, and its coefficients."""
+        v = _grid(self.limits, omega_b, GRID)
+        g, weight = least_scaling(self.basis.values(v), *self.limits.radii(v, v, omega_b))
+        v = _grid(self.limits, omega_b, FINE)
+        m_S, m_T = self.limits.radii(v, v, omega_b)
+        T = self.basis.values(v) @ weight
+        shares = np.maximum(np.abs(T) / m_T, np.abs(1.0 - T) / m_S)
+        return max(g, float(shares.max())), weight
+
+
+def _where(
+    scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
+) -> tuple[float, Array]:
+    """The ω_b at which the scaling is as aimed at; secants in ln."""
+    x, slope = np.log(begin), 0.6
+    known: list[tuple[float, float]] = []
+    for _ in range(8):
+        g, weight = scaling(float(np.exp(x)))
+        error = float(np.log(np.clip(g / aim, *STEPS)))
+        if abs(error) < CLOSE:
+            break
+        if known and x != known[-1][0]:
+            slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))
+        known.append((x, error))
+        x = float(min(x - error / slope, np.log(most)))
+    return float(np.exp(x)), weight

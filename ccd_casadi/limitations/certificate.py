@@ -1,0 +1,131 @@
+"""Whether a multiplier h forbids every controller: ∫ σ(v) dv < 0, evaluated as an upper bound.
+
+Where h T is analytic in the right half plane and falls as 1/v², Re ∫ h T dv = 0 for the T of every
+stabilising controller. T lies in both discs, |T| <= m_T and |1 - T| <= m_S, so that
+
+    0 = -Re ∫ h T dv <= ∫ σ dv,   σ = max Re(-h T) over T in both discs.
+
+If the right side is negative, there is no such T. On an interval of width w both discs are as large
+as they are anywhere on it; h is the line between its ends but for e = w²/8 max|h''|; and σ is
+convex in h, so that on that line it is at most the line between its own ends:
+
+    ∫ σ dv <= w (σ(h_low) + σ(h_high))/2 + w e m_T.
+
+Intervals are halved where that is most above the integrand. Rounding, of 1e-12 or so of the
+integrals, is covered by a margin of 1e-6 of them.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.limits import Limits
+from ccd_casadi.support.arrays import Array
+
+SPLIT = 0.9  # of what is lost to the intervals' widths: by the intervals that are halved
+MOST = 300_000  # intervals
+MARGIN = 1e-6  # of ∫ m_T|h|: what rounding may not reach
+TAIL = 1e13  # where the last interval ends, over the largest root of h
+
+
+def support(h: np.ndarray, m_S: Array, m_T: Array) -> Array:
+    """max Re(-h T) over |T| <= m_T, |1 - T| <= m_S; -∞ where no T is in both.
+
+    In the direction of -h the farthest point of one disc, where the other holds it, else a corner.
+    """
+    g, size = -h, np.abs(h)
+    unit = np.conj(g) / np.where(size > 0.0, size, 1.0)
+    one, two = m_T * unit, 1.0 + m_S * unit
+    x = 0.5 * (1.0 + m_T**2 - m_S**2)
+    y = np.sqrt(np.maximum(m_T**2 - x**2, 0.0))
+    corner = g.real * x + np.abs(g.imag) * y
+    found = np.where(np.abs(two) <= m_T, g.real + m_S * size, corner)
+    found = np.where(np.abs(one - 1.0) <= m_S, m_T * size, found)
+    return np.where(m_S + m_T < 1.0, -np.inf, found)
+
+
+@dataclass(frozen=True)
+class _Intervals:
+    """Intervals of v with h at their ends and middles; of σ and m_T|h| upper and point values."""
+
+    low: Array
+    high: Array
+    h_low: np.ndarray
+    h_high: np.ndarray
+    h_middle: np.ndarray
+    upper: Array  # of ∫ σ dv
+    loss: Array  # upper less the value by the middle
+    size: Array
+
+    def only(self, where: np.ndarray) -> tuple[np.ndarray, ...]:
+        return tuple(getattr(self, item.name)[where] for item in fields(self))
+
+    def with_halves(self, split: np.ndarray, halves: "_Intervals") -> "_Intervals":
+        rest = np.ones(len(self.low), bool)
+        rest[split] = False
+        every = np.ones(len(halves.low), bool)
+        pairs = zip(self.only(rest), halves.only(every), strict=True)
+        return _Intervals(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True)
+class _Multiplier:
+    limits: Limits
+    basis: Basis
+    weight: Array
+    omega_b: float
+
+    def at(self, v: Array) -> np.ndarray:
+        return np.asarray(self.basis.values(v) @ self.weight)
+
+    def _radii(self, low: Array, high: Array) -> tuple[Array, Array]:
+        m_S, m_T = self.limits.radii(low, high, self.omega_b)
+        return m_S, np.minimum(m_T, 1.0 + m_S)  # |T| <= 1 + |S|
+
+    def intervals(
+        self, low: Array, high: Array, h_low: np.ndarray, h_high: np.ndarray
+    ) -> _Intervals:
+        w, middle = high - low, 0.5 * (low + high)
+        h = self.at(middle)
+        m_S, m_T = self._radii(low, high)
+        line = 0.5 * (support(h_low, m_S, m_T) + support(h_high, m_S, m_T))
+        curved = self.basis.most_curved(low, high, self.weight) * w**2 / 8.0
+        upper, size = w * (line + m_T * curved), w * m_T * np.abs(h)
+        value = w * support(h, *self._radii(middle, middle))
+        loss = upper - np.maximum(value, -size)
+        return _Intervals(low, high, h_low, h_high, h, upper, loss, size)
+
+
+def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: Array) -> bool:
+    """Whether h = Σ weight_k h_k shows that no controller reaches ω_b (rad/s).
+
+    `start`: frequencies v that the first intervals end at.
+    """
+    multiplier = _Multiplier(limits, basis, weight, omega_b)
+    top = TAIL * max(basis.corner, *basis.reals, *map(abs, basis.pairs))
+    steps = [omega_b, limits.ratio * omega_b, limits.bounds.omega_low]
+    parts = [start, [limits.variable(omega) for omega in steps], [0.0]]
+    ends = np.concatenate([*parts, np.geomspace(start.max(), top, 400)])
+    ends = np.unique(ends[ends <= top])
+    h = multiplier.at(ends)
+    beyond = (1.0 + limits.bounds.S_max) * basis.tail(top, weight)
+    found = multiplier.intervals(ends[:-1], ends[1:], h[:-1], h[1:])
+    while True:
+        total, excess = float(found.upper.sum()) + beyond, float(found.loss.sum())
+        if total < -MARGIN * float(found.size.sum()):
+            return True
+        if not np.isfinite(total) or total - excess > 0.0:
+            return False
+        order = np.argsort(-found.loss)
+        share = np.cumsum(found.loss[order])
+        split = order[: int(np.searchsorted(share, SPLIT * excess)) + 1]
+        if len(found.low) + len(split) > MOST:
+            return False
+        low, high, h_low, h_high, middle_h, *_ = found.only(split)
+        middle = 0.5 * (low + high)
+        halves = multiplier.intervals(
+            np.concatenate([low, middle]), np.concatenate([middle, high]),
+            np.concatenate([h_low, middle_h]), np.concatenate([middle_h, h_high]),
+        )  # fmt: skip
+        found = found.with_halves(split, halves)

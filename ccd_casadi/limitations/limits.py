@@ -1,0 +1,171 @@
+"""What every controller's S and T keep at a frequency: two discs, enclosed over intervals.
+
+With T = 1 - S all bounds of a loop are |S| <= m_S and |T| <= m_T:
+
+    m_S = min(S_max, 1/√2 up to ω_b, shape (ω/ω_b)/√2, compliance_max/|G|)
+    m_T = min(weighted_level/|W_T|, |G| weighted_level/|W_KS|)
+
+Of several channels S and T are uᵀSu and uᵀTu, and |G| is ‖uᵀG‖, for a unit direction u of outputs:
+‖uᵀGKS‖ <= ‖uᵀG‖ ‖KS‖. Only what follows from the bounds of the whole is used, so that a bound on
+this loop's ω_b is one on all of it. |S(jω_low)| <= S_low, one frequency, is left out.
+The variable is v: ω of a continuous loop, (2/T) tan(ωT/2) of a sampled one.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
+from ccd_casadi.lti.hold import Sampling, sampled
+from ccd_casadi.lti.state_space import StateSpace, balanced
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+FAITHFUL = 1e-6  # relative error of a response by its poles and zeros, up to which they are used
+OUTSIDE = 1e-3  # of its size: real part from which on a zero counts as one of the right half plane
+WIDE = 20.0  # m_T where nothing bounds T: more than 1 + S_max
+ROOT_HALF = np.sqrt(0.5)
+
+
+@dataclass(frozen=True)
+class Magnitude:
+    """|g(jv)| by poles and zeros, `value` at `at`; between two frequencies each factor has an
+    exact range."""
+
+    zeros: np.ndarray
+    poles: np.ndarray
+    at: float
+    value: float
+
+    def range(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """The least and the largest that |g| can be on the intervals, FAITHFUL included."""
+        least, most = (np.full(low.shape, np.log(self.value)) for _ in range(2))
+        for roots, sign in ((self.zeros, 1.0), (self.poles, -1.0)):
+            for r in roots:
+                near = np.maximum(np.maximum(low - r.imag, r.imag - high), 0.0)
+                far = np.maximum(np.abs(low - r.imag), np.abs(high - r.imag))
+                one, two = (
+                    sign * np.log(np.hypot(r.real, gap) / abs(1j * self.at - r))
+                    for gap in (near, far)
+                )
+                least += np.minimum(one, two)
+                most += np.maximum(one, two)
+        return np.exp(least) * (1.0 - FAITHFUL), np.exp(most) * (1.0 + FAITHFUL)
+
+
+def magnitude(system: StateSpace) -> Magnitude:
+    """Of one input and output, continuous or sampled; there in v, delays as zeros at 2/T.
+
+    Raises PlantError where poles and zeros do not give the response.
+    """
+    T = system.period
+    even = balanced(system.A, system.B, system.C)  # or its zeros have errors of 1e-3
+    system = StateSpace(*even, system.D, period=T)
+    poles = system.poles
+    size = 1.0 if T else float(np.abs(poles).max())
+    zeros = system.zeros(size)
+    if T:
+        beyond = np.full(len(poles) - len(zeros), 2.0 / T, complex)  # zeros at z = ∞
+        poles, zeros = (2.0 / T * (x - 1.0) / (x + 1.0) for x in (poles, zeros))
+        zeros = np.append(zeros, beyond)
+    top = 2.0 / T if T else float(np.median(np.abs(poles)))
+    v = top * np.geomspace(1e-3, 3.0, 25)
+    omega = v if not T else 2.0 / T * np.arctan(0.5 * v * T)
+    response = np.abs(system.response(omega)[:, 0, 0])
+    found = Magnitude(zeros, poles, float(v[12]), float(response[12]))
+    error = np.abs(found.range(v, v)[1] / response - 1.0).max()
+    if not error <= 1.5 * FAITHFUL:
+        words = "its poles and zeros do not give its response"
+        raise PlantError(f"no bound on every controller: {words} (off by {error:.1e})")
+    return found
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The loop in one direction of outputs: ‖uᵀG‖ as held, |G| without hold (one channel), bounds.
+
+    `ratio`: its bandwidth over ω_b. `integrator`: the shape counts from 0 on, else from ω_low.
+    `beyond`: zeros of G in the right half plane, in v, which T has for every controller.
+    """
+
+    name: str
+    bounds: Bounds
+    row: tuple[Magnitude, ...]
+    free: Magnitude | None
+    period: float
+    beyond: tuple[complex, ...] = ()
+    ratio: float = 1.0
+    integrator: bool = True
+
+    def omega(self, v: Array) -> Array:
+        """ω in rad/s."""
+        T = self.period
+        return np.asarray(2.0 / T * np.arctan(0.5 * T * v)) if T else v
+
+    def variable(self, omega: float) -> float:
+        """v of ω in rad/s, infinite from half the sampling rate on."""
+        if not self.period:
+            return omega
+        angle = 0.5 * omega * self.period
+        return float(2.0 / self.period * np.tan(angle)) if angle < 0.5 * np.pi else np.inf
+
+    @cached_property
+    def roots(self) -> np.ndarray:
+        """Poles and zeros of the plant, in v."""
+        return np.concatenate([part for g in self.row for part in (g.poles, g.zeros)])
+
+    def radii(self, low: Array, high: Array, omega_b: float) -> tuple[Array, Array]:
+        """m_S and m_T on the intervals [low, high] of v: no S, no T is larger anywhere on them."""
+        bounds, own = self.bounds, self.ratio * omega_b
+        first, last = self.omega(low), self.omega(high)
+        m_S = np.full(low.shape, bounds.S_max)
+        m_S = np.where(last <= own, np.minimum(m_S, ROOT_HALF), m_S)
+        if bounds.shape is not None:
+            counts = first >= (0.0 if self.integrator else bounds.omega_low)
+            if bounds.shape_ends is ShapeEnd.CROSSING:
+                counts &= last <= own
+            m_S = np.where(counts, np.minimum(m_S, bounds.shape * ROOT_HALF * last / own), m_S)
+        if bounds.compliance_max is not None and self.free is not None:
+            least = self.free.range(first, last)[0]
+            m_S = np.minimum(m_S, bounds.compliance_max / least)
+        m_T = np.full(low.shape, WIDE)
+        if bounds.weighted_level is not None and bounds.weights is not None:
+            ends = np.abs([bounds.weights.responses(omega) for omega in (first, last)])
+            _, W_KS, W_T = ends.min(axis=0)  # both are monotone in ω
+            square = sum(g.range(low, high)[1] ** 2 for g in self.row)
+            m_T = np.minimum(m_T, bounds.weighted_level / W_T)
+            m_T = np.minimum(m_T, bounds.weighted_level / W_KS * np.sqrt(square))
+        return m_S, m_T
+
+
+def limits_of(
+    plant: StateSpace,
+    bounds: Bounds,
+    sampling: Sampling | None,
+    name: str = "",
+    direction: Array | None = None,
+    ratio: float = 1.0,
+    integrator: bool = True,
+) -> Limits:
+    """Of a stable SI plant in a direction of outputs (one output: None); `bounds` are its own.
+
+    Raises PlantError where the plant is not stable.
+    """
+    if not plant.stable:
+        raise PlantError("no bound on every controller: the plant is not stable")
+    if sampling is None:
+        held, period = plant, 0.0
+    else:
+        held, period = sampled(plant, sampling.period, sampling.delay), sampling.period
+    u = np.ones((1, 1)) if direction is None else np.asarray(direction)[None, :]
+    row = tuple(
+        magnitude(StateSpace(held.A, held.B[:, [j]], u @ held.C, u @ held.D[:, [j]], period=period))
+        for j in range(held.B.shape[1])
+        if np.abs(held.B[:, j]).any()
+    )
+    one = plant.B.shape[1] == 1 and len(plant.C) == 1
+    zeros = row[0].zeros if one else np.empty(0, complex)
+    beyond = zeros[zeros.real > OUTSIDE * np.abs(zeros)]
+    free = magnitude(plant) if one and bounds.compliance_max is not None else None
+    return Limits(name, bounds, row, free, period, tuple(beyond.tolist()), ratio, integrator)
