@@ -12,7 +12,7 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem

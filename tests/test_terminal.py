@@ -11,7 +11,7 @@ import pytest
 
 import ccd_casadi
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import wrapped
+from ccd_casadi.support.terminal import coloured, wrapped
 
 
 def on_screen(columns: int, *words: str) -> list[str]:
@@ -50,6 +50,14 @@ def test_a_line_goes_on_under_its_words() -> None:
     broken = wrapped(line, 50).split("\n")
     assert all(part.startswith(" " * 23) for part in broken[1:])
     assert " ".join(" ".join(broken).split()) == " ".join(line.split())
+
+
+def test_the_state_of_a_line_has_its_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert coloured("survives      warned   so") == "survives      \x1b[33mwarned\x1b[0m   so"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert coloured("survives      warned   stable") == "survives      warned   stable"
 
 
 def test_work_that_ends_early_ends_its_bar(capsys: pytest.CaptureFixture[str]) -> None:
