@@ -25,7 +25,7 @@ LEADS = {"auto": None, "on": True, "off": False}
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.later_lines import told
+    from ccd_casadi.codesign.result import told
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files

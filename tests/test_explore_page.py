@@ -12,7 +12,7 @@ from ccd_casadi import explore
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support import optional_packages
+from ccd_casadi.support import errors
 
 PATIENCE = 240e3  # ms: the machine may be busy
 # Pixels of one unit of Re L and of Im L.
@@ -190,7 +190,7 @@ def test_a_package_that_is_missing_is_asked_for_before_anything_is_done(
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(optional_packages, "import_module", missing)
+    monkeypatch.setattr(errors, "import_module", missing)
     assert explore.main(["runs/two_mass.toml", "--out", str(tmp_path / "none"), "--no-open"]) == 2
     assert "pip install 'ccd-casadi[explore]'" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

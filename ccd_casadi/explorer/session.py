@@ -18,7 +18,7 @@ from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.machine import lumped
-from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of

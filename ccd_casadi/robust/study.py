@@ -9,7 +9,7 @@ from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.later_lines import at_solve
+from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -30,9 +30,9 @@ from ccd_casadi.robust.perturbed import (
 from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.statics import Statics, statics
 
 NYQUIST = 0.999  # of half the sampling rate: where a grid ends
