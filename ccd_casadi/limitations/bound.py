@@ -24,7 +24,7 @@ BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a gri
 MOST_PAIRS, SAME = 16, 1e-3  # how many of them, and how near two are that count as one
 BEGIN = 0.65  # of what one frequency alone forbids
 NEAR = 0.6  # of the ω_b that a basis is made for: where another one is made
-STEPS = (0.6, 1.6)  # of the scaling that one step goes for: 0 and ∞ are programmes not solved
+SECANTS, LARGEST = 10, 1.0  # programmes, and how far one step goes in ln ω_b
 CLOSE = 1e-3  # of the scaling: to what aims are met, and by how much T may pass a bound
 
 
@@ -46,12 +46,12 @@ def outside(limits: Limits, known: float = np.inf) -> float:
         if NEAR < omega_b / begin < 1.0 / NEAR:
             break
         begin = omega_b
-    for _ in range(TRIES):
+    for number in range(TRIES):
         if omega_b >= most:
             break
         if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, GRID)):
             return min(omega_b, known)
-        omega_b *= 1.0 + 2.0 * OVER
+        omega_b *= 1.0 + OVER * 2.0 ** (number + 1)
         weight = search.multiplier(omega_b)[1]
     return min(most, known)
 
@@ -153,16 +153,19 @@ class _Search:
 def _where(
     scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
 ) -> tuple[float, Array]:
-    """The ω_b at which the scaling is as aimed at; secants in ln."""
-    x, slope = np.log(begin), 0.6
-    known: list[tuple[float, float]] = []
-    for _ in range(8):
+    """The ω_b at which the scaling is as aimed at; secants in ln, between what is known."""
+    x, low, high, slope = float(np.log(begin)), -np.inf, float(np.log(most)), 0.8
+    before: tuple[float, float] | None = None
+    for _ in range(SECANTS):
         g, weight = scaling(float(np.exp(x)))
-        error = float(np.log(np.clip(g / aim, *STEPS)))
+        error = float(np.log(np.clip(g / aim, 0.1, 10.0)))  # 0 and ∞: a programme not solved
         if abs(error) < CLOSE:
             break
-        if known and x != known[-1][0]:
-            slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))
-        known.append((x, error))
-        x = float(min(x - error / slope, np.log(most)))
+        low, high = (max(low, x), high) if error < 0.0 else (low, min(high, x))
+        if before is not None and x != before[0]:
+            slope = float(np.clip((error - before[1]) / (x - before[0]), 0.3, 5.0))
+        before = x, error
+        x += float(np.clip(-error / slope, -LARGEST, LARGEST))
+        if not low < x < high:
+            x = 0.5 * (low + high) if low > -np.inf else high
     return float(np.exp(x)), weight

@@ -24,7 +24,7 @@ from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
 SPLIT = 0.9  # of what is lost to the intervals' widths: by the intervals that are halved
-MOST = 300_000  # intervals
+MOST = 120_000  # intervals
 MARGIN = 1e-6  # of ∫ m_T|h|: what rounding may not reach
 TAIL = 1e13  # where the last interval ends, over the largest root of h
 
