@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,9 @@ from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
+from ccd_casadi.inner_problem import sections_robustness
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.insight import main as insight_main
@@ -99,6 +102,34 @@ def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
     # more plants, or hold and delay, can only cost: the climbs start from the design itself
     for easier in ("sections_on_model_hz", "sections_continuous_hz"):
         assert beside[easier] >= result["bandwidth_hz"] * (1.0 - 1e-3)
+
+
+def test_no_controller_exceeds_what_the_run_says(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = json.loads((folder / "run" / "result.json").read_text())
+    bound = result["gap"]["outside_hz"]
+    assert bound >= result["full_order"]["sections_on_model_hz"] >= result["bandwidth_hz"]
+    assert f"no controller of any order exceeds {bound:.2f} Hz" in (
+        result["verdict"]["optimal"]["words"]
+    )
+    assert gap_main([str(folder / "run")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["gap"]["relative"] == pytest.approx(result["gap"]["relative"])
+    assert result["bandwidth_hz"] < answer["gap"]["inside_hz"] < bound
+
+
+def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = read_run(folder / "run")
+    monkeypatch.setattr(sections_robustness, "FRESH", 40)
+    for more, survived in ((1.0, 40), (1.05, 0)):
+        bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
+        made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
+        drawn = sections_robustness.fresh_yield(run.problem, run.theta, made)
+        assert drawn is not None
+        assert (drawn.survived, drawn.draws) == (survived, 40)
 
 
 def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
