@@ -61,7 +61,7 @@ def greatest_multiplier(
     right = np.append(1.0, np.zeros(6 * N + n + 1))
     aim = np.concatenate([np.zeros(n), -width, np.zeros(3 * N), [COST]])
     x = _solved(aim, rows, right, 1, n + 1)
-    return (0.0, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])
+    return (np.inf, np.zeros(n)) if x is None else (float(-aim[:-1] @ x[:-1]), x[:n])
 
 
 def _solved(
