@@ -21,10 +21,11 @@ def least_scaling(functions: np.ndarray, m_S: Array, m_T: Array) -> tuple[float,
     N, n = functions.shape
     rows, right = np.zeros((2, N, 3, n + 1)), np.zeros((2, N, 3))
     for i, (m, sign) in enumerate(((m_T, -1.0), (m_S, 1.0))):
-        rows[i, :, 0, -1] = -1.0
-        rows[i, :, 1, :n] = sign * functions.real / m[:, None]
-        rows[i, :, 2, :n] = sign * functions.imag / m[:, None]
-    right[1, :, 1] = 1.0 / m_S
+        size = np.sqrt(m)  # between rows that are ill scaled and discs that are
+        rows[i, :, 0, -1] = -m / size
+        rows[i, :, 1, :n] = sign * functions.real / size[:, None]
+        rows[i, :, 2, :n] = sign * functions.imag / size[:, None]
+    right[1, :, 1] = 1.0 / np.sqrt(m_S)
     aim = np.append(np.zeros(n), 1.0)
     x = _solved(aim, sparse.csc_matrix(rows.reshape(-1, n + 1)), right.ravel(), 0, 0)
     return (np.inf, np.zeros(n)) if x is None else (float(x[-1]), x[:n])
