@@ -10,8 +10,7 @@ import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.support.deadline import Runner
-from ccd_casadi.synthesis.backends.judgement import verdicts
-from ccd_casadi.synthesis.backends.mixed import TITLES, synthesise_with
+from ccd_casadi.synthesis.backends.mixed import TITLES, synthesise_with, verdicts
 
 SEED = 0
 

@@ -99,7 +99,7 @@ def full_order(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sections", action="store_true", help="a race of sections too")
+    parser.add_argument("--sections", action="store_true", help="search sections too")
     parser.add_argument("--bound", type=float, default=1e-6, help="compliance_max, m/N")
     parser.add_argument("--only", default="", help='a case and a set, "tutorial, ±3 %%"')
     parser.add_argument("--disturbance", type=float, nargs="*", default=[1.0, 10.0, 20.0])

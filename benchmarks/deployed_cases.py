@@ -8,8 +8,9 @@ What `deploy` calls verified is then rebuilt here, with NumPy alone: modes from 
 problem, each flexible one shifted, hold and delay by a matrix exponential of this file's own, the
 loop closed with the matrices of controller.json. It must be stable with a peak of S within 5 % of
 S_max on the whole set, on plants between those that the package looked at too, and no peak may lie
-above the one that deploy.json names. No look over the box: whether a better design exists is no
-matter here, and costs two thirds of a case. What the file of `--out` holds is not run again.
+above the one that deploy.json names. There is no global check over the box, which costs two
+thirds of a case: whether a better design exists does not matter here. What the file of `--out`
+holds is not run again.
 """
 
 import argparse

@@ -15,12 +15,25 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.drawing.content import (
+    Block,
+    Curve,
+    Figure,
+    Head,
+    Level,
+    Lines,
+    Mark,
+    Page,
+    Panel,
+    Section,
+    Table,
+    Words,
+)
+from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.svg import CYCLE
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
-from ccd_casadi.reporting.bode import figure_bode, table_bode
-from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
+from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.loops import synthesised_loop, table_gains
-from ccd_casadi.reporting.page import Section, Table, figure_html, page, paragraph, table_html
-from ccd_casadi.reporting.svg import CYCLE
 from ccd_casadi.studies.published import TWO_MASS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -53,17 +66,17 @@ def _case(problem: CoDesignProblem, name: str, M_K: float) -> LoopView | None:
     return synthesised_loop(local, THETA, figures.omega_S, figures.omega_T, label)
 
 
-def _plant(loop: LoopView, published: dict[str, Any]) -> str:
+def _plant(loop: LoopView, published: dict[str, Any]) -> tuple[Block, ...]:
     paper = published["plant_60_60"]
     caption = (
         f"Plant and the controller of case A. Anti-resonance {loop.antiresonances_hz[0]:.1f} Hz "
         f"(paper {paper['antiresonance_hz']:g}), resonance {loop.resonances_hz[-1]:.1f} Hz "
         f"(paper {paper['resonance_hz']:g})."
     )
-    return figure_html(figure_bode(loop, key="figure4"), caption, table_bode(loop))
+    return (replace(bode(loop), caption=caption),)
 
 
-def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> str:
+def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> tuple[Block, ...]:
     """S and K of both cases with bandwidths and local peaks, and a table against the paper's."""
     S_curves, K_curves, marks, levels = [], [], [], []
     rows = []
@@ -83,28 +96,20 @@ def _cases(loops: dict[str, LoopView], published: dict[str, Any]) -> str:
         ]
     x = "frequency (Hz)"
     span = (float(loops["A"].hz[0]), float(loops["A"].hz[-1]))
-    panels = [
-        [
-            Panel(
-                x, "|S| (–)", tuple(S_curves), marks=tuple(marks),
-                levels=(*levels, Level(2**-0.5, "-3 dB")), log_x=True, log_y=True, x_range=span,
-                legend="lower right",
-            )
-        ],
-        [Panel(x, "|K| (N/m)", tuple(K_curves), log_x=True, log_y=True, x_range=span)],
-    ]  # fmt: skip
-    svg = figure_lines(
-        panels, key="figure5", title="Sensitivity and controller of cases A and B",
-        heights=(3.6, 2.8),
+    S = Panel(
+        x, "|S| (–)", tuple(S_curves), marks=tuple(marks), log_x=True, log_y=True, x_range=span,
+        levels=(*levels, Level(2**-0.5, "-3 dB")), legend="lower right",
     )  # fmt: skip
+    K = Panel(x, "|K| (N/m)", tuple(K_curves), log_x=True, log_y=True, x_range=span)
+    lines = Lines(((S,), (K,)), "Sensitivity and controller of cases A and B", (3.6, 2.8))
     caption = (
         "Inner optima of this case file at 60 kg each. The complex zero pair of the plant peaks in "
         "S; a higher gain moves the peak, and the bandwidth, to higher frequencies."
     )
     table = Table(("figure", "here", "paper", "difference"), tuple(rows))
-    body = figure_html(svg, caption, *(table_gains(loop) for loop in loops.values()))
+    figure = Figure(lines, caption, tuple(table_gains(loop) for loop in loops.values()))
     note = "How far S_max and the box bring these to the paper's: docs/development/calibration.md."
-    return f"{body}\n{table_html(table)}\n{paragraph(note)}"
+    return figure, table, Words(note)
 
 
 def _against(label: str, ours: float, paper: float) -> tuple[str, str, str, str]:
@@ -119,7 +124,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("paper_figures.html"))
     given = parser.parse_args()
     found = sections(problem_of(load_case(given.case)), TWO_MASS)
-    given.out.write_text(page("The paper's figures 4 and 5", found, "", index=""))
+    head = Head("The paper's figures 4 and 5", "good", "computed", "", "", "")
+    given.out.write_text(painted(Page(head, tuple(found), index="")))
 
 
 if __name__ == "__main__":

@@ -32,11 +32,7 @@ from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.backends import slicot
-from ccd_casadi.synthesis.backends.standard_plant import (
-    balance,
-    close,
-    mixed_sensitivity,
-)
+from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 SB10AD_STATES = 30  # of the generalized plant; larger ones take it seconds

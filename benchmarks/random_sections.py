@@ -13,7 +13,7 @@ Most problems are small, so that many can be run:
                bring one to four bounds to bear; the end goes through the same gate to a
                certificate as every design, its box through branch and bound with some 800
                boxes, so that looser levels are judged too.
-    1 of 100   all of `synthesise_robustly`: a race from one start by rule and one at random with
+    1 of 100   all of `synthesise_robustly`: a search from one start by rule and one at random with
                all its rounds, worst plants added once, judge, proof with all its boxes.
 
 The judge (`sections_judge`) uses NumPy alone, on the set's plants and random ones. Refuted

@@ -25,11 +25,7 @@ from scipy.signal import cont2discrete
 
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-)
+from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
 from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.state_space import StateSpace

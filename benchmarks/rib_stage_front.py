@@ -37,12 +37,12 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inn
 from ccd_casadi.inner_problem.sections_bandwidth import ROUNDS, prepared, with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
+    moved,
     sections_of_problem,
     structure_of,
     with_options,
 )
 from ccd_casadi.inner_problem.sections_robustness import worst_members
-from ccd_casadi.inner_problem.sections_warm import moved
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.studies.sequential import first_resonance

@@ -136,8 +136,7 @@ def measured(climbs: bool) -> dict[str, dict[str, float]]:
     """Milliseconds of a loop and of the Hessians at it, seconds of a climb, by set."""
     import warnings
 
-    from ccd_casadi.fixed_structure.curvature import hessians
-    from ccd_casadi.fixed_structure.figures import assess
+    from ccd_casadi.fixed_structure.figures import assess, hessians
 
     warnings.filterwarnings("ignore")
     table = {}

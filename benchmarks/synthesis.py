@@ -2,7 +2,7 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/synthesis.py
 
-Every design is certified by the same kernel, `design.assess`. Times are CPU seconds of this
+Every design is certified by the same kernel, `design.judge`. Times are CPU seconds of this
 process on one core, the best of several, so that neighbours on the machine count little. SB10AD
 is called well: job 1 from a finite γ, then job 4 at the backed-off γ; mixsyn as its users call it.
 """
@@ -23,7 +23,7 @@ from problems import BACKOFF, HZ, OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerProblem
-from ccd_casadi.kernels.design import assess, design, sweep
+from ccd_casadi.kernels.design import design, judge, sweep
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.gamma import optimal_gamma
 from ccd_casadi.kernels.generalized_plant import generalized_plant
@@ -49,7 +49,8 @@ def certify(problem: Problem, controller, gamma: float) -> str:
     plant, w = problem.plant, problem.weights.scaled(problem.plant.omega_0)
     row = np.full(int(Figure.COUNT), np.nan)
     Ak, Bk, Ck, Dk = (np.ascontiguousarray(matrix, float) for matrix in controller)
-    assess(plant.A, plant.B, plant.C, Ak, Bk, Ck, Dk, w, gamma, OMEGA_LOW / plant.omega_0, row)
+    low = OMEGA_LOW / plant.omega_0
+    judge(plant.A, plant.B, plant.C, Ak, Bk, Ck, Dk, w, 0.0, gamma, low, row)
     return Code(int(row[Figure.CODE])).name.lower()
 
 

@@ -9,15 +9,14 @@ from ccd_casadi.codesign.lifted import Lifted as Lifted
 from ccd_casadi.codesign.nested import Nested as Nested
 from ccd_casadi.codesign.run import solve as solve
 from ccd_casadi.codesign.run import verify as verify
-from ccd_casadi.codesign.solution import Solution as Solution
 from ccd_casadi.codesign.tuning import Tuned as Tuned
 from ccd_casadi.codesign.tuning import tune as tune
+from ccd_casadi.codesign.verified import Solution as Solution
 from ccd_casadi.deployment.pipeline import deploy as deploy
 from ccd_casadi.fixed_structure.bounds import Bounds as Bounds
 from ccd_casadi.fixed_structure.certificate import certify as certify
 from ccd_casadi.fixed_structure.existing_plants import synthesise_sections as synthesise_sections
 from ccd_casadi.fixed_structure.measured import read_frequency_response as read_frequency_response
-from ccd_casadi.fixed_structure.modal_fit import fit_modes as fit_modes
 from ccd_casadi.fixed_structure.sections_design import SectionsDesign as SectionsDesign
 from ccd_casadi.fixed_structure.structure import Structure as Structure
 from ccd_casadi.inner_problem.problem import CoDesignProblem as CoDesignProblem

@@ -11,13 +11,14 @@ from ccd_casadi.support.command_line import ExitCode
 from ccd_casadi.support.interrupts import begun
 from ccd_casadi.support.options import one_line
 from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.terminal import say
 
 # word -> the module of its `main`, and what it does
 COMMANDS = {
     "check": ("ccd_casadi.check", "looks at a case's plant before anything is designed"),
     "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
     "gap": ("ccd_casadi.gap", "what no controller at one theta can reach, as JSON"),
-    "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that was measured"),
+    "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
     "retrain": ("ccd_casadi.retrain", "adds true samples to a run where they help most"),
@@ -25,6 +26,7 @@ COMMANDS = {
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
     "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
     "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
+    "report": ("ccd_casadi.report", "draws the pages of a finished folder again"),
     "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
     "imported": ("ccd_casadi.imported", "a modal table from result files; also: ccd import"),
 }
@@ -70,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         wrong = f"{words[0]} takes nothing more, as in: ccd {words[0]}"
     else:
         wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, *OWN))}"
-    print(one_line(wrong), file=sys.stderr)
+    say(one_line(wrong), sys.stderr)
     return ExitCode.BAD_INPUT
 
 
@@ -83,7 +85,7 @@ def new(folder: Path) -> int:
     there = [name for name in TEMPLATE if (folder / name).exists()]
     if there:
         words = f"{folder}: {' and '.join(there)} would be overwritten; choose another name"
-        print(one_line(words), file=sys.stderr)
+        say(one_line(words), sys.stderr)
         return ExitCode.BAD_INPUT
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +95,7 @@ def new(folder: Path) -> int:
         (folder / SCHEMA).write_text(f"{schema}\n", encoding="utf-8")
     except OSError as error:
         words = f"{folder}: cannot be written: {error.strerror}; choose another name"
-        print(one_line(words), file=sys.stderr)
+        say(one_line(words), sys.stderr)
         return ExitCode.BAD_INPUT
     case = folder / "case.toml"
     print(f"{folder / 'plant.py'}: the stage\n{case}: what is wanted")

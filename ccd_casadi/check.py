@@ -7,17 +7,23 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.terminal import say
+from ccd_casadi.support.units import counted
 
 
 def text(found: dict[str, Any]) -> str:
     """The diagnosis for a terminal."""
     from ccd_casadi.cases.plant_report import SHARES
 
-    theta = ", ".join(f"{name} = {value:.6g}" for name, value in found["theta"].items())
+    theta = ", ".join(
+        f"{name} = {value:.6g} {found['units'][name]}".strip()
+        for name, value in found["theta"].items()
+    )
     lines = [
-        f"plant         {found['plant']}: {found['inputs']} inputs, {found['outputs']} outputs",
+        f"plant         {found['plant']}: {counted(found['inputs'], 'input')}, "
+        f"{counted(found['outputs'], 'output')}",
         *(f"note          {words}" for words in found["notes"]),
-        f"looked at     {found['points']} points: start, middle and corners of the bounds",
+        f"checked       {found['points']} points: start, middle and corners of the bounds",
         f"start         {theta}",
         f"in SI         {found['size']}",
         "",
@@ -31,7 +37,7 @@ def text(found: dict[str, Any]) -> str:
             f"  {mode['driven']:7.2g}  {mode['measured']:8.2g}   {where}"
         )
     low, high = found["bandwidth_window_hz"]
-    window = "ω_b cannot be told: the plant falls through 1/M_K nowhere"
+    window = "no ω_b follows: |G| crosses 1/M_K nowhere"
     if low is not None:
         window = f"ω_b about {low:.3g} to {high:.3g} Hz"
     lines += ["", f"M_K           {found['M_K']:.3g}: {window}"]
@@ -72,13 +78,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     )
     errors = [f for f in findings if f.severity is Severity.ERROR]
     for item in errors:
-        print(f"{options.case}: plant: {item.words}", file=sys.stderr)
+        say(f"{options.case}: plant: {item.words}", sys.stderr)
     if errors:
         return ExitCode.BAD_INPUT
     found = clean(plant_report(case, problem, facts, findings))
     if options.out is not None:
         write_json(run_folder(options.case, options.out) / "check.json", found)
-    print(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
+    say(json.dumps(found, indent=2, allow_nan=False) if options.json else text(found))
     return ExitCode.DONE
 
 

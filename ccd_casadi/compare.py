@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.terminal import say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.studies.comparison import Comparison
@@ -59,13 +60,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     write_json(folder / "compare.json", answer)
     if not options.quiet:
         print(table(comparison))
-        print("\n".join(answer["conclusions"]["sentences"]))
-        print(f"run folder    {folder}")
-    from ccd_casadi.studies.compare_page import (
-        write_comparison_report,  # matplotlib is slow to import
-    )
+        say("\n".join(answer["conclusions"]["sentences"]))
+    from ccd_casadi.drawing.stored import write_page  # matplotlib is slow to import
+    from ccd_casadi.studies.compare_page import comparison_page
 
-    write_comparison_report(folder, comparison, answer)
+    write_page(folder / "report.html", comparison_page(folder, comparison, answer))
+    if not options.quiet:
+        say(f"page          {folder / 'report.html'}")
     statuses = {method.figures["status"] for method in comparison.methods if method.solution}
     if statuses == {"infeasible"}:
         return ExitCode.INFEASIBLE

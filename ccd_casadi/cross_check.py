@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.options import positive
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.inner_problem.problem import CoDesignProblem
-    from ccd_casadi.synthesis.backends.judgement import Verdict
+    from ccd_casadi.synthesis.backends.mixed import Verdict
 
 
 def _problem(
@@ -58,8 +59,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     """Synthesise with every back end, print the table, and say who is right."""
     from ccd_casadi.inner_problem.problem import scaled_plant
     from ccd_casadi.support.json_files import write_json
-    from ccd_casadi.synthesis.backends.judgement import verdicts
-    from ccd_casadi.synthesis.backends.mixed import RICCATI, every_backend
+    from ccd_casadi.synthesis.backends.mixed import RICCATI, every_backend, verdicts
 
     problem, theta, point = _problem(options)
     results = every_backend(
@@ -74,7 +74,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         names = ", ".join(f"{k} = {v:.6g}" for k, v in zip(problem.names, theta, strict=True))
         print(f"{names}; omega_S {point[0] / HZ:.6g} Hz, omega_T {point[1] / HZ:.6g} Hz")
         print(_table(found))
-        print(_conclusion(found))
+        say(_conclusion(found))
     if options.out is not None:
         folder = run_folder(options.case, options.out)
         write_json(folder / "cross_check.json", _json(problem, theta, point, found))
@@ -107,8 +107,7 @@ def _cell(value: float, form: str, unit: str = "") -> str:
 
 
 def _conclusion(found: "Sequence[Verdict]") -> str:
-    from ccd_casadi.synthesis.backends.judgement import AGREE
-    from ccd_casadi.synthesis.backends.mixed import TITLES
+    from ccd_casadi.synthesis.backends.mixed import AGREE, TITLES
 
     right = [TITLES[item.result.backend] for item in found if item.holds]
     wrong = [TITLES[item.result.backend] for item in found if item.holds is False]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.robust.demands import add_move_options, move_limits
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
-from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import UserError, require
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -39,14 +39,15 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.deployment.words import deployed_line
     from ccd_casadi.inner_problem.kinds import kind_of
 
-    require("slycot", "slicot")  # before anything is computed
     finished = read_run(options.run)
+    if not kind_of(finished.problem).as_designed:  # what reduces a controller
+        require("slycot", "slicot")
     status = finished.result.get("status")
     if status != "verified" and not options.unverified:
         reason = finished.result.get("reason") or "no reason is given"
         words = f"the run is {status}: {reason}"
         remedy = "solve it better, or give --unverified to look at it all the same"
-        print(one_line(f"{options.run}: {words}; {remedy}"), file=sys.stderr)
+        say(one_line(f"{options.run}: {words}; {remedy}"), sys.stderr)
         return ExitCode.NOT_VERIFIED
     folder = run_folder(options.run, options.out or options.run / "deploy")
     if folder.resolve() == options.run.resolve():
@@ -89,20 +90,22 @@ def command(options: argparse.Namespace) -> ExitCode:
         if options.fmu and not write_fmu(
             folder / FMU_FILE, found.realisation, texts, str(naming["title"])
         ):
-            print("note: no C compiler here (cc, or CC): the FMU has its sources alone",
-                  file=sys.stderr)  # fmt: skip
+            say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
     if not options.quiet:
-        print(_summary(finished, found))
+        say(_summary(finished, found))
         if moved is not None:
-            print(f"{'a move':13s} {_move_words(moved)}")
-        print(f"report        {folder / 'report.html'}")
-    from ccd_casadi.reporting.deploy_page import write_report  # matplotlib is slow to import
+            say(f"{'a move':13s} {_move_words(moved)}")
+    from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
+    from ccd_casadi.reporting.index import index_above, publish
 
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
-    write_report(folder / "report.html", finished, found, moved)
+    page = deploy_page(finished, found, moved, index_above(folder, finished.folder))
+    publish(finished.folder, folder / "report.html", page)
+    if not options.quiet:
+        say(f"page          {folder / 'report.html'}")
     if found.passed:
         return ExitCode.DONE
-    print(one_line(f"not verified: {_shortfall(finished, found)}"), file=sys.stderr)
+    say(one_line(f"not verified: {_shortfall(finished, found)}"), sys.stderr)
     return ExitCode.NOT_VERIFIED
 
 

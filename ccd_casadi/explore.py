@@ -12,7 +12,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.support.optional_packages import require
+    from ccd_casadi.support.errors import require
 
     require("bokeh", "explore")
     from ccd_casadi.cases.case import load_case

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
 from ccd_casadi.support.options import positive
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
@@ -33,11 +34,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     measured = measured_case(options.case)
     if measured is not None:
         return _measured(measured, options, began)
-    if options.theta is None:
-        raise CaseError(
-            f"{options.case}: --theta is missing; give the hardware, --theta m1=60,m2=60"
-        )
     case = load_case(options.case)
+    if options.theta is None:
+        start = ",".join(f"{each.name}={each.start:g}" for each in case.theta)
+        raise CaseError(f"{case.path}: --theta is missing; give the hardware, --theta {start}")
     problem = problem_of(case)
     theta = parse_theta(case, options.theta)
     omega_S_hz, omega_T_hz = options.omega_S_hz, options.omega_T_hz
@@ -57,7 +57,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -> ExitCode:
     """Sections on a measured response, with a page where a folder is asked for."""
     from ccd_casadi.cases.case import CaseError
-    from ccd_casadi.codesign.measured_answer import measured_answer
+    from ccd_casadi.codesign.inner_answer import measured_answer
 
     given = (options.theta, options.omega_S_hz, options.omega_T_hz, options.begin_at)
     if any(value is not None for value in given):
@@ -66,10 +66,12 @@ def _measured(case: "MeasuredCase", options: argparse.Namespace, began: float) -
     found, made = measured_answer(case, seed=options.seed, progress=_progress(options))
     stable = made.figures is not None and made.figures.stable
     if options.out is not None and made.controller is not None and stable:
-        from ccd_casadi.reporting.measured_page import write_measured
+        from ccd_casadi.drawing.stored import write_page
+        from ccd_casadi.reporting.measured_page import measured_page
 
         folder = run_folder(options.case, options.out)
-        write_measured(folder, case, made.controller, {"status": found.status, **found.figures})
+        answer = {"status": found.status, **found.figures}
+        write_page(folder / "report.html", measured_page(case, made.controller, answer))
     return _print(found, options, began)
 
 
@@ -77,7 +79,7 @@ def _progress(options: argparse.Namespace) -> Callable[[str], None] | None:
     """Progress on stderr, as stdout is for the answer."""
     if options.quiet:
         return None
-    return lambda words: print(words, file=sys.stderr, flush=True)
+    return lambda words: say(words, sys.stderr)
 
 
 def _print(found: "InnerAnswer", options: argparse.Namespace, began: float) -> ExitCode:
@@ -115,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--begin-at",
         metavar="FOLDER",
         type=Path,
-        help="sections: search from the controller.json of a run alone, not from a race",
+        help="sections: search from the controller.json of a run alone, not from many starts",
     )
     for name in ("S", "T"):
         arguments.add_argument(

@@ -12,6 +12,7 @@ from time import perf_counter
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_folder, run_parser
 from ccd_casadi.support.options import whole
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.terminal import say
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -49,12 +50,15 @@ def command(options: argparse.Namespace) -> ExitCode:
     verified = [point for point in front.points if point.verified]
     if not options.quiet:
         efficient = sum(point.efficient for point in verified)
-        print(f"front         {len(verified)} of {len(front.points)} points verified, ", end="")
-        print(f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")
-        print(f"written       {folder / 'insight.html'}")
-    from ccd_casadi.reporting.insight_page import write_insight  # matplotlib is slow to import
+        say(f"front         {len(verified)} of {len(front.points)} points verified, "
+            f"{efficient} efficient, {front.syntheses} syntheses, {seconds:.1f} s")  # fmt: skip
+    from ccd_casadi.reporting.index import index_of, publish
+    from ccd_casadi.reporting.insight import insight_page
 
-    write_insight(folder, done, front, responses)
+    page = insight_page(done, front, responses, index_of(folder))
+    publish(folder, folder / "insight.html", page)
+    if not options.quiet:
+        say(f"page          {folder / 'insight.html'}")
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
 
 

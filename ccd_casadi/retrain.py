@@ -11,10 +11,11 @@ from ccd_casadi.support.command_line import ExitCode, add_scheduler, run, run_pa
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, whole
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.terminal import say
 from surrogates.files import copy_run
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -56,10 +57,10 @@ def command(options: argparse.Namespace) -> ExitCode:
                       options.seed)  # fmt: skip
             outcome = job.run(write)
     if not options.quiet:
-        print(f"{outcome.status} ({outcome.reason}): {outcome.rounds} rounds, {outcome.spent} "
-              f"syntheses, surrogate {outcome.version} in {folder}")  # fmt: skip
+        say(f"{outcome.status} ({outcome.reason}): {outcome.rounds} rounds, {outcome.spent} "
+            f"syntheses, surrogate {outcome.version} in {folder}")  # fmt: skip
     elif outcome.status != "verified":
-        print(f"{folder}: {outcome.status} ({outcome.reason})", file=sys.stderr)
+        say(f"{folder}: {outcome.status} ({outcome.reason})", sys.stderr)
     return ExitCode.of(outcome.status)
 
 

@@ -11,6 +11,7 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, positive, whole
 from ccd_casadi.support.process_pool import PATIENCE, Workers
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import say
 
 LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 
@@ -66,17 +67,16 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = with_structured_bound(finished, found, options.limit)
         bar.advance()
     write()
-    from ccd_casadi.reporting.robustness_page import (  # matplotlib is slow
-        conclusion,
-        write_robustness,
-    )
+    from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
+    from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
 
     if options.controller is None:
         finished = told(finished, folder, "survives", survival_line(finished, found))
-    write_robustness(folder, finished, found, options.seed)
+    page = robustness_page(finished, found, options.seed, index_of(folder))
+    publish(folder, folder / "robustness.html", page)
     if not options.quiet:
-        print("\n".join(conclusion(finished, found)))
-        print(f"written to {folder / 'robustness.json'} and robustness.html")
+        say("\n".join(conclusion(finished, found)))
+        say(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
 
 

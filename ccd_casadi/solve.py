@@ -3,19 +3,18 @@
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.units import counted
-from ccd_casadi.support.worker_process import Ahead
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
-    from ccd_casadi.codesign.solution import Solution
+    from ccd_casadi.codesign.verified import Solution
     from ccd_casadi.inner_problem.problem import CoDesignProblem
 
 
@@ -98,7 +97,7 @@ def _optimality(result: Mapping[str, Any]) -> str:
     if "race" in result:
         ends = ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"])
         off = result["controller"]["kkt_residual"]
-        words += f", {off:.1e} over the controller; a full race there: {ends}"
+        words += f", {off:.1e} over the controller; a multi-start search there: {ends}"
     return words
 
 
@@ -150,30 +149,29 @@ def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
 def show_findings(case: "Case", problem: "CoDesignProblem") -> None:
     """On stderr: what is serious about a plant of the user's own, and what it is made of."""
     from ccd_casadi.cases.diagnosis import diagnose, first_seen
-    from ccd_casadi.cases.findings import Severity, Topic
+    from ccd_casadi.cases.findings import Severity, Topic, peak_words
     from ccd_casadi.cases.plant_report import size_words
-    from ccd_casadi.cases.unit_findings import peak_words
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.registry import model_named
 
     model = model_named(case.plant.model)
     if model is not None and model.sound:
         for words in peak_words(problem.inner.S_max):
-            print(f"warning: {words}", file=sys.stderr)
+            say(f"warning: {words}", sys.stderr)
         return
     facts, findings = diagnose(problem, case.suspension.rigid_modes)
-    print(f"note: in SI, at the start: {size_words(facts[0])}", file=sys.stderr)
+    say(f"note: in SI, at the start: {size_words(facts[0])}", sys.stderr)
     for item in first_seen(findings):
         if item.severity is not Severity.NOTE:
             subject = "" if item.topic is Topic.UNITS else "plant: "
-            print(f"{item.severity.value}: {subject}{item.words}", file=sys.stderr)
+            say(f"{item.severity.value}: {subject}{item.words}", sys.stderr)
     for words in plant_of(problem).notes(problem.start):
-        print(f"note: {words}", file=sys.stderr)
+        say(f"note: {words}", sys.stderr)
 
 
 def with_units(solution: "Solution", problem: "CoDesignProblem") -> "Solution":
     """The solution, a failed one's reason with what looks like a wrong unit."""
-    from ccd_casadi.cases.unit_findings import unit_findings
+    from ccd_casadi.cases.findings import unit_findings
     from ccd_casadi.inner_problem.problem import plant_of
     from ccd_casadi.plants.facts import facts_of
     from ccd_casadi.plants.modal import modal_plant
@@ -213,39 +211,34 @@ def command(options: argparse.Namespace) -> ExitCode:
         show_findings(case, problem)
         slow = slow_words(formulation, len(problem.names))
         if slow:
-            print(f"warning: {slow}", file=sys.stderr)
-    with ExitStack() as stack:
-        helper = None
-        if not options.no_report and options.workers > 1 and not options.quiet:
-            # Where somebody waits, a process gets ready to draw half of the report meanwhile.
-            from ccd_casadi.reporting.solve_page import ready
+            say(f"warning: {slow}", sys.stderr)
+    given = None
+    if options.surrogate is not None:
+        given = named_surrogate(folder, options.surrogate, name, problem)
+    store = folder / "samples.sqlite"
+    with (
+        pool(options.scheduler, options.workers, PATIENCE) as workers,
+        SampleStore(store) as samples,
+    ):
+        if options.resume and not options.quiet:
+            held = counted(samples.count(), "row") if samples.count() else "nothing yet"
+            say(f"resuming      {store} holds {held}", sys.stderr)
+        sampler = Sampler(problem, samples, workers, quiet=options.quiet)
+        solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
+        write_run(folder, case, solution)
+    code = ExitCode.of(solution.result["status"])
+    if not options.quiet:
+        say(summary(solution))
+        say(f"run folder    {folder}")
+    if not options.no_report:
+        from ccd_casadi.reporting.solve_page import write_report
 
-            helper = stack.enter_context(Ahead(ready))
-        given = None
-        if options.surrogate is not None:
-            given = named_surrogate(folder, options.surrogate, name, problem)
-        store = folder / "samples.sqlite"
-        with (
-            pool(options.scheduler, options.workers, PATIENCE) as workers,
-            SampleStore(store) as samples,
-        ):
-            if options.resume and not options.quiet:
-                held = counted(samples.count(), "row") if samples.count() else "nothing yet"
-                print(f"resuming      {store} holds {held}", file=sys.stderr)
-            sampler = Sampler(problem, samples, workers, quiet=options.quiet)
-            solution = with_units(co_design(sampler, formulation, options.seed, given), problem)
-            write_run(folder, case, solution)
-        code = ExitCode.of(solution.result["status"])
+        plant_case, solved = resolved(case, solution), solution.problem or problem
+        write_report(folder, plant_case, solved, solution, quiet=options.quiet)
         if not options.quiet:
-            print(summary(solution))
-            print(f"run folder    {folder}")
-        if not options.no_report:
-            from ccd_casadi.reporting.solve_page import write_report
-
-            plant_case, solved = resolved(case, solution), solution.problem or problem
-            write_report(folder, plant_case, solved, solution, quiet=options.quiet, helper=helper)
+            say(f"page          {folder / 'index.html'}")
     if options.quiet and code is not ExitCode.DONE:
-        print(f"{options.case}: {solution.result['reason']}", file=sys.stderr)
+        say(f"{options.case}: {solution.result['reason']}", sys.stderr)
     return code
 
 
@@ -270,7 +263,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--no-report",
         action="store_true",
-        help="write no report.html: for jobs whose result.json is read by a program",
+        help="write no report: for jobs whose result.json is read by a program",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

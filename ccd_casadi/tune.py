@@ -1,4 +1,4 @@
-"""`python -m ccd_casadi.tune DATA...`: a controller for a plant that was measured."""
+"""`python -m ccd_casadi.tune DATA...`: a controller for a plant that exists."""
 
 import argparse
 import sys
@@ -8,19 +8,21 @@ from time import perf_counter
 
 from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parser
 from ccd_casadi.support.options import number, one_line, positive, whole
+from ccd_casadi.support.terminal import say
 
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
     from ccd_casadi.analysis.loop_figures import loop_lines
-    from ccd_casadi.codesign.measured_answer import answer_of
+    from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.realisation import Realisation, block_diagonal
+    from ccd_casadi.drawing.stored import write_page
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
-    from ccd_casadi.reporting.measured_page import write_measured
+    from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.process_pool import Workers
     from ccd_casadi.support.versions import versions
@@ -34,7 +36,7 @@ def command(options: argparse.Namespace) -> ExitCode:
         found = tune(
             options.run, rate_hz=options.rate_hz, delay=options.delay, S_max=options.s_max,
             shape=options.shape, effort=options.effort, structure=structure, seed=options.seed,
-            progress=None if options.quiet else lambda words: print(words, file=sys.stderr),
+            progress=None if options.quiet else lambda words: say(words, sys.stderr),
             workers=workers,
         )  # fmt: skip
     answer, case = answer_of(found.case, found.design), found.case
@@ -46,7 +48,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     K = found.controller
     if K is not None and "phase_margin_deg" in result:
         write_json(folder / "controller.json", answer.controller)
-        write_measured(folder, case, K, result)
+        write_page(folder / "report.html", measured_page(case, K, result))
         if case.period is not None:
             system, blocks = block_diagonal(tustin(K, case.period))
             whole = Realisation(replace(system, period=case.period), tuple(blocks))
@@ -57,25 +59,25 @@ def command(options: argparse.Namespace) -> ExitCode:
             f"{result['sensitivity_peak']:.4g} at {result['sensitivity_peak_hz']:.4g} Hz",
             *loop_lines(result),
             *(f"{'':14s}{SectionWords(**item).text}" for item in result["controller"]["sections"]),
-            f"{'report':14s}{folder / 'report.html'}",
+            f"{'page':14s}{folder / 'report.html'}",
         ]
         if not options.quiet:
-            print("\n".join([f"{'status':14s}{answer.status}", *lines]))
+            say("\n".join([f"{'status':14s}{answer.status}", *lines]))
     if answer.status != "verified":
-        print(one_line(f"{case.file}: {answer.status}: {result['reason']}"), file=sys.stderr)
+        say(one_line(f"{case.file}: {answer.status}: {result['reason']}"), sys.stderr)
     return ExitCode.of(answer.status)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.tune", "The fastest PID with notches for a measured plant, with its C code.",
+        "ccd_casadi.tune", "The fastest PID with notches for a plant that exists, with its C code.",
         metavar="DATA", nargs="+",
-        about="measured responses, .csv, .mat or .npz; several are one set",
+        about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip
     for name, metavar, kind, default, words in (
-        ("--rate-hz", "X", positive, None, "of the controller; the hold is in DATA"),
-        ("--delay", "SECONDS", number(), 0.0, "on top of what is in DATA"),
+        ("--rate-hz", "X", positive, None, "of the controller; a response has the hold in it"),
+        ("--delay", "SECONDS", number(), 0.0, "in s, on top of what is in DATA"),
         ("--s-max", "X", number(1.0, strict=True), 1.8, "the largest |S|"),
         ("--shape", "X", number(1.0), 1.1, "|S| over ω/(√2 ω_b) at most"),
         ("--effort", "X", positive, 20.0, "|KS| at most, over 1/|G| about ω_b"),

@@ -13,9 +13,8 @@ from helpers import HZ, SUSPENSION, scaled
 from ccd_casadi.fixed_structure import Bounds, Sampling, Structure
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, find_decoupling
-from ccd_casadi.fixed_structure.figures import assess, constraints, to_theta
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians, to_theta
 from ccd_casadi.fixed_structure.loop_problem import (
     Constraints,
     Curve,

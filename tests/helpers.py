@@ -18,7 +18,7 @@ from scipy.optimize import brentq, minimize_scalar
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem
-from ccd_casadi.kernels.design import assess
+from ccd_casadi.kernels.design import judge
 from ccd_casadi.kernels.figures import Figure
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -201,7 +201,7 @@ def assessed(
     row[Figure.LIMITED_BY_BOUND] = 0.0
     scaled_weights = weights.scaled(plant.omega_0)
     low = omega_low / plant.omega_0
-    assess(plant.A, plant.B, plant.C, *matrices, scaled_weights, gamma, low, row)
+    judge(plant.A, plant.B, plant.C, *matrices, scaled_weights, 0.0, gamma, low, row)
     return figures_from_row(row, weights.omega_S, weights.omega_T, plant.omega_0)
 
 

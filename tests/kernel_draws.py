@@ -1,10 +1,7 @@
 """Systems to draw, for tests of the kernels' parts."""
 
 import numpy as np
-from helpers import (
-    HZ,
-    PAPER,
-)
+from helpers import HZ, PAPER
 from hypothesis import strategies as st
 
 from ccd_casadi.lti.state_space import StateSpace

@@ -4,13 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from surrogates import (
-    Hyperparameters,
-    Surrogate,
-    condition,
-    design,
-    fit,
-)
+from surrogates import Hyperparameters, Surrogate, condition, design, fit
 
 LOW, HIGH = np.array([-2.0, 10.0, 0.0]), np.array([2.0, 30.0, 1e-3])
 SPAN = HIGH - LOW

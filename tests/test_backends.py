@@ -20,10 +20,14 @@ from ccd_casadi.cross_check import main
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
-from ccd_casadi.support.optional_packages import MissingPackage
-from ccd_casadi.synthesis.backends.judgement import AGREE, verdicts
-from ccd_casadi.synthesis.backends.mixed import BackendResult, synthesise_with
-from ccd_casadi.synthesis.backends.registry import Backend
+from ccd_casadi.support.errors import MissingPackage
+from ccd_casadi.synthesis.backends.mixed import (
+    AGREE,
+    Backend,
+    BackendResult,
+    synthesise_with,
+    verdicts,
+)
 from ccd_casadi.synthesis.backends.standard_plant import (
     StandardPlant,
     close,

@@ -411,4 +411,4 @@ def test_what_sections_spend_is_counted_over_all_nodes(
     with SampleStore(tmp_path / "s.sqlite") as store:
         sampler = Sampler(own, store, Workers(1))
         searched(SectionsOuter(sampler.of(own)), Direct(), 0)
-        assert sampler.syntheses == 6  # five designs and a race
+        assert sampler.syntheses == 6  # five designs and a multi-start search

@@ -2,7 +2,10 @@
 
 import argparse
 import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from importlib import import_module
 from pathlib import Path
@@ -72,12 +75,7 @@ def test_a_new_stage_is_a_case_that_can_be_solved(
     problem = problem_of(load_case(case))
     assert scaled_plant(problem, (19.0, 8.0)).B.shape[1] == 1
     assert main(["check", str(case), "--quiet"]) == 0
-    # what is commented out is right too
-    lines = case.read_text().splitlines()
-    begin = next(i for i, line in enumerate(lines) if line == "# [controller]")
-    built = lines[:begin] + [line.removeprefix("# ") for line in lines[begin:]]
-    (folder / "built.toml").write_text("\n".join(built))
-    assert isinstance(problem_of(load_case(folder / "built.toml")).controller, SectionsProblem)
+    assert isinstance(problem.controller, SectionsProblem)
     schema = json.loads((folder / "case.schema.json").read_text())
     jsonschema.validate(tomllib.loads(case.read_text()), schema)
 
@@ -161,3 +159,25 @@ def test_the_page_of_all_keys_is_up_to_date(capsys: pytest.CaptureFixture[str]) 
     assert page == (ROOT / "docs/case_file.md").read_text(), "ccd keys > docs/case_file.md"
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(case_schema()))
+
+
+@pytest.mark.slow
+def test_the_readme_leads_from_nothing_to_tested_c_code(tmp_path: Path) -> None:
+    """Its commands as printed, in an empty folder, without the packages that are optional."""
+    for package in ("slycot", "cvxpy", "bokeh", "dask"):
+        (tmp_path / f"{package}.py").write_text(f"raise ImportError('no {package}')\n")
+    path = os.pathsep.join([str(tmp_path), str(ROOT)])
+    block = (ROOT / "README.md").read_text().partition("## Your own stage\n\n")[2]
+    commands = re.findall(r"^    ccd ([^#\n]+)", block, re.MULTILINE)
+    assert [words.split()[0] for words in commands] == ["new", "check", "solve", "deploy"]
+    for words in commands:
+        subprocess.run(
+            [sys.executable, "-m", "ccd_casadi", *words.split()], cwd=tmp_path, check=True,
+            env=os.environ | {"PYTHONPATH": path},
+        )  # fmt: skip
+    run = tmp_path / "my_stage" / "case"
+    verdict = json.loads((run / "result.json").read_text())["verdict"]
+    assert {line["state"] for line in verdict.values()} == {"passed"}
+    subprocess.run(["cc", "-std=c99", "-ffp-contract=off", "-o", "t", "controller.c",
+                    "controller_test.c", "-lm"], cwd=run / "deploy", check=True)  # fmt: skip
+    subprocess.run(["./t"], cwd=run / "deploy", check=True, capture_output=True)

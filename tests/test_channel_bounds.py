@@ -24,9 +24,8 @@ from ccd_casadi.fixed_structure import Bounds, Sampling, SectionsDesign, Structu
 from ccd_casadi.fixed_structure.channel_design import synthesise
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem, kinds_of_rows
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import channel_bounds, given_decoupling
-from ccd_casadi.fixed_structure.figures import assess, constraints
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
 from ccd_casadi.plants.plant import build_plant, mechanics

@@ -196,7 +196,7 @@ def test_an_unstable_loop_leaves_no_code(
     options = ["--rate-hz", "400", "--out", str(tmp_path), "--method", "zoh", "--quiet"]
     assert main([str(two_mass_run), *options]) == 4
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"deploy.json", "report.html"}
+    assert left == {"deploy.json", "report.html", "report.json"}
     assert json.loads((tmp_path / "deploy.json").read_text())["simulated"] is None
     assert main([str(two_mass_run), "--out", str(two_mass_run), *QUICK]) == 2
     assert "overwrite" in capsys.readouterr().err

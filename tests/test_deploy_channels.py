@@ -16,12 +16,15 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.drawing.paint import painted
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant
-from ccd_casadi.reporting.deploy_page import write_report
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.reporting.deploy_page import deploy_page
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
@@ -137,12 +140,11 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
     for option in (0, 1):  # in between, by plants of one's own
         for gain in (-0.02, 0.007, 0.02):
             plant = uncertain.plant(np.array([gain]), option).plant_si()
-            held = sampled_plant(plant, 1.0 / 8000.0, 60e-6)
-            figures = sampled_figures(sensitivity_loop(held, found.realisation.system))
+            held = sampled(plant, 1.0 / 8000.0, 60e-6)
+            figures = sampled_figures(closed_loop(held, found.realisation.system).S)
             assert figures.stable
             assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
-    write_report(tmp_path / "page.html", run, found)
-    page = (tmp_path / "page.html").read_text()
+    page = painted(deploy_page(run, found))
     assert "Channel sum: gain 3000 N/m" in page
     assert "Channel difference: 3 states, as designed" in page
 

@@ -13,9 +13,11 @@ from ccd_casadi.deploy import main
 from ccd_casadi.deployment.compliance import sampled_compliance
 from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
@@ -55,8 +57,8 @@ def peaks(run: FinishedRun, found, shifts) -> list[float]:  # type: ignore[no-un
     for shift in shifts:
         modal = modal_plant(system, run.problem.suspension, Perturbation(float(shift)))
         plant = scale_plant(modal, run.weights.M_K).plant_si()
-        held = sampled_plant(plant, 1.0 / found.rate_hz, found.delay)
-        figures = sampled_figures(sensitivity_loop(held, found.realisation.system))
+        held = sampled(plant, 1.0 / found.rate_hz, found.delay)
+        figures = sampled_figures(closed_loop(held, found.realisation.system).S)
         out.append(figures.sensitivity_peak if figures.stable else np.inf)
     return out
 
@@ -80,7 +82,7 @@ def test_a_bound_on_the_compliance_is_kept_or_told(
     run, found = deployed
     assert found.compliance is None, "this case bounds none"
     most = sampled_compliance(
-        run.plant.plant_si(), sensitivity_loop(found.plant, found.realisation.system)
+        run.plant.plant_si(), closed_loop(found.plant, found.realisation.system).S
     )
     whole = compliance_of(run.plant, found.reduced).gain
     assert most == pytest.approx(whole, rel=0.05), "the rate is far above the loop's peak"

@@ -10,15 +10,11 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
-from ccd_casadi.deployment.sampled import (
-    SampledFigures,
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-    together,
-)
+from ccd_casadi.deployment.sampled import SampledFigures, sampled_figures, together
 from ccd_casadi.deployment.simulation import measure_set, simulate
 from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 
 HZ = 2.0 * np.pi
@@ -44,7 +40,7 @@ def lead(channels: int = 1) -> StateSpace:
 
 def loop(period: float, delay: float, channels: int = 1) -> StateSpace:
     K = discretise(lead(channels), Conversion(Discretisation.RAMP, True, HZ), period, delay)
-    return sensitivity_loop(sampled_plant(stage(channels), period, delay), K)
+    return closed_loop(sampled(stage(channels), period, delay), K).S
 
 
 @few(max_examples=25)
@@ -59,7 +55,7 @@ def test_the_sampled_plant_is_the_plant(seed: int, steps: int, part: int, states
     B, C = rng.normal(size=(states, 2)), rng.normal(size=(2, states))
     period = 0.3
     delay = period * (steps + part / 20)
-    found = sampled_plant(StateSpace(A, B, C, np.zeros((2, 2))), period, delay)
+    found = sampled(StateSpace(A, B, C, np.zeros((2, 2))), period, delay)
     u = rng.normal(size=(12, 2))
     joint = np.zeros((states + 2, states + 2))
     joint[:states] = np.hstack([A, B])
@@ -107,9 +103,9 @@ def test_an_unstable_loop_has_no_figures() -> None:
 def test_a_simulation_measures_the_same_sensitivity(channels: int) -> None:
     period, delay = 3e-3, 4.2e-3
     conversion = Conversion(Discretisation.TUSTIN, False, HZ)
-    G = sampled_plant(stage(channels), period, delay)
+    G = sampled(stage(channels), period, delay)
     K = discretise(lead(channels), conversion, period, delay)
-    S = sensitivity_loop(G, K)
+    S = closed_loop(G, K).S
     exact = sampled_figures(S)
     found = measure_set([G], K, exact.bandwidth, seed=3)[0]
     assert found.leftover < 1e-6
@@ -125,8 +121,8 @@ def test_figures_of_loops_side_by_side_are_the_wholes() -> None:
     both = together([one, sampled_figures(loop(period, 2.0 * delay))])
     K = discretise(lead(), Conversion(Discretisation.RAMP, True, HZ), period, delay)
     slow = discretise(lead(), Conversion(Discretisation.RAMP, True, HZ), period, 2.0 * delay)
-    S1 = sensitivity_loop(sampled_plant(stage(), period, delay), K)
-    S2 = sensitivity_loop(sampled_plant(stage(), period, 2.0 * delay), slow)
+    S1 = closed_loop(sampled(stage(), period, delay), K).S
+    S2 = closed_loop(sampled(stage(), period, 2.0 * delay), slow).S
     zero = np.zeros((len(S1.A), len(S2.A)))
     whole = sampled_figures(StateSpace(
         np.block([[S1.A, zero], [zero.T, S2.A]]),
@@ -194,7 +190,7 @@ def test_needed_rate(met: Callable[[float], bool], found: float | None) -> None:
 
 
 def test_a_simulation_goes_on_from_its_state() -> None:
-    G = sampled_plant(stage(), 1e-3, 1e-3)
+    G = sampled(stage(), 1e-3, 1e-3)
     K = discretise(lead(), Conversion(Discretisation.STEP, True, HZ), 1e-3, 1e-3)
     r = np.random.default_rng(0).normal(size=(60, 1, 1))
     whole, _ = simulate(G, K, r)

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow  # another example is solved in test_own_examples
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    """The example without the look over the box, which finds nothing here and is half the work."""
+    """The example without the global check over the box, half the work for nothing."""
     folder = tmp_path_factory.mktemp("planar") / "run"
     copy = Path(shutil.copytree(EXAMPLE, folder.parent / "example"))
     with (copy / "case.toml").open("a") as stream:

@@ -25,7 +25,6 @@ from helpers import sensitivity_gain
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import composite_problem, plants_of_rows
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import (
     Decoupling,
     find_decoupling,
@@ -33,7 +32,7 @@ from ccd_casadi.fixed_structure.decoupling import (
     in_channels,
     is_decoupled,
 )
-from ccd_casadi.fixed_structure.figures import assess, constraints
+from ccd_casadi.fixed_structure.figures import assess, constraints, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
 from ccd_casadi.fixed_structure.peak_search import Brackets, split

@@ -401,7 +401,7 @@ def test_a_redrawn_controller_differs_from_its_end_in_one_section() -> None:
 
 
 def test_what_is_redrawn_never_loses_what_was_found() -> None:
-    """A race with the ends of another in its field ends with the best of both."""
+    """A search that is given the ends of another ends with the best of both."""
     problem = problem_for([plant()], Structure(biquads=0), EASY)
     rng = np.random.default_rng(1)
     pool = kept(problem, by_rules(problem, np.geomspace(0.05, 0.5, 4)))[:3]

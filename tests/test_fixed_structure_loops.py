@@ -9,16 +9,16 @@ from fixed_structure_channels import closed
 from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, by_curve, loop, plant
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.figures import (
     assess,
     constraints,
     evaluate_rows,
+    hessians,
     to_theta,
 )
 from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
@@ -34,6 +34,8 @@ from ccd_casadi.fixed_structure.structure import (
     state_space,
 )
 from ccd_casadi.kernels import sections
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import PlantError
@@ -115,7 +117,7 @@ def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
     si = problem.structure.in_units(kappa, members.omega_0, members.force)
     conversion = Conversion(Discretisation.TUSTIN, False, 1.0)
     K = discretise(state_space(problem.structure, si), conversion, sampling.period, sampling.delay)
-    S = sensitivity_loop(sampled_plant(plant().plant_si(), sampling.period, sampling.delay), K)
+    S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
     w = found.poles[0] * 0.5 * members.period
     z = np.sort(np.abs((1.0 + w) / (1.0 - w)))
     np.testing.assert_allclose(z, np.sort(np.abs(np.linalg.eigvals(S.A)))[-len(z) :], atol=1e-6)

@@ -14,10 +14,13 @@ from ccd_casadi.codesign import run
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulations import MANY, SAMPLES, formulation_of, slow_words, usual_name
 from ccd_casadi.codesign.lifted import Lifted
+from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import build_plant, mechanics
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.spent import Spent
 
 ROOT = Path(__file__).parent.parent
 CASE = load_case(ROOT / "runs" / "two_mass.toml")
@@ -132,3 +135,28 @@ def test_a_chain_of_twelve_masses_ends_verified(tmp_path: Path) -> None:
     assert solution.result["status"] == "verified"
     assert solution.verified is not None
     assert np.isfinite(solution.verified.objective)
+
+
+@pytest.mark.parametrize("reach", [0.3, 1e-6])
+def test_nested_looks_around_the_only_feasible_sample(reach: float) -> None:
+    """A sliver that one θ of the plan lies in; narrower than any step, it is the design."""
+    case = problem()
+    centre, width = np.array([55.0, 62.5]), np.array([15.0, 15.0])
+    asked: list[tuple[float, ...]] = []
+
+    def bandwidths(thetas: np.ndarray, *_: object) -> list[BandwidthSample]:
+        found = []
+        for theta in map(tuple, np.atleast_2d(thetas).tolist()):
+            inside = np.abs((theta - centre) / width).max() < reach
+            value = 400.0 + theta[1] if inside else np.nan
+            asked.append(theta)
+            found.append(BandwidthSample(theta, value, (0.0, 1.0), 1e3, 1e2, (), "", 0.0, 1))
+        return found
+
+    sampler = SimpleNamespace(problem=case, bandwidths=bandwidths, spent=Spent())
+    options = Nested(points=3, starts=4, max_refinements=3)
+    found = solve_nested(sampler, options, seed=0)  # type: ignore[arg-type]
+    assert len(asked) > 10 + 5  # the plan and the start, then around what is feasible
+    assert found.x is not None
+    assert np.abs((found.x[:2] - centre) / width).max() < reach
+    assert bool(found.surrogates) is (reach > 0.1)

@@ -2,13 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import (
-    HZ,
-    OMEGA_LOW,
-    PAPER,
-    flexible_case,
-    two_mass,
-)
+from helpers import HZ, OMEGA_LOW, PAPER, flexible_case, two_mass
 from kernel_draws import WEIGHTS
 
 from ccd_casadi.kernels import design, gamma, riccati

@@ -12,7 +12,7 @@ import pytest
 from ccd_casadi.solve import main as solve
 
 ROOT = Path(__file__).parent.parent
-CURSOR = (ROOT / "ccd_casadi" / "reporting" / "assets" / "cursor.js").read_text()
+CURSOR = (ROOT / "ccd_casadi" / "drawing" / "assets" / "cursor.js").read_text()
 
 HOSTILE = "kg</td></pre><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\\\frac$ {0} %s"
 PLANT = """

@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import (
-    few,
-    state_response,
-)
+from helpers import few, state_response
 from hypothesis import example, given
 from hypothesis import strategies as st
 from kernel_draws import complex_matrix, random_system, seeds

@@ -19,11 +19,11 @@ from ccd_casadi.__main__ import main
 from ccd_casadi.cases.measured_case import measured_case
 from ccd_casadi.codesign import outer_mixed, outer_sections
 from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.inner_answer import measured_answer
 from ccd_casadi.codesign.lifted import Lifted
-from ccd_casadi.codesign.measured_answer import measured_answer
 from ccd_casadi.codesign.result import FORMAT
 from ccd_casadi.codesign.run import solve
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem

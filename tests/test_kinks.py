@@ -12,8 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.sections_polish import by_pieces
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import joint_residual, theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verdict import State, optimal
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure import Structure

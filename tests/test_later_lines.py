@@ -11,9 +11,10 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.later_lines import told
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deploy import main as deploy
+from ccd_casadi.drawing.content import Page
+from ccd_casadi.drawing.paint import painted
 from ccd_casadi.reporting.index import write_index
-from ccd_casadi.reporting.page import page
-from ccd_casadi.reporting.verdict import run_header
+from ccd_casadi.reporting.verdict import run_head
 from ccd_casadi.robustness import main as robustness
 
 
@@ -89,7 +90,7 @@ def test_words_from_anywhere_stay_words_and_a_study_kept_apart_changes_no_run(tm
     place = folder / "result.json"
     place.write_text(json.dumps(result))
     for name in ("report.html", "other/report.html"):
-        (folder / name).write_text(page("t", [], run_header("t", result, "", "")))
+        (folder / name).write_text(painted(Page(run_head("t", result, "", ""), ())))
     (folder / "other" / "result.json").write_text("{}")  # another run, below this one
     run, kept = run_in(folder, result), place.read_bytes()
     line = Line(State.FAILED, r"</table><script>\1 \g<0>", {"figure": 1.0})

@@ -32,10 +32,20 @@ def test_a_value_beyond_a_jump_is_learnt(place: float, jump: float, sloped: bool
         assert with_sample(before, x, place + jump, np.array([np.nan])) is before
 
 
+@pytest.mark.parametrize("sloped", [False, True])
+def test_a_better_value_takes_the_place_of_one_at_the_same_theta(sloped: bool) -> None:
+    """An inner search may miss what the polish finds at its very θ: the better one is the truth."""
+    X = np.linspace(0.0, 1.0, 6)[:, None]
+    before = fit(X, X[:, 0], np.ones_like(X) if sloped else None, lower=[0.0], upper=[1.0])
+    after = with_sample(before, X[2] + 1e-12, 0.6, np.array([1.0]))
+    assert float(after.predict(X[2:3])[0]) == pytest.approx(0.6, rel=1e-6)
+    assert len(after.X) == 6
+
+
 @pytest.mark.parametrize("rounds", [1, 0])
 def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, rounds: int) -> None:
-    """Where the budget of rounds is spent and no look over the box has moved the design; not
-    where the case allows none."""
+    """Where the budget of rounds is spent and no global check has moved the design; not where the
+    case allows none."""
     X = np.linspace(0.0, 1.0, 6)[:, None]
     process = fit(X, 1.0 + X[:, 0], lower=[0.0], upper=[1.0])
     end = End(np.array([0.5]), 2.5, -1.0, KktCertificate(0.0, 0.0, 0.0, {}, (), None, ()), 0.0)

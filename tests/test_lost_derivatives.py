@@ -35,7 +35,7 @@ def lose(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
 def test_the_optimum_is_found_past_designs_without_derivatives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, formulation: str
 ) -> None:
-    """By IPOPT's starts alone: without the look over the box at the end."""
+    """By IPOPT's starts alone: without the global check over the box at the end."""
     lose(monkeypatch, 0.2)
     case = changed(tmp_path, more="\n[outer]\nbox_points = 0\n")
     words = [str(case), "--out", str(tmp_path / "run"), "--quiet", "--no-report", "--workers", "1"]

@@ -10,8 +10,7 @@ from test_kkt import MODEL, point
 
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.direct import true_objective as objective
-from ccd_casadi.codesign.kkt import active_at, kkt_certificate
-from ccd_casadi.codesign.newton import NEAR, newton_step
+from ccd_casadi.codesign.kkt import NEAR, active_at, kkt_certificate, newton_step
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem

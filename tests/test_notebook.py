@@ -15,10 +15,10 @@ import ccd_casadi as ccd
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.result import infeasible_dict
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
+from ccd_casadi.support.errors import MissingPackage
 from ccd_casadi.support.notebook import Shown
-from ccd_casadi.support.optional_packages import MissingPackage
 from ccd_casadi.support.progress import Progress
 
 ROOT = Path(__file__).resolve().parent.parent

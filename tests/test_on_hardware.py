@@ -19,9 +19,9 @@ from ccd_casadi.deployment.c_code import vectors
 from ccd_casadi.deployment.feedforward import feedforward
 from ccd_casadi.deployment.move import PARTS, Hardware, move
 from ccd_casadi.deployment.realisation import Realisation, difference_equation
-from ccd_casadi.deployment.sampled import sampled_plant
 from ccd_casadi.deployment.simulation import simulate
 from ccd_casadi.deployment.structured_text import structured_text
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
 
@@ -147,7 +147,7 @@ def made(K: Realisation, **also: object) -> Move:
 
 
 def test_an_unlimited_move_is_the_linear_loop() -> None:
-    K, plant = pid(), sampled_plant(stage(), PERIOD, DELAY)
+    K, plant = pid(), sampled(stage(), PERIOD, DELAY)
     found = made(K)
     errors, _ = simulate(plant, K.system, found.position[:, None, None])
     np.testing.assert_allclose(found.error, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)

@@ -36,8 +36,8 @@ def test_the_bounds_drawn_of_sections_are_those_that_they_are_judged_by() -> Non
     assert np.allclose(S[~below & np.isfinite(S)], rising[~below & np.isfinite(S)])
     assert np.array_equal(short[below], S[below])
     assert np.isnan(short[~below]).all()
-    ((area, _),) = above(hz, KS, 1e12)
-    assert len(area) == len(hz) + 2
+    (area,) = above(hz, KS, 1e12)
+    assert len(area.x) == len(area.y) == len(hz) + 2
     assert above(hz, np.full_like(hz, np.nan), 1.0) == ()
 
 

@@ -5,10 +5,9 @@ import shutil
 import pytest
 
 from ccd_casadi.deploy import main as deploy
+from ccd_casadi.drawing.content import Head, Lines, Page, Section, Steps, Table
+from ccd_casadi.drawing.paint import painted
 from ccd_casadi.insight import main as insight
-from ccd_casadi.reporting.page import Section
-from ccd_casadi.reporting.page import page as html_page
-from ccd_casadi.reporting.steps import steps_html
 from ccd_casadi.robustness import main as robustness
 
 WIDTHS, SCHEMES = (1300, 390), ("light", "dark")
@@ -124,10 +123,11 @@ def test_every_page_of_a_run(browser, solved, tmp_path):
 
 
 def test_a_slider_shows_one_step_at_a_time(browser, tmp_path):
-    steps = [(f"step {i}", f"<i>{i}</i>") for i in range(4)]
+    steps = tuple((f"step {i}", Lines(((Table(("",), ((i,),)),),), "")) for i in range(4))
     place = tmp_path / "page.html"
-    section = Section("Steps", steps_html(steps, 1, "first to last"))
-    place.write_text(html_page("a page", [section]), encoding="utf-8")
+    section = Section("Steps", (Steps(steps, 1, "first to last"),))
+    head = Head("a page", "good", "", "", "", "")
+    place.write_text(painted(Page(head, (section,))), encoding="utf-8")
     page = browser.new_page()
     heard = complaints(page)
     page.goto(place.as_uri())

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
+from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import THREADS, Ahead, WorkerLost
+from ccd_casadi.support.worker_process import THREADS, WorkerLost
 
 HERE = Path(__file__).parent
 
@@ -153,16 +154,14 @@ def test_a_task_that_kills_twice_is_told() -> None:
     assert workers._workers == []
 
 
-def test_a_process_ahead_gives_its_result_or_what_went_wrong() -> None:
-    with Ahead(usable_cores) as helper:
-        helper.begin(square, 3)
-        assert helper.result() == 9
-        helper.begin(failing, 3)
+def test_a_call_in_a_process_of_its_own_gives_its_result_or_what_went_wrong() -> None:
+    with Runner() as runner:
+        assert runner.call(60.0, square, 3) == 9
         with pytest.raises(TaskFailure, match="at three"):
-            helper.result()
-        helper.begin(os._exit, 3)
-        with pytest.raises(WorkerLost, match="exit code 3"):
-            helper.result()
+            runner.call(60.0, failing, 3)
+        with pytest.raises(Overrun, match="died"):
+            runner.call(60.0, os._exit, 3)
+        assert runner.call(60.0, square, 2) == 4
 
 
 def test_an_abandoned_map_leaves_no_process() -> None:

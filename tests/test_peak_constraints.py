@@ -101,7 +101,7 @@ def test_a_descent_synthesises_every_design_once(
 def test_a_verification_synthesises_every_design_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Polish, verification and the look over the box ask the same truth."""
+    """Polish, verification and the global check over the box ask the same truth."""
     asked: list[tuple] = []
     real = true_function.true_design
 

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import TWO_MASS, changed, run
-from helpers import (
-    HZ,
-)
+from helpers import HZ
 
 from ccd_casadi.inner import main as inner
 from ccd_casadi.sampling import sampler as sampling

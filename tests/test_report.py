@@ -2,8 +2,8 @@
 
 import base64
 import hashlib
-import os
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
@@ -20,21 +20,35 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.deployment.channels import split
+from ccd_casadi.drawing.content import (
+    Curve,
+    Head,
+    Landscape,
+    Lines,
+    Page,
+    Panel,
+    Section,
+    Table,
+    ThetaPath,
+    Words,
+)
+from ccd_casadi.drawing.lines import figure_lines
+from ccd_casadi.drawing.maps import figure_landscape
+from ccd_casadi.drawing.page import table_html
+from ccd_casadi.drawing.paint import block_html, painted
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.bode import figure_bode
+from ccd_casadi.report import main as report_command
+from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
-from ccd_casadi.reporting.maps import Landscape, ThetaPath, figure_landscape
-from ccd_casadi.reporting.page import Section, Table, number, page, table_html
-from ccd_casadi.reporting.solve_page import report_html, write_report
+from ccd_casadi.reporting.solve_page import solve_page, write_report
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import Ahead
+from ccd_casadi.support.units import number
 from surrogates.gaussian_process import mean_at_many
 
 HZ = 2.0 * np.pi
@@ -279,20 +293,45 @@ def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
     result = {key: solution.result[key] for key in kept}
     result |= {"status": "infeasible", "reason": "S_max cannot be met by <0.1>"}
     nothing = FormulationResult(None, None, (), (), None, False, "")
-    text = report_html(tmp_path, case, problem, Solution(result, nothing, None))
+    text = painted(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
     Document(text)
     assert "S_max cannot be met by &lt;0.1&gt;" in text
 
 
-@pytest.mark.parametrize("lost", [False, True])
-def test_a_helper_draws_the_same_report_and_may_die(lost: bool) -> None:
-    folder, case, problem, solution, alone = run("one")
-    with Ahead(int) as helper:
-        if lost:
-            helper.begin(os._exit, 1)
-        helped = report_html(folder, case, problem, solution, helper=helper)
-    minute = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d")
-    assert minute.sub("", helped) == minute.sub("", alone)
+@pytest.mark.parametrize("name", ["one", "two_mass"])
+def test_a_page_is_drawn_again_from_its_folder_alone(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, *_, first = run(name)
+    again = tmp_path / "run"
+    again.mkdir()
+    shutil.copy(folder / "report.json", again)
+
+    def refused(*given: object, **named: object) -> None:
+        raise AssertionError("a page that is there computes nothing")
+
+    for computing in (
+        "synthesis.synthesis.synthesise", "analysis.move.simulate", "lti.loop.constant_drive",
+        "inner_problem.problem.plant_of", "lti.state_space.StateSpace.response",
+    ):  # fmt: skip
+        monkeypatch.setattr(f"ccd_casadi.{computing}", refused)
+    for _ in range(2):
+        assert report_command([str(again), "--quiet"]) == 0
+        assert (again / "report.html").read_text(encoding="utf-8") == first
+
+
+def test_a_foreign_or_damaged_report_json_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "report.json"
+    for text, said in (
+        ("{", "is no report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
+        ('{"format": 1, "pages": {"../a.html": {}}}', "names what is no page"),
+        ('{"format": 1, "pages": {"a.html": {"head": 3}}}', "is not what a page shows"),
+    ):  # fmt: skip
+        place.write_text(text)
+        assert report_command([str(tmp_path)]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_mimo_shows_its_channels_or_all_singular_values() -> None:
@@ -302,7 +341,7 @@ def test_mimo_shows_its_channels_or_all_singular_values() -> None:
         plant = scaled_plant(problem, theta)
         weights = problem.weights.at(HZ * 50.0, HZ * 100.0)
         loop = design_view(problem, theta, K, weights=weights, gamma=1.0, bandwidth_hz=50.0)
-        text = figure_bode(loop, split(plant, K))
+        text = block_html(bode(loop, split(plant, K)), "k")
         assert ("channel 1, outputs +" in text) == apart
         assert ("phase of G" in text) == apart
         assert ("plant σ(G) (m/N)" in text) != apart
@@ -316,7 +355,7 @@ def test_paper_frequencies_are_marked() -> None:
 def test_other_problems_in_the_store_are_left_out() -> None:
     folder, case, problem, solution, _ = run("two_mass")
     other = replace(problem, weights=replace(problem.weights, M_K=1e7))
-    text = report_html(folder, case, other, solution)
+    text = painted(solve_page(folder, case, other, solution))
     assert "Too few syntheses" in text
 
 
@@ -342,7 +381,7 @@ def test_figures_are_deterministic_and_keep_the_callers_style() -> None:
     before = dict(matplotlib.rcParams)
     x = np.linspace(1.0, 10.0, 5)
     panel = Panel("time (s)", "cost ($a$ & <b>) (–)", (Curve(x, x**2, "J"),), log_y=True)
-    drawn = [figure_lines([[panel]], key="k", title="<t>") for _ in range(2)]
+    drawn = [figure_lines(Lines(((panel,),), "<t>"), "k") for _ in range(2)]
     assert drawn[0] == drawn[1]
     assert "cost ($a$ &amp; &lt;b&gt;)" in drawn[0]
     assert 'aria-label="&lt;t&gt;: cost' in drawn[0]
@@ -353,12 +392,13 @@ def test_landscape_takes_several_paths_and_unknown_letters() -> None:
     axis = np.linspace(0.0, 1.0, 5)
     field = axis[:, None] + axis
     field[0, 0] = np.nan
+    ways = np.array([[0.1, 0.2], [0.9, 0.8]])
     land = Landscape(
         ("a", "b"), ("天", "x" * 90), axis, axis, field, np.array([[0.5, 0.5, 1.0]]),
         np.empty((0, 2)), forbidden=field > 1.5, region=(0.2, 0.6, 0.2, 0.6),
+        paths=tuple(ThetaPath(name, ways) for name in ("ours", "theirs")), optimum=(0.9, 0.8),
     )  # fmt: skip
-    paths = [ThetaPath(name, np.array([[0.1, 0.2], [0.9, 0.8]])) for name in ("ours", "theirs")]
-    svg = figure_landscape(land, paths, (0.9, 0.8), key="two")
+    svg = figure_landscape(land, "two")
     Document(svg)
     assert all(word in svg for word in ("ours", "theirs", "天", "…"))
 
@@ -370,4 +410,5 @@ def test_tables_round_and_escape() -> None:
     assert "&amp;" in html
     assert '<td class="n">0.33333</td>' in html
     assert '<td class="n">–</td>' in html
-    Document(page("t", [Section("<h>", "<p>x</p>")]))
+    head = Head("t", "good", "", "", "", "")
+    Document(painted(Page(head, (Section("<h>", (Words("x"),)),))))

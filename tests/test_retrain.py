@@ -15,7 +15,7 @@ from busy import HANGS
 import ccd_casadi as ccd
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.retraining import Job, Outcome
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.versions import FOLDER, LOCK, load_version, only_job, version_names
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler

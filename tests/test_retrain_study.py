@@ -43,7 +43,7 @@ def result(folder: Path) -> dict[str, Any]:
 
 
 def without_look(folder: Path) -> Path:
-    """The case without the look over the box at the end, whose syntheses are not a surrogate's."""
+    """The case without the global check at the end, whose syntheses are not a surrogate's."""
     case = folder / "without_look.toml"
     case.write_text(TWO_MASS.read_text() + "\n[outer]\nbox_points = 0\n")
     return case

@@ -12,11 +12,13 @@ from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
 from ccd_casadi.inner_problem.sections_plant_set import structure_of
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.support.errors import UserError
@@ -35,9 +37,9 @@ def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
                          mode_shift=0.02, damping=(0.5, 2.0))  # fmt: skip
     K = built.controller(built.DESIGN)
     for _, point in box.corners()[1:]:
-        loop = sensitivity_loop(
-            sampled_plant(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K
-        )
+        loop = closed_loop(
+            sampled(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K
+        ).S
         figures = sampled_figures(loop)
         assert figures.stable
         assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-4)

@@ -14,12 +14,13 @@ from helpers import HZ, SUSPENSION, random_plant, scaled
 from scipy.integrate import trapezoid
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
+from ccd_casadi.drawing.paint import painted
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
-from ccd_casadi.reporting.robustness_page import _bandwidth_lost, conclusion, robustness_html
+from ccd_casadi.reporting.robustness_page import _bandwidth_lost, conclusion, robustness_page
 from ccd_casadi.robust.demands import Demands
 from ccd_casadi.robust.hardware import tolerances
 from ccd_casadi.robust.margins import margins
@@ -280,7 +281,7 @@ def test_a_structured_bound_that_takes_too_long_is_said_not_to_be_there(run: Fin
     assert study_dict(run, found)["structured"] is None
     assert study_dict(run, found)["structured_not_computed_within_s"] == 1e-4
     assert any("not computed within 0.0001 s" in words for words in conclusion(run, found))
-    assert "Not computed within 0.0001 s" in robustness_html(run, found, 0)
+    assert "Not computed within 0.0001 s" in painted(robustness_page(run, found, 0))
 
 
 def test_in_a_process_of_its_own_the_structured_bound_is_the_same(run: FinishedRun) -> None:

@@ -15,10 +15,10 @@ import pytest
 from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
 from ccd_casadi.case_studies.rib_stage.drawing import TALLER, draw_stages, drawing
 from ccd_casadi.case_studies.rib_stage.geometry import LOWER, UPPER, mass
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
-from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
-from ccd_casadi.reporting.page import Section, page
-from ccd_casadi.reporting.turntable import (
+from ccd_casadi.drawing.content import Block, Head, Page, Section, Words
+from ccd_casadi.drawing.paint import block_html, painted
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.turntable import (
     HEIGHT,
     MARGIN,
     REACH,
@@ -29,6 +29,7 @@ from ccd_casadi.reporting.turntable import (
     data,
     still,
 )
+from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
 
 Array = np.ndarray
 A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)
@@ -39,7 +40,11 @@ HOSTILE = '</text><script>alert(1)</script>"&'
 
 @cache
 def modes_figure() -> str:
-    return mode_shape_figure(mode_shapes(STAGE, A))
+    return block_html(mode_shape_figure(mode_shapes(STAGE, A)), "f")
+
+
+def page(*blocks: Block) -> str:
+    return painted(Page(Head("t", "good", "", "", "", ""), (Section("s", blocks),)))
 
 
 def svgs(html: str) -> list[ElementTree.Element]:
@@ -155,7 +160,7 @@ def test_corners_do_not_see_the_saddle() -> None:
 
 def test_lopsided_stage_has_pictures_without_symmetry() -> None:
     stage = RibStage(Geometry(point_masses=(PointMass(0.1, 0.12, 0.05),)), order=COARSE)
-    html = mode_shape_figure(mode_shapes(stage, A, 10))
+    html = block_html(mode_shape_figure(mode_shapes(stage, A, 10)), "f")
     found = re.findall(r"<p>(\d+): bending, ", html)
     assert found == [str(i) for i in range(1, 11)]
     assert "A1" not in html
@@ -192,9 +197,10 @@ def test_data_cannot_end_its_script_element() -> None:
 
 
 def test_page_allows_this_script_and_nothing_else() -> None:
-    plain = page("t", [Section("s", "<p>x</p>")])
+    plain = page(Words("x"))
     assert "script" not in plain
-    text = page("t", [Section("s", modes_figure() + modes_figure())])
+    figure = mode_shape_figure(mode_shapes(STAGE, A))
+    text = page(figure, figure)
     scripts = re.findall(r"<script>(.*?)</script>", text, flags=re.DOTALL)
     assert len(scripts) == 1
     digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()

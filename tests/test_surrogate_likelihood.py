@@ -10,13 +10,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 from surrogate_draws import BOX, KERNELS, drawn, few, seeds, smooth
 
-from surrogates import (
-    Hyperparameters,
-    Kernel,
-    design,
-    fit,
-    loo_errors,
-)
+from surrogates import Hyperparameters, Kernel, design, fit, loo_errors
 from surrogates.covariance import covariance, observed_covariance, radial
 from surrogates.likelihood import log_likelihood
 

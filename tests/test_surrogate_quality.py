@@ -12,12 +12,18 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.gaussian_processes import best_left_out, kernels_of
+from ccd_casadi.codesign.gaussian_processes import (
+    best_left_out,
+    kernels_of,
+    quality_dict,
+    recommendation,
+    surrogate_quality,
+)
 from ccd_casadi.codesign.lifted import fit_quantities, update_quantities
 from ccd_casadi.codesign.stored import stored_designs
-from ccd_casadi.codesign.surrogate_quality import quality_dict, recommendation, surrogate_quality
+from ccd_casadi.drawing.paint import block_html
 from ccd_casadi.inner_problem.figure import BANDWIDTH
-from ccd_casadi.reporting.trust import caption_trust, figure_trust, table_trust
+from ccd_casadi.reporting.trust import table_trust, trust_figure
 from ccd_casadi.sampling.samples import quantity_sample
 from ccd_casadi.sampling.store import SampleStore
 from surrogates import GaussianProcess, Roughness, design, errors, fit
@@ -116,10 +122,10 @@ def test_nothing_is_said_of_no_surrogate() -> None:
 
 def test_the_figure_shows_every_sample_and_the_bands() -> None:
     qualities = surrogate_quality([process(5.0)], at(*[60.0, 60.0]))
-    svg = figure_trust(qualities)
+    svg = block_html(trust_figure(qualities), "trust")
     assert "predicted (Hz)" in svg
-    assert svg.count("95 % band") == 2
-    assert f"{100 * qualities[0].coverage:.0f} % within" in caption_trust(qualities)
+    assert svg.count(">95 % band<") == 2
+    assert f"{100 * qualities[0].coverage:.0f} % within" in svg
 
 
 def test_a_run_holds_its_quality(two_mass_run: Path) -> None:

@@ -11,17 +11,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ccd_casadi.codesign.loops_off_model import Controller, LoopsOffModel, loops_off_model
-from ccd_casadi.codesign.reach import reach
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
-from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, survival
+from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
 from ccd_casadi.codesign.verdict import State, survives
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-)
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.robust_set import RobustSet
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
@@ -199,7 +196,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
         B, C = np.vstack([empty, modal.B]), np.hstack([modal.C, empty.T])
         G = StateSpace(A, B, C, np.zeros((1, 1)))
         figures = sampled_figures(
-            sensitivity_loop(sampled_plant(G, sampling.period, sampling.delay), K)
+            closed_loop(sampled(G, sampling.period, sampling.delay), K).S
         )
         return figures.stable, figures.sensitivity_peak
 

@@ -8,7 +8,7 @@ from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccd_casadi.optim.quasi_newton import damped_bfgs, symmetric_rank_one
+from ccd_casadi.optim.quadratic import damped_bfgs, symmetric_rank_one
 from ccd_casadi.optim.trust_region import End, Iterate, Model, Radius, Rows, Step, minimise
 from ccd_casadi.support.arrays import Array
 

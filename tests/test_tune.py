@@ -2,11 +2,13 @@
 
 import json
 import subprocess
+import sys
 from pathlib import Path
 
 import control
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.signal import cont2discrete
 from test_measured import two_by_two
 
@@ -55,13 +57,15 @@ def test_models_are_tuned_and_judged_apart(plant: object, rate: float, delay: in
         assert norm == pytest.approx(S, rel=1e-3)
 
 
-def test_every_form_of_a_plant_is_the_same_plant() -> None:
-    """A state space, a sampled one and its response: one bandwidth."""
+def test_every_form_of_a_plant_is_the_same_plant(tmp_path: Path) -> None:
+    """A state space, a sampled one, its response and its matrices in a file: one bandwidth."""
     sampled = control.sample_system(control.ss(LAGS), 0.1)
     omega = np.geomspace(1e-2, 0.98 * np.pi / 0.1, 400)
     lines = control.FRD(sampled(np.exp(0.1j * omega)), omega)
     plants = (LAGS, control.ss(LAGS), sampled, lines)
     found = [ccd.tune(plant, rate_hz=10.0, starts=4).design for plant in plants]
+    savemat(tmp_path / "plant.mat", {part: getattr(control.ss(LAGS), part) for part in "ABCD"})
+    found.append(ccd.tune(tmp_path / "plant.mat", rate_hz=10.0, starts=4).design)
     assert all(design.usable for design in found)
     np.testing.assert_allclose([d.bandwidth / found[0].bandwidth for d in found], 1.0, rtol=1e-2)
 
@@ -119,9 +123,10 @@ def written(path: Path, found: MeasuredResponse) -> str:
 
 
 def test_the_command_writes_what_can_be_built(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two channels, a set of two; the C code gives what its own test expects."""
+    """Two channels, a set of two; the C code gives what its own test expects; no slycot."""
+    monkeypatch.setitem(sys.modules, "slycot", None)
     files = [written(tmp_path / f"{i}.npz", two_by_two(g)) for i, g in enumerate((1.0, 1.2))]
     out = tmp_path / "out"
     words = ["--rate", "1000", "--biquads", "0", "--lead", "0", "--out", str(out), "--workers", "1"]

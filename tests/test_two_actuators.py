@@ -11,14 +11,13 @@ from fixed_structure_channels import BOUNDS, FAST, assert_derivatives, plant
 from scipy.signal import cont2discrete
 
 from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
-from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
 from ccd_casadi.fixed_structure.certificate import certify
 from ccd_casadi.fixed_structure.composite import composite_problem
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
-from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
 from ccd_casadi.support.errors import PlantError

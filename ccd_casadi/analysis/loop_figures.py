@@ -210,7 +210,9 @@ def loop_lines(result: Mapping[str, Any]) -> list[str]:
         return []
 
     def shown(value: float | None, unit: str) -> str:
-        return "unlimited" if value is None else f"{value:.3g}{unit}"
+        if value is None:
+            return "unlimited"
+        return f"{value:.0f}{unit}" if value >= 1e3 else f"{value:.3g}{unit}"
 
     r = result
     lines = [

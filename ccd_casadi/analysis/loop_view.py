@@ -7,9 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import largest, responses_of
-from ccd_casadi.lti.grid import around, frequency_grid, light
+from ccd_casadi.lti.grid import around, climbed, frequency_grid, light, local_maxima
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.peaks import climbed, local_maxima
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -149,3 +148,9 @@ def _unit(loop: Loop) -> float:
 def _hz(roots: np.ndarray) -> tuple[float, ...]:
     """Frequencies in Hz of lightly damped pairs, ascending."""
     return tuple(float(value) for value in np.abs(light(roots)) / HZ)
+
+
+def phase_deg(response: np.ndarray) -> Array:
+    """Without jumps along the first axis, from within ±180° on."""
+    phase = np.degrees(np.unwrap(np.angle(response), axis=0))
+    return phase - 360.0 * np.round(phase[0] / 360.0)

@@ -14,11 +14,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.budget.evaluation import is_stable
-from ccd_casadi.budget.frequency import (
-    integrated,
-    responses,
-    sampled_plant,
-)
+from ccd_casadi.budget.frequency import integrated, responses, sampled_plant
 from ccd_casadi.budget.loops import Disturbed, Process, closed, disturbed
 from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope

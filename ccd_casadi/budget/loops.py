@@ -14,14 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from ccd_casadi.budget.holding import (
-    Matrix,
-    held,
-    noise_of_a_period,
-    over,
-    stacked,
-    tustin_change,
-)
+from ccd_casadi.budget.holding import Matrix, held, noise_of_a_period, over, stacked, tustin_change
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.lti.closed_loop import closed_matrix
 from ccd_casadi.lti.hold import Sampling, tustin

@@ -4,8 +4,10 @@ to give instead. Each carries what JSON Schema can say of the same, for editors 
 import difflib
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from typing import Any
+
+LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
 
 
 @dataclass(frozen=True)
@@ -22,9 +24,6 @@ class Check:
 
 def _with(schema: Mapping[str, Any]) -> Callable[[Callable[[Any], str | None]], Check]:
     return lambda test: Check(test, schema)
-
-
-LARGEST, SMALLEST = 1e30, 1e-30  # beyond them squares and products leave double precision
 
 
 def _list(items: Mapping[str, Any], least: int = 0, most: int | None = None) -> dict[str, Any]:
@@ -208,3 +207,11 @@ def closest(name: str, known: Collection[str]) -> str:
     """The end of a message: the known name nearest to a mistyped one, else all of them."""
     near = difflib.get_close_matches(name, known, 1)
     return f"; did you mean {near[0]}?" if near else f"; known are {', '.join(known)}"
+
+
+def key(check: Check, default: Any = MISSING, *, says: str, unit: str = "") -> Any:
+    """The field of a section's dataclass that a key is."""
+    metadata = {"check": check, "says": says, "unit": unit}
+    if default is MISSING:
+        return field(metadata=metadata)
+    return field(default=default, metadata=metadata)

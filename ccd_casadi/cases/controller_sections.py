@@ -3,8 +3,17 @@
 import math
 from dataclasses import dataclass
 
-from ccd_casadi.cases.checks import POSITIVE, choice, count, direction, flag, number, table, text
-from ccd_casadi.cases.keys import key
+from ccd_casadi.cases.checks import (
+    POSITIVE,
+    choice,
+    count,
+    direction,
+    flag,
+    key,
+    number,
+    table,
+    text,
+)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,15 @@ from itertools import product
 
 import numpy as np
 
-from ccd_casadi.cases.findings import Finding, Severity, Topic
-from ccd_casadi.cases.unit_findings import entry_findings, unit_findings
-from ccd_casadi.cases.zero_findings import most_limiting, zero_findings
+from ccd_casadi.cases.findings import (
+    Finding,
+    Severity,
+    Topic,
+    entry_findings,
+    most_limiting,
+    unit_findings,
+    zero_findings,
+)
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.facts import PlantFacts, facts_of
 from ccd_casadi.plants.modal import ModalPlant, Suspension, modal_plant, require_damping
@@ -79,33 +85,33 @@ def _diagnosed(
     if findings:
         return (), tuple(findings)
     points = points_to_check(problem, seed)
-    progress = Progress(len(points), "looking at the plant", quiet=quiet.yes)
-    for index, theta in enumerate(points):
-        progress.advance(int(index > 0))
-        place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
-        try:
-            system = mechanics(plant, theta, derivatives=index == 0)
-            modal = modal_plant(system, problem.suspension)
-            require_damping(modal)
-            scaled = scale_plant(modal, problem.weights.M_K)
-            free = scale_plant(modal_plant(system, Suspension(0.0, 0.0)), problem.weights.M_K)
-        except PlantError as error:
-            words = str(error) if "at theta" in str(error) else f"{error} {place}"
-            findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
-            continue
-        found = facts_of(theta, modal, scaled, free)
-        doubt = plant.doubt(theta) if index < CHECKED else ""
-        if doubt:
-            findings.append(Finding(Severity.ERROR, Topic.DERIVATIVES, doubt, index))
-        findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
-        findings += _hidden(modal, index, place)
-        findings += zero_findings(found, problem.inner.S_max, index, place)
-        if index == 0:
-            findings += unit_findings(problem, found, scaled)
-            findings += entry_findings(problem, system)
-        facts.append(found)
+    with Progress(len(points), "checking the plant", quiet=quiet.yes) as progress:
+        for index, theta in enumerate(points):
+            progress.advance(int(index > 0))
+            place = f"at theta = {theta_words(plant, theta)}" if index else "at the start"
+            try:
+                system = mechanics(plant, theta, derivatives=index == 0)
+                modal = modal_plant(system, problem.suspension)
+                require_damping(modal)
+                scaled = scale_plant(modal, problem.weights.M_K)
+                free = scale_plant(modal_plant(system, Suspension(0.0, 0.0)), problem.weights.M_K)
+            except PlantError as error:
+                words = str(error) if "at theta" in str(error) else f"{error} {place}"
+                findings.append(Finding(Severity.ERROR, Topic.MATRICES, words, index))
+                continue
+            found = facts_of(theta, modal, scaled, free)
+            doubt = plant.doubt(theta) if index < CHECKED else ""
+            if doubt:
+                findings.append(Finding(Severity.ERROR, Topic.DERIVATIVES, doubt, index))
+            findings += _rigid(found, modal, problem.suspension, rigid_modes, index, place)
+            findings += _hidden(modal, index, place)
+            findings += zero_findings(found, problem.inner.S_max, index, place)
+            if index == 0:
+                findings += unit_findings(problem, found, scaled)
+                findings += entry_findings(problem, system)
+            facts.append(found)
+        progress.advance()
     findings = most_limiting(findings)
-    progress.advance()
     counts = sorted({sum(mode.rigid for mode in item.modes) for item in facts})
     if len(counts) > 1 and rigid_modes is None:
         words = (

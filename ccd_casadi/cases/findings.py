@@ -1,7 +1,33 @@
-"""What is told of a plant before anything is designed for it: severity, topic, one sentence."""
+"""What is told of a plant before anything is designed for it: severity, topic, one sentence.
 
+What its transmission zeros say about the bandwidth, and numbers that look like those of another
+unit: M_K, stiffness, S_max, told by name. For these frequencies are compared that a consistent case
+has close together: where the plant falls through 1/M_K, its first resonance, and where [inner]
+looks.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+
+import numpy as np
+
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.plants.facts import PlantFacts, Zero
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
+from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.support.units import HZ
+
+LIGHT = 0.3  # damping ratio below which a zero is a dip in the frequency response
+LIMIT = "no bandwidth above "
+FAR = 3.0  # how far outside the frequencies that [inner] searches effort may end
+DECIBEL = 3.0  # from here on a peak of S is more likely one in dB
+# in SI, by how a person writes them
+MASS = {"t": 1e3, "kg": 1.0, "g": 1e-3, "mg": 1e-6}
+STIFFNESS = {"MN/m": 1e6, "kN/mm": 1e6, "N/um": 1e6, "N/µm": 1e6, "kN/m": 1e3, "N/mm": 1e3,
+             "N/m": 1.0}  # fmt: skip
+SI = "all values are taken in SI (kg, N/m, m; 1 N/um is 1e6 N/m, 1 N/mm is 1e3 N/m)"
 
 
 class Severity(StrEnum):
@@ -32,3 +58,151 @@ class Finding:
     topic: Topic
     words: str
     index: int
+
+
+def zero_findings(facts: PlantFacts, S_max: float, index: int, place: str) -> list[Finding]:
+    """The right half-plane zero that limits most, and the dips; `place` names the θ."""
+    found = []
+    right = [zero for zero in facts.zeros if zero.damping_ratio < -1e-9]
+    true = [zero for zero in right if not zero.artefact]
+    if true:
+        found.append(_right(min(true, key=lambda z: z.frequency_hz), facts, S_max, index, place))
+    elif right:
+        z = right[0].frequency_hz
+        words = (
+            f"a transmission zero in the right half-plane at {z:.4g} Hz {place} is the "
+            "suspension's: without it the plant has none there; a softer suspension "
+            "(suspension.frequency_hz) moves it away"
+        )
+        found.append(Finding(Severity.NOTE, Topic.ZERO, words, index))
+    for zero in facts.zeros:
+        if -1e-9 <= zero.damping_ratio < LIGHT:
+            found.append(_dip(zero, index))
+    return found
+
+
+def _right(zero: Zero, facts: PlantFacts, S_max: float, index: int, place: str) -> Finding:
+    z, limit = zero.frequency_hz, bandwidth_limit_hz(zero, S_max)
+    words = (
+        f"a transmission zero in the right half-plane at {z:.4g} Hz {place}: with a peak of S of "
+        f"{S_max:g} {LIMIT}{limit:.3g} Hz is possible there (Poisson integral), and well before "
+        f"it, from about {0.5 * z:.3g} Hz on, robustness is lost; move sensor and actuator closer "
+        "together"
+    )
+    severe = z < 2.0 * facts.effort_hz
+    return Finding(Severity.WARNING if severe else Severity.NOTE, Topic.ZERO, words, index)
+
+
+def _dip(zero: Zero, index: int) -> Finding:
+    z = zero.frequency_hz
+    words = (
+        f"a transmission zero at {z:.4g} Hz, damping {100 * zero.damping_ratio:.2g} %: the "
+        f"plant's gain falls to {100 * zero.dip:.2g} % of its surroundings, and so much "
+        f"more force is needed there; |S| returns to about 1, so ω_b stays below {z:.4g} "
+        "Hz unless M_K pays for it"
+    )
+    return Finding(Severity.NOTE, Topic.ZERO, words, index)
+
+
+def most_limiting(findings: Sequence[Finding]) -> list[Finding]:
+    """All findings, of the right half-plane warnings only that with the lowest limit."""
+    severe = [f for f in findings if f.severity is Severity.WARNING and LIMIT in f.words]
+    if not severe:
+        return list(findings)
+    worst = min(severe, key=lambda f: float(f.words.split(LIMIT)[1].split()[0]))
+    return [f for f in findings if f is worst or f not in severe]
+
+
+def unit_findings(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[Finding]:
+    """Warnings about M_K, the resonances and S_max, from the plant at the start."""
+    words = [
+        *_effort(problem, facts, plant),
+        *_resonances(problem, facts),
+        *peak_words(problem.inner.S_max),
+    ]
+    return [Finding(Severity.WARNING, Topic.UNITS, item, 0) for item in words]
+
+
+def entry_findings(problem: CoDesignProblem, system: Mechanics) -> list[Finding]:
+    """Warnings of a θ in a unit of mass or stiffness that stands in the matrix in that unit.
+
+    The entries' slopes tell: of a mass in g that is told in kg they are 0.001.
+    """
+    found = []
+    for key, units, slopes in (
+        ("mass", MASS, system.derivatives[0]),
+        ("stiffness", STIFFNESS, system.derivatives[2]),
+    ):
+        for name, unit, slope in zip(problem.names, problem.units, slopes, strict=True):
+            entries = np.abs(slope[np.abs(slope) > 1e-6 * np.abs(slope).max(initial=0.0)])
+            if unit not in units or not entries.size:
+                continue
+            powers = np.log10(entries / units[unit]) / 3.0
+            times = round(float(powers[0]))
+            if times == 0 or not np.allclose(powers, times, atol=1e-4):
+                continue
+            words = (
+                f"theta.{name} is in {unit}, and {key} grows by {entries[0]:.4g} with each, where "
+                f"{units[unit]:g} is meant: is the matrix in another unit? {SI}"
+            )
+            found.append(Finding(Severity.WARNING, Topic.UNITS, words, 0))
+    return found
+
+
+def _searched(problem: CoDesignProblem) -> tuple[float, float]:
+    """From where to where, in Hz, a bandwidth can be meant."""
+    inner = problem.inner
+    low = max(inner.omega_low, min(inner.omega_S[0], inner.omega_T[0]) / 4.0)
+    return low / HZ, max(inner.omega_S[1], inner.omega_T[1]) / HZ
+
+
+def _effort(problem: CoDesignProblem, facts: PlantFacts, plant: ScaledPlant) -> list[str]:
+    low, high = _searched(problem)
+    M_K, effort = problem.weights.M_K, facts.effort_hz
+    if np.isfinite(effort) and low / FAR <= effort <= FAR * high:
+        return []
+    first = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
+    aim = float(np.clip(first[0] / 3.0 if first else np.sqrt(low * high), low, high))
+    gain = float(np.exp(np.interp(
+        np.log(aim * HZ / plant.omega_0), np.log(plant.grid), np.log(np.maximum(plant.gain, 1e-300))
+    )))  # fmt: skip
+    where = (
+        f"the plant's gain falls through 1/M_K at {effort:.3g} Hz"
+        if np.isfinite(effort)
+        else "the plant's gain falls through 1/M_K nowhere"
+    )
+    side = "small" if gain < 1.0 else "large"
+    return [
+        f"weights.M_K = {M_K:.3g} looks {max(gain, 1.0 / gain):.1g} times too {side}: {where}, "
+        f"and [inner] searches {low:.3g} to {high:.3g} Hz; {M_K / gain:.2g} would suit a bandwidth "
+        f"of {aim:.3g} Hz. Check the units of M_K (force over displacement) and of mass and "
+        f"stiffness: {SI}"
+    ]
+
+
+def _resonances(problem: CoDesignProblem, facts: PlantFacts) -> list[str]:
+    low, high = _searched(problem)
+    flexible = [mode.frequency_hz for mode in facts.modes if not mode.rigid]
+    if not flexible or not any(mode.rigid for mode in facts.modes):
+        return []
+    if flexible[-1] < low:
+        side = f"all resonances lie below {flexible[-1]:.3g} Hz"
+    elif flexible[0] > 100.0 * high:
+        side = f"the first resonance is at {flexible[0]:.3g} Hz"
+    else:
+        return []
+    return [
+        f"{side}, and [inner] searches {low:.3g} to {high:.3g} Hz: is the stiffness in another "
+        f"unit? {SI}"
+    ]
+
+
+def peak_words(S_max: float) -> list[str]:
+    """Whether S_max looks like one in dB."""
+    if S_max <= DECIBEL:
+        return []
+    factor = 10.0 ** (S_max / 20.0)
+    return [
+        f"inner.S_max = {S_max:g} is a factor: was {S_max:g} dB meant? Then write {factor:.4g}; "
+        "loops on hardware have 1.4 to 2"
+    ]

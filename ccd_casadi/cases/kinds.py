@@ -10,11 +10,7 @@ from ccd_casadi.budget import Kind
 from ccd_casadi.cases.controller_sections import ChannelSection, ControllerSection, LoopSection
 from ccd_casadi.cases.sections import Case, InnerSection, RobustSection, WeightsSection
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
-from ccd_casadi.inner_problem.sections_problem import (
-    ChannelProblem,
-    SectionsProblem,
-    Uncertainty,
-)
+from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem, Uncertainty
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.weights import Weights
 

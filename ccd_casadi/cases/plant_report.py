@@ -33,6 +33,7 @@ def plant_report(
         "outputs": plant.outputs,
         "notes": list(plant.notes(problem.start)),
         "theta": dict(zip(problem.names, problem.start, strict=True)),
+        "units": {parameter.name: parameter.unit for parameter in case.theta},
         "points": len(facts),
         "size": size_words(start),
         "inertia": start.inertia,

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, count, steps
-from ccd_casadi.cases.keys import key
+from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, count, key, steps
 
 
 @dataclass(frozen=True)

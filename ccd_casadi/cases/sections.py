@@ -18,6 +18,7 @@ from ccd_casadi.cases.checks import (
     factors,
     files,
     interval,
+    key,
     number,
     points,
     signed,
@@ -25,7 +26,6 @@ from ccd_casadi.cases.checks import (
     text,
 )
 from ccd_casadi.cases.controller_sections import ControllerSection, LoopSection
-from ccd_casadi.cases.keys import key
 from ccd_casadi.cases.run_sections import (
     BaselineSection,
     LimitsSection,

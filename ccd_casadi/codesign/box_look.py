@@ -86,7 +86,7 @@ def look_over_box(
     if len(ends) and processes:
         ends = ends[_optimistic_objective(problem, processes, ends) < best]
     if len(ends) and np.isfinite(best) and 2 * len(ends) <= points:
-        found = outer.sampler.bandwidths(ends, "looking at the ends of each parameter")
+        found = outer.sampler.bandwidths(ends, "search from the ends of each parameter")
         least = np.inf if outer.look_is_cheap else best
         solve_from([sample for sample in found if objective_of(problem, sample) < least])
     return BoxLook(
@@ -148,7 +148,7 @@ def _spread(
             hopes = _optimistic_objective(sampler.problem, processes, np.array(more))
             order = np.argsort(hopes)
             keep = [int(i) for k, i in enumerate(order) if k < CHECKED or hopes[i] < J]
-            first = sampler.bandwidths(np.array([more[i] for i in keep]), "looking over the box")
+            first = sampler.bandwidths(np.array([more[i] for i in keep]), "global check")
             refuted = any(
                 sample.feasible
                 and objective(sampler.problem, sample.theta, sample.value) < hopes[i]
@@ -158,7 +158,7 @@ def _spread(
             solve = [more[i] for i in range(len(more)) if i not in keep] if refuted else []
             passed_over = len(more) - len(keep) - len(solve)
         if solve:
-            known = [*known, *sampler.bandwidths(np.array(solve), "looking over the box")]
+            known = [*known, *sampler.bandwidths(np.array(solve), "global check")]
     return known, passed_over
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ccd_casadi.budget import BudgetFigures, SourceFigures
-from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 

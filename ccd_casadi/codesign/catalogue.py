@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.design_plants import order
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.spent import spent_entry, was_moved

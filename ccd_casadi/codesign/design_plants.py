@@ -15,7 +15,7 @@ import numpy as np
 
 from ccd_casadi.codesign.direct import acceptable, polish
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.problem import CoDesignProblem, design_choices, plant_of
 from ccd_casadi.inner_problem.sweep import LABELS, missed_by

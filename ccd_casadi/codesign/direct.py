@@ -9,8 +9,7 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate
-from ccd_casadi.codesign.newton import newton_step
+from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate, newton_step
 from ccd_casadi.codesign.outer_problem import (
     LocalOptimum,
     OuterFailure,

@@ -23,7 +23,10 @@ def formulation_of(case: Case, name: str) -> Formulation:
 
 def usual_name(case: Case, parameters: int) -> str:
     """The formulation where the user names none: nested, or direct where nested has no end."""
-    return "direct" if slow_words(formulation_of(case, "nested"), parameters) else "nested"
+    listed = any(len(one.values) > 1 for one in case.theta)
+    sampled_anew = listed and case.controller.structure == "sections"
+    slow = sampled_anew or slow_words(formulation_of(case, "nested"), parameters)
+    return "direct" if slow else "nested"
 
 
 def slow_words(formulation: Formulation, parameters: int) -> str:

@@ -13,20 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.codesign.kkt import lagrangian_parts
+from ccd_casadi.codesign.kkt import INSIDE, lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, SAME_PEAK, other_peaks
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.optim.quasi_newton import damped_bfgs
+from ccd_casadi.optim.quadratic import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, minimise
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 BAND = 0.25  # ln: peaks this close to their bound are constraints of a step
-INSIDE = 2e-9  # ln: what a step aims inside S_max and S_low, so that its end is feasible as given
 FIRST, LARGEST, LEAST = 0.1, 0.4, 1e-9  # of the box: radii of the trust region
 SETTLED = 1e-9  # of J: a model that promises less has nothing left to give
 SHELF = 10.0  # ln per (share of the box)²: how far a first step stays from where ω_b jumps

@@ -81,6 +81,15 @@ def solve_nested(
     def value_of(sample: BandwidthSample) -> float:
         return objective(problem, sample.theta, sample.value)
 
+    def refine(number: int) -> None:
+        """True inner problems spread over the region around the best θ."""
+        low, high = _region(problem, _best(problem, samples), radius)
+        new = design("lhs", low, high, 2 * len(lower) + 1, seed + number)
+        with sampler.spent.on("rounds"):
+            samples.extend(
+                sampler.bandwidths(_allowed(problem, new), f"refining round {number + 1}")
+            )
+
     radius, agreed = 1.0, False
     surrogate: GaussianProcess | None = None
     solution: OuterSolution | None = None
@@ -88,6 +97,10 @@ def solve_nested(
         best = _best(problem, samples)
         low, high = _region(problem, best, radius)
         local = _local(samples, low, high, upper - lower)
+        if len(local) == 1:  # a feasible sliver: what is fitted has to be found first
+            radius = max(0.4 * radius, 1e-3)
+            refine(round_number)
+            continue
         surrogate = fit_bandwidth(problem, local, seed, options.kernel, gradients)
         program = nested_program(problem, to_casadi(surrogate, std=False))
         program = replace(program, lower=low, upper=high)
@@ -114,16 +127,7 @@ def solve_nested(
             break
         if not agreed:
             radius = max(radius * (0.6 if improved else 0.4), 1e-3)
-            new = design(
-                "lhs",
-                *_region(problem, _best(problem, samples), radius),
-                2 * len(theta) + 1,
-                seed + round_number,
-            )
-            with sampler.spent.on("rounds"):
-                samples += sampler.bandwidths(
-                    _allowed(problem, new), f"refining round {round_number + 1}"
-                )
+            refine(round_number)
         elif not improved:
             radius *= 0.5
         elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
@@ -131,8 +135,8 @@ def solve_nested(
     best = _best(problem, samples)
     x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
     message = "" if agreed else "prediction and truth did not agree within the budget"
-    assert surrogate is not None
-    return FormulationResult(x, None, tuple(iterates), (surrogate,), solution, agreed, message)
+    surrogates = () if surrogate is None else (surrogate,)
+    return FormulationResult(x, None, tuple(iterates), surrogates, solution, agreed, message)
 
 
 def fit_bandwidth(

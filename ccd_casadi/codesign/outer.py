@@ -17,9 +17,8 @@ from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.front_learners import Learner
 from ccd_casadi.codesign.gaussian_processes import with_sample
 from ccd_casadi.codesign.post_optimal import PostOptimal
-from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.sampler import Sampler

@@ -12,7 +12,6 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.closer_models import check_references
 from ccd_casadi.codesign.design_plants import failure_words
 from ccd_casadi.codesign.direct import (
     Direct,
@@ -32,10 +31,10 @@ from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
-from ccd_casadi.codesign.robust_check import check_robust, other_damping, survived
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
 from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.objective import objective
@@ -107,7 +106,7 @@ class MixedOuter(Outer):
         lower, upper = box(self.problem)
         points = design("sobol", lower, upper, 8, seed)
         with self.sampler.spent.on("rescue"):
-            samples = self.sampler.bandwidths(points, "looking for a feasible design")
+            samples = self.sampler.bandwidths(points, "search for a feasible design")
         feasible = [sample for sample in samples if sample.feasible]
         if not feasible:
             assert self.sampler.nearest is not None
@@ -121,10 +120,12 @@ class MixedOuter(Outer):
         problem, sampler, truth = self.problem, self.sampler, self.sampler.truth
         gap, made = np.inf, None
         for _ in range(POLISH_ROUNDS):
+            before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
                 x, made, _ = polish(sampler, x)
                 progress.advance()
+            sampler.report(before)
             at_bounds = _snapped(problem, x)
             if acceptable(problem, at_bounds, truth.at(at_bounds)):
                 x, made = at_bounds, truth.at(at_bounds)

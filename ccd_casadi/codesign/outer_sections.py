@@ -1,8 +1,8 @@
 """The outer problem with controllers of fixed structure, over θ alone.
 
 A formulation works on v(θ) of the problem's anchors and plant set, with envelope gradients. At its
-end a full race and a search for worse plants ask whether these were good enough at that θ; if not,
-what they find joins, and the outer problem is solved again.
+end a multi-start search and a search for worse plants ask whether these were good enough at that
+θ; if not, what they find joins, and the outer problem is solved again.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +13,8 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
+from ccd_casadi.codesign.costs import Costs, costs_of
 from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.full_order import Beside, full_order_beside
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal
@@ -23,8 +23,8 @@ from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
@@ -46,13 +46,13 @@ from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 
-BETTER = 1e-3  # relative: what a race at the end has to gain to be worth another round
+BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
 
 
 @dataclass(frozen=True)
 class SectionsEnd(End):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
-    a race there, the worst plant, and those to add."""
+    a multi-start search there, the worst plant, and those to add."""
 
     asked: Sampler
     best: BandwidthSample
@@ -63,7 +63,7 @@ class SectionsEnd(End):
 
 
 class SectionsOuter(ThetaOuter):
-    """See the module; `words` say why a race at the start found no anchors."""
+    """See the module; `words` say why the search at the start found no anchors."""
 
     kkt_level = VerifiedSections.kkt_level
 
@@ -72,7 +72,7 @@ class SectionsOuter(ThetaOuter):
         self.words = words
 
     def prepared(self, seed: int) -> "SectionsOuter":
-        """Raced at the start for anchors and the plant set, where there are none."""
+        """Searched at the start for anchors and the plant set, where there are none."""
         sampler = self.sampler
         if sections_of_problem(sampler.problem).anchors:
             return self
@@ -84,7 +84,7 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem), words if lost else "")
 
     def continued(self, folder: Path, seed: int) -> "SectionsOuter":
-        """With the anchors and the plant set of a run, or those of a race where it has none."""
+        """With the anchors and the plant set of a run, or those of a search where it has none."""
         path, sampler = folder / "result.json", self.sampler
         if not path.exists():
             return self.prepared(seed)
@@ -92,7 +92,7 @@ class SectionsOuter(ThetaOuter):
         return SectionsOuter(sampler.of(problem)).prepared(seed)
 
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """None: every θ has had its own race. Why, in words."""
+        """None: every θ has had its own multi-start search. Why, in words."""
         nearest = self.sampler.nearest
         words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
@@ -133,9 +133,10 @@ class SectionsOuter(ThetaOuter):
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
         drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
-        with Progress(1, "full order beside it", quiet=asked.quiet) as bar:
-            make = partial(full_order_beside, problem, best.theta, made)
-            beside = asked.kept("full order", best.theta, Beside, make)
+        with Progress(1, "what limits it", quiet=asked.quiet) as bar:
+            make = partial(costs_of, problem, best.theta, made.kappa)
+            costs = asked.kept("costs", best.theta, Costs, make)
+            gap = known_gap(problem, best.theta)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -156,8 +157,8 @@ class SectionsOuter(ThetaOuter):
             drawn=drawn,
             worst=worst,
             rounds=rounds,
-            beside=beside,
-            gap=known_gap(problem, best.theta),
+            costs=costs,
+            gap=gap,
         )
 
     def responses(self, x: Array) -> PostOptimal:

@@ -18,9 +18,8 @@ from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
 from ccd_casadi.codesign.post_optimal import PostOptimal
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.theta_direct import SETTLED, pieces_from, solve_direct_value
+from ccd_casadi.codesign.theta_direct import SETTLED, TrueBandwidth, pieces_from, solve_direct_value
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array

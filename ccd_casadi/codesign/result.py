@@ -7,8 +7,8 @@ from typing import Any
 
 from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
+from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
-from ccd_casadi.codesign.surrogate_quality import quality_dict
 from ccd_casadi.codesign.verdict import (
     Line,
     State,

@@ -19,9 +19,8 @@ from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.outer_sections import SectionsOuter
 from ccd_casadi.codesign.search import concluded, concluded_at, nothing_found, searched
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.codesign.verified import Solution, Verified
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem

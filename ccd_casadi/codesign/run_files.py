@@ -6,7 +6,7 @@ from pathlib import Path
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.lifted import OUTPUTS
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.support.json_files import write_json
 from surrogates import save
 from surrogates.files import write_whole

@@ -1,7 +1,7 @@
 """The outer problem from a formulation to a verified design, for every kind of controller.
 
 A formulation, a polish of its end on the truth and the whole inner problem there; where that finds
-better the search begins anew with it. Then a look over the box, and on from what is better.
+better the search begins anew with it. Then a global check over the box, and on from what is better.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from ccd_casadi.codesign.box_look import look_over_box, perturbed
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
+from ccd_casadi.codesign.gaussian_processes import surrogate_quality
 from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
-from ccd_casadi.codesign.solution import Solution
 from ccd_casadi.codesign.stored import Surrogates
-from ccd_casadi.codesign.surrogate_quality import surrogate_quality
+from ccd_casadi.codesign.verified import Solution
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
@@ -59,7 +59,7 @@ def searched(
 def _looked(
     found: Searched, formulation: Formulation, sampled: Sequence[tuple[float, ...]], seed: int
 ) -> Searched:
-    """After a look over the box, and a last try where the end is not stationary."""
+    """After the global check over the box, and a last try where the end is not stationary."""
     outer, outcome, end = found.outer, found.outcome, found.end
     assert end is not None
     with outer.sampler.spent.on("box_look"):
@@ -134,7 +134,7 @@ def concluded_at(
     outer: Outer, outcome: FormulationResult, formulation: str, tolerance: float, seed: int,
     began: float,
 ) -> Solution:  # fmt: skip
-    """An outcome polished and judged as it is, without a look over the box."""
+    """An outcome polished and judged as it is, without a global check over the box."""
     end = None if outcome.x is None else outer.ended(outcome.x)
     return concluded(Searched(outer, outcome, end, 1), formulation, tolerance, seed, began)
 

@@ -7,14 +7,12 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.codesign.design_entries import compliance_dict, controller_dict
-from ccd_casadi.codesign.full_order import Beside, FullOrder
 from ccd_casadi.fixed_structure import Bounds, Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.fixed_structure.box_proof import Proof
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
-from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ
 
 BINDS = {
@@ -158,28 +156,6 @@ def proof_dict(proof: Proof) -> dict[str, Any]:
             "passed": [BINDS[proof.passed[0]], proof.passed[1]],
         }
     return found
-
-
-def beside_dict(beside: Beside) -> dict[str, Any]:
-    """`full_order`: what mixed sensitivity reaches beside the sections, and the stacked norm."""
-
-    def one(found: FullOrder | None) -> dict[str, Any] | None:
-        if found is None:
-            return None
-        return {"bandwidth_hz": found.bandwidth / HZ} | {
-            key: value for key, value in vars(found).items() if key != "bandwidth"
-        }
-
-    return clean(
-        {
-            "on_model": one(beside.on_model),
-            "on_set": one(beside.on_set),
-            "sections_on_model_hz": beside.sections_on_model / HZ,
-            "sections_continuous_hz": beside.sections_continuous / HZ,
-            "stacked_norm": beside.stacked_norm,
-            "gamma_opt": beside.gamma_opt,
-        }
-    )
 
 
 def sections_controller(problem: CoDesignProblem, made: SectionsDesign) -> dict[str, Any]:

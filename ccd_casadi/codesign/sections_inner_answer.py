@@ -1,4 +1,4 @@
-"""The inner problem of a fixed structure at one θ: race, worst plants, judge and proof; as JSON."""
+"""A fixed structure's inner problem at one θ: search, worst plants, judge and proof; as JSON."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def sections_answer(
 ) -> InnerAnswer:
     """The largest bandwidth (or least error) of the structure at θ, judged over its box.
 
-    From the controller of the folder `options.begin_at` alone, where there is one, without a race.
+    From the controller of the folder `options.begin_at` alone, where there is one.
     """
     if options.point is not None:
         words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"

@@ -1,9 +1,9 @@
 """Searches over lists of values with a controller of fixed structure, each near another's end.
 
-The first is a whole one, with races. From then on a search begins at the nearest θ and controller
-that are known and takes local steps on the true function. Where these find nothing a whole one is
-made: a part is not empty for that. What is found so is good for its J; the best combination is then
-designed as any other case, from that controller.
+All take local steps on the true function. The first begins with a full multi-start search, every
+other one at the nearest θ and controller that are known; where that finds no design a few starts
+are tried at the θ themselves: a part is not empty for that. What is found so is good for its J; the
+best combination is then designed as any other case, from that controller.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,10 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_sections import SectionsEnd, SectionsOuter
-from ccd_casadi.codesign.search import searched
+from ccd_casadi.codesign.outer_sections import SectionsOuter
 from ccd_casadi.codesign.sections_polish import by_pieces
-from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
@@ -35,15 +34,16 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     plants_of,
     sections_of_problem,
     structure_of,
+    warm_starts,
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+from surrogates import design
 
 SETTLED = 1e-7  # of J: what local steps promise less than that is not looked for
 INSIDE = 1e-7  # of λ
@@ -67,31 +67,30 @@ class ListedSections:
         forbidden = unmet_constraint(problem, self.formulation.starts, self.seed)
         if forbidden:
             return _nothing(forbidden)
-        found = None if near is None else self._near(sampler, near)
-        return self._anew(sampler) if found is None else found
+        return self._anew(sampler) if near is None else self._near(sampler, near)
 
     def _anew(self, sampler: Sampler) -> Solution:
-        quick = replace(self.formulation, box_points=0)  # a bound needs no look at the box
-        first = searched(SectionsOuter(sampler), quick, self.seed)
-        if first.end is None:
-            return _nothing(first.outcome.message)
-        end = cast(SectionsEnd, first.end)
-        more = sections_of_problem(end.asked.problem).members
-        self.members = tuple(dict.fromkeys((*self.members, *more)))
-        return _found(end.asked.problem, end.best)
+        outer = SectionsOuter(sampler).prepared(self.seed)
+        self.members = sections_of_problem(outer.problem).members
+        found = _climbed(outer.sampler, np.array(sampler.problem.start))
+        for theta in design("sobol", *box(sampler.problem), self.formulation.starts, self.seed):
+            allowed = _allowed(sampler.problem, theta)
+            if not np.isfinite(found.result.get("objective", np.inf)) and allowed is not None:
+                found = _climbed(outer.sampler, allowed)
+        return found
 
-    def _near(self, sampler: Sampler, near: Solution) -> Solution | None:
-        """None where local steps from there find no design."""
+    def _near(self, sampler: Sampler, near: Solution) -> Solution:
         problem = sampler.problem
         known = _start(near)
         values = known.source.held | dict(zip(known.names, known.start, strict=True))
         theta = _allowed(problem, np.array([values[name] for name in problem.names]))
         if theta is None:
-            return None
-        truth = TrueBandwidth(sampler.of(carried(known, problem, self.members)), "near by")
-        truth, best = by_pieces(truth, truth.at(theta), SETTLED)
-        found = _found(truth.sampler.problem, best)
-        return found if np.isfinite(found.result.get("objective", np.inf)) else None
+            return _nothing("no theta within the constraints was found")
+        carried_on = carried(known, problem, self.members)
+        found = _climbed(sampler.of(with_sections(carried_on, starts=0)), theta)
+        if np.isfinite(found.result.get("objective", np.inf)):
+            return found
+        return _climbed(sampler.of(with_sections(carried_on, anchors=())), theta)
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
@@ -99,6 +98,13 @@ class ListedSections:
         if solution.verified is not None:
             self.members = sections_of_problem(solution.verified.problem).members
         return solution
+
+
+def _climbed(sampler: Sampler, theta: Array) -> Solution:
+    """From θ to the least J near by."""
+    truth = TrueBandwidth(sampler, "near by")
+    truth, best = by_pieces(truth, truth.at(theta), SETTLED)
+    return _found(truth.sampler.problem, best)
 
 
 def carried(

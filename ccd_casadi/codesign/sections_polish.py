@@ -1,14 +1,14 @@
 """A polish on the true value of a fixed structure: it passes kinks, and keeps its controller."""
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.sections_races import value_at
-from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, pieces_from
+from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.inner_problem.sections_bandwidth import joined
@@ -41,7 +41,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     if theta_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(sampler, best):
         return sampler, best
     program = nested_program(problem, truth)
-    program = type(program)(**{**vars(program), "exact_hessian": False})
+    program = replace(program, exact_hessian=False)
     with suppress(OuterFailure):  # what it has asked for on its way counts
         solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
     return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))

@@ -1,8 +1,8 @@
-"""The races of a co-design with a controller of fixed structure, kept in the store of samples.
+"""The multi-start searches of a co-design with a fixed structure, kept in the store of samples.
 
-At the start a race and a search for worst plants give the problem its anchors and members; at the
-end another asks whether they were good enough. A run that goes on from its store races neither
-again.
+At the start such a search and one for worst plants give the problem its anchors and members; at
+the end another asks whether they were good enough. A run that goes on from its store repeats
+neither.
 """
 
 import sys
@@ -27,11 +27,12 @@ from ccd_casadi.sampling.keys import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.terminal import say
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Anchors (κ in SI, rad/s) and members that a race at the start found; `words` why none."""
+    """Anchors (κ in SI, rad/s) and members that the search at the start found; `words` why none."""
 
     anchors: tuple[tuple[float, ...], ...]
     members: tuple[Member, ...]
@@ -58,7 +59,7 @@ def seeded_and_prepared(
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def found() -> Seeds:
-        tell = teller("race at the start", quiet)
+        tell = teller("search at the start", quiet)
         anchored, made = prepared(problem, tell, workers)
         anchored, made = least_from(anchored, problem.start, made, tell)
         own = sections_of_problem(anchored)
@@ -75,11 +76,11 @@ def seeded_and_prepared(
 
 
 def raced_at(sampler: Sampler, theta: tuple[float, ...]) -> SectionsValue:
-    """A full race at θ with all its optima, from the store where it was run before; counted."""
+    """A multi-start search at θ with all its optima, counted; from the store if it is there."""
     problem = sampler.problem
 
     def raced() -> SectionsValue:
-        made = race(problem, theta, teller("race at the end", sampler.quiet), sampler.workers)
+        made = race(problem, theta, teller("search at the end", sampler.quiet), sampler.workers)
         found = valued(problem, theta, plants_of(problem, theta), made, 1)
         return replace(found, design=replace(found.design, local_optima=made.local_optima))
 
@@ -99,6 +100,6 @@ def teller(label: str, quiet: bool) -> Callable[[str], None]:
     def tell(words: str) -> None:
         if not quiet:
             with suppress(OSError, ValueError):  # a stream that fails ends the printing
-                print(f"{label}: {words}", file=sys.stderr, flush=True)
+                say(f"{label}: {words}", sys.stderr)
 
     return tell

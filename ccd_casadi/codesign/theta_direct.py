@@ -1,21 +1,48 @@
-"""Local solves on the true v(θ): IPOPT, and steps that pass its kinks (`optim.pieces`)."""
+"""The true v(θ) and local solves on it: IPOPT, and steps that pass its kinks (`optim.pieces`)."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
-from ccd_casadi.codesign.true_value import TrueBandwidth
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.optim.pieces import Local, descend, jumps
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from surrogates import design
 
 PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
 SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
+
+
+class TrueBandwidth(VectorCallback):
+    """θ -> ω_b*(θ) in rad/s with its envelope gradient; NaN where no design is certified."""
+
+    def __init__(self, sampler: Sampler, label: str) -> None:
+        self.sampler, self.label = sampler, label
+        self.known: dict[bytes, BandwidthSample] = {}
+        count = len(sampler.problem.names)
+        super().__init__("true_bandwidth", count, 1, self._value, self._slope)
+
+    def at(self, theta: Array) -> BandwidthSample:
+        """The sample at θ; repeated points cost nothing."""
+        key = np.asarray(theta, float).tobytes()
+        if key not in self.known:
+            self.known[key] = self.sampler.bandwidths(theta, self.label)[0]
+        return self.known[key]
+
+    def _value(self, theta: Array) -> Array:
+        sample = self.at(theta)
+        stationary = np.isfinite(sample.gradient).all()
+        return np.array([sample.value if stationary else np.nan])
+
+    def _slope(self, theta: Array) -> Array:
+        return np.array(self.at(theta).gradient)[None, :]
 
 
 def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> FormulationResult:
@@ -31,7 +58,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
         message = f"none of {len(points)} starting designs is certified"
         return FormulationResult(None, None, (), (), None, False, message)
     program = nested_program(problem, truth)
-    program = type(program)(**{**vars(program), "exact_hessian": False})
+    program = replace(program, exact_hessian=False)
     try:
         solution = solve_program(program, np.array(good), tolerance=PRECISE, settled=SETTLED)
     except OuterFailure as error:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from ccd_casadi.codesign.true_value import TrueBandwidth
+from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.constraints import constraint_sizes
 from ccd_casadi.inner_problem.objective import hardware_at, objective, objective_gradient

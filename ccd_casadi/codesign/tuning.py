@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.io import whosmat
 
 from ccd_casadi.cases.measured_case import MeasuredCase
 from ccd_casadi.fixed_structure.bounds import Bounds
@@ -79,7 +80,8 @@ def tune(
                         |S(jω)| <= shape (ω/ω_b)/√2,   |KS| <= effort/|G| about ω_b
 
     `plants`: one or a list (a set, one controller for all): a file as `read_frequency_response`
-    takes it, a `MeasuredResponse`, or of python-control an FRD, a TransferFunction or a StateSpace.
+    takes it or a .mat file with A, B, C, D (and Ts), a `MeasuredResponse`, or of python-control an
+    FRD, a TransferFunction or a StateSpace.
     K runs at `rate_hz`: models, stable or not, are held, responses have the hold in them. `delay`
     (s) comes on top of both. `effort` keeps noise and lead in bounds. `structure`: by default with
     a biquad for each resonance, three at most.
@@ -130,7 +132,7 @@ def _plant(
 ) -> tuple[MeasuredResponse, StateSpace | None]:
     """The response as the controller sees it; of a model also itself in discrete time."""
     if isinstance(item, str | Path):
-        item = read_frequency_response(item)
+        item = _of_file(Path(item))
     elif hasattr(item, "frdata"):
         item = from_control(item)
     if isinstance(item, MeasuredResponse):
@@ -138,12 +140,15 @@ def _plant(
         lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
         G = (item.matrix * lag).reshape(item.G.shape)
         return replace(item, hz=item.hz[kept], G=G[kept]), None
-    system, own = interchange.from_control(item)
+    if isinstance(item, interchange.NamedSystem):
+        system, own = item.system, item.period
+    else:
+        system, own = interchange.from_control(item)
     if own and rate_hz is None:
         rate_hz = 1.0 / own
     if rate_hz is None:
-        words = "rate_hz is missing: without a rate no model limits the bandwidth of its controller"
-        raise UserError(f"{words}; give that of the controller, and its delay")
+        words = "rate_hz is missing: nothing else limits the bandwidth of a controller for a model"
+        raise UserError(f"{words}; give the controller's rate (--rate-hz) and its delay (--delay)")
     if system.D.any():
         raise UserError("the plant has feedthrough; give it the lag of its sensor or actuator")
     T = 1.0 / rate_hz
@@ -169,6 +174,21 @@ def _plant(
     one = G.shape[1:] == (1, 1)
     found = MeasuredResponse(omega / HZ, G[:, 0, 0] if one else G, unstable, modelled=True)
     return found, model
+
+
+def _of_file(path: Path) -> MeasuredResponse | interchange.NamedSystem:
+    """A measured response, or the one model of a .mat file."""
+    try:
+        variables = whosmat(path) if path.suffix.lower() == ".mat" else []
+    except Exception:  # a damaged file: what reads it says so
+        variables = []
+    names = {name for name, _, _ in variables}
+    if not ({"A", "B", "C"} <= names or any(kind == "struct" for _, _, kind in variables)):
+        return read_frequency_response(path)
+    systems = interchange.read_mat(path).systems
+    if len(systems) != 1:
+        raise UserError(f"{path}: holds the systems {', '.join(systems)}; save one plant a file")
+    return next(iter(systems.values()))
 
 
 def _peak(G: StateSpace, K: StateSpace | None) -> tuple[float, float]:

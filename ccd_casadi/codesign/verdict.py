@@ -166,13 +166,14 @@ def _sides(kink: Kink) -> str:
 def look_words(
     starts: int, optima: int, look: BoxLook | None, gap: str = "gap not known"
 ) -> tuple[str, dict[str, Any]]:
-    """What IPOPT's starts, the look over the box and bounds say, in words and figures."""
+    """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
     known = f"best of {_count(starts, 'start')}" if starts else ""
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
-        return ", ".join(part for part in (known, "no look at the box", gap) if part), figures
+        words = (known, "no global check over the box", gap)
+        return ", ".join(part for part in words if part), figures
     figures |= {
         "box_points": look.points,
         "box_solved": look.solved,
@@ -187,7 +188,7 @@ def look_words(
         how += f" ({look.solved} solved, the rest ruled out by the surrogates)"
     said = f"none better at {how}"
     if look.moved:
-        said = f"moved by a look at {how}: the formulation ended at J = {look.before:.6g}"
+        said = f"moved by the global check at {how}: the formulation ended at J = {look.before:.6g}"
     return ", ".join(part for part in (known, said, gap) if part), figures
 
 

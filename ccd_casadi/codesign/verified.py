@@ -2,7 +2,7 @@
 
 Each kind of controller says what only it knows (`figures`, `evidence`, some lines of the verdict);
 what the outer problem is judged by stands here, and results, verdicts and pages ask for nothing
-else.
+else. `Solution` is what a whole run leaves.
 """
 
 from abc import ABC, abstractmethod
@@ -20,6 +20,8 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.notebook import Shown
+from surrogates import Quality
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,3 +110,17 @@ class Verified(ABC):
         self, outcome: FormulationResult, look: BoxLook | None
     ) -> tuple[str, Mapping[str, Any]]:
         """Where something better was looked for and not found, in words and figures."""
+
+
+@dataclass(frozen=True)
+class Solution(Shown):
+    """Everything a run found: the JSON result, and the objects behind it (None: infeasible).
+
+    `problem` is the one solved: of a robust case that leaves its design plant open, the best one's.
+    """
+
+    result: dict[str, Any]
+    outcome: FormulationResult
+    verified: Verified | None
+    quality: tuple[Quality, ...] = ()
+    problem: CoDesignProblem | None = None

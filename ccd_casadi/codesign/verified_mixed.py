@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
 
-from ccd_casadi.codesign.closer_models import ReferenceCheck
 from ccd_casadi.codesign.design_entries import (
     compliance_dict,
     controller_dict,
@@ -13,7 +12,7 @@ from ccd_casadi.codesign.design_entries import (
     loop_of_design,
 )
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
-from ccd_casadi.codesign.robust_check import RobustCheck
+from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import CloserModel, Line, certified, look_words, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.lti.state_space import StateSpace

@@ -8,11 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
+from ccd_casadi.codesign.costs import Costs
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
-from ccd_casadi.codesign.full_order import Beside
 from ccd_casadi.codesign.sections_entries import (
     active_of,
-    beside_dict,
     design_dict,
     proof_dict,
     sections_controller,
@@ -30,6 +29,7 @@ from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ, counted
 
 
@@ -39,8 +39,8 @@ class VerifiedSections(Verified):
 
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
-    `worst` the worst plant that was found. `raced` is a full race at θ, and
-    `beside` what controllers of full order reach there; `gap`, of ω_b, what none reaches.
+    `worst` the worst plant that was found. `raced` is a multi-start search at θ,
+    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches.
     """
 
     design: SectionsDesign
@@ -51,7 +51,7 @@ class VerifiedSections(Verified):
     drawn: Yield | None
     worst: Excess
     rounds: int
-    beside: Beside
+    costs: Costs
     gap: Gap | None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
@@ -105,7 +105,7 @@ class VerifiedSections(Verified):
             "anchors": [list(kappa) for kappa in sections.anchors],
             "robust": self._robust_entry(),
             "proof": proof_dict(self.proof),
-            "full_order": beside_dict(self.beside),
+            "costs": clean({f"{name}_hz": w / HZ for name, w in vars(self.costs).items()}),
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
@@ -196,7 +196,8 @@ class VerifiedSections(Verified):
     def gap_words(self) -> str:
         figure = self.problem.figure
         here, there = figure.shown(self.value), figure.shown(self.raced.value)
-        return f"a race at this theta found a controller with {there} in place of {here}"
+        found = f"found a controller with {there} instead of {here}"
+        return f"a multi-start search at this theta {found}"
 
     def no_gradient_words(self) -> str:
         off = self.design.kkt_residual
@@ -214,5 +215,5 @@ class VerifiedSections(Verified):
         if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"
         raced = ", ".join(f"{value:.2f}" for value in found)
-        words = f"a full race at this theta ended at {raced} Hz{of}; {known}"
+        words = f"a multi-start search at this theta ended at {raced} Hz{of}; {known}"
         return words, {**figures, "local_optima_hz": found}

@@ -7,14 +7,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.channels import Channel, split
-from ccd_casadi.deployment.discretise import (
-    FASTEST,
-    Conversion,
-    Target,
-    loop_at,
-    needed_rate,
-    nice_rate,
-)
+from ccd_casadi.deployment.discretise import Conversion, Target, loop_at
 from ccd_casadi.deployment.judgement import SampledSet
 from ccd_casadi.deployment.outcome import (
     SAMPLED_BANDWIDTH,
@@ -23,17 +16,14 @@ from ccd_casadi.deployment.outcome import (
     Deployment,
     Trial,
 )
-from ccd_casadi.deployment.rate_choice import conversions_of
+from ccd_casadi.deployment.rate_choice import ChannelLoops, choose, conversions_of
 from ccd_casadi.deployment.reduction import Limits, Reduced, Reduction
 from ccd_casadi.deployment.robust_set import WorstFirst, section_members
-from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem, structure_of
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -52,59 +42,37 @@ def deploy_as_designed(
     Where the case gives no rate, the one that is needed is searched as for any controller.
     """
     inner, full, K = run.problem.inner, run.figures, run.controller
-    G, designed = run.plant.plant_si(), run.problem.sampling
+    designed = run.problem.sampling
     _require_own_bounds(run, designed, timing)
-    orders = _channels(run)
-    limits = Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth)
+    p, m = len(run.plant.C), run.plant.B.shape[1]
+    whole = Channel("all", np.eye(p), np.eye(m), run.plant, K)
+    family, dense = section_members(run), section_members(run, dense=True)
     tustin = Conversion(Discretisation.TUSTIN, False, full.sensitivity_peak_frequency)
+    trials: tuple[Trial, ...]
     if designed is None:
-        progress("rate")
-        bandwidth, conversions = full.bandwidth, conversions_of(timing, tustin.warp)
-        target = Target(inner.S_max, SAMPLED_EXCESS, bandwidth, SAMPLED_BANDWIDTH)
+        target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
+        loops, conversions = ChannelLoops([whole], [K], target), conversions_of(timing, tustin.warp)
+        remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
+        trials, best, rate = choose(run, timing, loops, family, conversions, progress,
+                                    remedy=remedy)  # fmt: skip
     else:
         # What was designed is the sampled loop: that is what a given rate or delay is held against.
-        conversions = [tustin]
-        own = loop_at(G, K, tustin, designed.period, designed.delay)
-        bandwidth = own.bandwidth
-        target = Target(inner.S_max, DESIGNED_EXCESS, bandwidth, SAMPLED_BANDWIDTH)
-        timing = replace(timing, rate_hz=timing.rate_hz or designed.rate_hz)
+        own = loop_at(run.plant.plant_si(), K, tustin, designed.period, designed.delay)
+        target = Target(inner.S_max, DESIGNED_EXCESS, own.bandwidth, SAMPLED_BANDWIDTH)
+        rate = timing.rate_hz or designed.rate_hz
         if timing.delay is None and timing.delay_samples == Timing.delay_samples:
             timing = replace(timing, delay=designed.delay)
-    trials = []
-    family, dense = section_members(run), section_members(run, dense=True)
-    for conversion in conversions:
-        progress(f"rate for {conversion.label}")
-        order = WorstFirst(family)
-
-        def met(
-            rate: float, conversion: Conversion = conversion, order: WorstFirst = order
-        ) -> bool:
-            def loop(plant: StateSpace) -> SampledFigures:
-                return loop_at(plant, K, conversion, 1.0 / rate, timing.delay_at(rate))
-
-            return target.met(loop(G)) and order.all(
-                lambda member: target.held(loop(member.plant.plant_si()))
-            )
-
-        if designed is None:
-            also = () if timing.rate_hz is None else (timing.rate_hz,)
-            trials.append(Trial(conversion, needed_rate(met, bandwidth / HZ, also)))
-        else:
-            given = timing.rate_hz or designed.rate_hz
-            trials.append(Trial(conversion, given if met(given) else designed.rate_hz))
-    best = min(trials, key=lambda t: float("inf") if t.needed_hz is None else t.needed_hz)
-    if timing.rate_hz is None and best.needed_hz is None:
-        words = f"no sampling rate up to {FASTEST * bandwidth / HZ:.3g} Hz keeps S_max to 5 %"
-        remedy = "shorten it, or design for it with loop.rate_hz and loop.delay_us in the case"
-        raise UserError(f"{run.folder}: {words} and omega_b to 3 % with this delay; {remedy}")
-    rate = timing.rate_hz or nice_rate(best.needed_hz or 0.0)
+        progress(f"rate for {tustin.label}")
+        met = ChannelLoops([whole], [K], target).met(tustin, rate, timing, WorstFirst(family))
+        best = Trial(tustin, rate if met else designed.rate_hz)
+        trials = (best,)
     plants = SampledSet(
-        run, dense, orders, best.conversion, rate, timing.delay_at(rate), saturation
+        run, dense, _channels(run), best.conversion, rate, timing.delay_at(rate), saturation
     )
     progress("simulation")
     return plants.deployment(
-        limits, K, full, trials, target, seed=seed,
-        compliance_max=sections_of_problem(run.problem).compliance_max,
+        Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth), K, full, trials, target,
+        seed=seed, compliance_max=sections_of_problem(run.problem).compliance_max,
     )  # fmt: skip
 
 

@@ -8,8 +8,7 @@ is not in it.
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import largest
-from ccd_casadi.lti.grid import frequency_grid
-from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.grid import climbed, frequency_grid, local_maxima
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
@@ -21,7 +20,7 @@ CLOSE = 0.1  # relative: local maxima this close to the largest are followed to 
 def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
     """max over ω of σ_max(S(e^{jωT}) G(jω)), m/N; the plant in SI without hold and delay.
 
-    S is stable (`sensitivity_loop`). Points on a logarithmic grid and at every resonance of plant
+    S is stable. Points on a logarithmic grid and at every resonance of plant
     and loop, the largest local maxima climbed.
     """
     end = np.pi / S.period

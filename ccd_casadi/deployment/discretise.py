@@ -6,14 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ccd_casadi.deployment.sampled import (
-    SampledFigures,
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-)
+from ccd_casadi.deployment.sampled import SampledFigures, sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
-from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
 
 SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
@@ -113,7 +109,7 @@ def loop_at(
     if not conversion.defined(period):
         return SampledFigures(False, np.inf, np.nan, np.nan, np.nan)
     K = discretise(controller, conversion, period, delay)
-    return sampled_figures(sensitivity_loop(sampled_plant(plant, period, delay), K))
+    return sampled_figures(closed_loop(sampled(plant, period, delay), K).S)
 
 
 def needed_rate(

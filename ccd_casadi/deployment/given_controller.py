@@ -21,12 +21,9 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-)
-from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.deployment.sampled import sampled_figures
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import Sampling, sampled, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -69,8 +66,8 @@ class Sampled:
 
     def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
         """Stability, ω_b, ‖S‖∞ and rate of growth of the sampled loop."""
-        held = sampled_plant(plant.plant_si(), self.period, self.delay)
-        f = sampled_figures(sensitivity_loop(held, self.system))
+        held = sampled(plant.plant_si(), self.period, self.delay)
+        f = sampled_figures(closed_loop(held, self.system).S)
         growth = np.log(max(f.spectral_radius, 1e-300)) / self.period
         return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
 
@@ -151,7 +148,7 @@ def _from_mat(path: Path) -> Given:
     if not path.exists():
         raise UserError(f"{path}: there is no such file; name a controller")
     systems = read_mat(path).systems
-    for name in ("controller_discrete", "controller"):
+    for name in ("controller_discrete", "controller", ""):
         if name in systems:
             found = systems[name]
             delay = found.period

@@ -11,12 +11,10 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
-from ccd_casadi.deployment.sampled import (
-    sampled_figures,
-    sampled_plant,
-    sensitivity_loop,
-)
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.simulation import measure_set
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.synthesis.statics import Statics, statics
@@ -42,8 +40,8 @@ class SampledSet:
         self.realisation = limited(realised, run.figures.bandwidth)
         self.free = {Perturbation(): run.plant.plant_si()}
         self.free |= {m.at: m.plant.plant_si() for m in members}
-        held = {at: sampled_plant(plant, period, delay) for at, plant in self.free.items()}
-        loops = {at: sensitivity_loop(G, self.realisation.system) for at, G in held.items()}
+        held = {at: sampled(plant, period, delay) for at, plant in self.free.items()}
+        loops = {at: closed_loop(G, self.realisation.system).S for at, G in held.items()}
         figures = {at: sampled_figures(loop) for at, loop in loops.items()}
         self.held, self.loops, self.sampled = held, loops, figures.pop(Perturbation())
         self.checked = tuple(MemberLoop(at, item) for at, item in figures.items())

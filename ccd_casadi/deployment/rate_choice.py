@@ -1,6 +1,7 @@
 """Which way of discretising to take, and at which rate."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -42,14 +43,20 @@ class ChannelLoops:
             ]
         )
 
-    def held(self, conversion: Conversion, rate: float, delay: float) -> Callable[[Member], bool]:
-        """Whether the loop on a member is stable within the peak."""
-        return lambda member: self.target.held(self.at(conversion, rate, delay, member))
+    def met(self, conversion: Conversion, rate: float, timing: Timing, order: WorstFirst) -> bool:
+        """Whether the nominal loop meets the target at a rate, and those of all members hold it."""
+        delay = timing.delay_at(rate)
+
+        def held(member: Member) -> bool:
+            return self.target.held(self.at(conversion, rate, delay, member))
+
+        return self.target.met(self.at(conversion, rate, delay)) and order.all(held)
 
 
 def choose(
     run: FinishedRun, timing: Timing, loops: ChannelLoops, family: tuple[Member, ...],
-    conversions: Sequence[Conversion], progress: Callable[[str], None], attempt: int,
+    conversions: Sequence[Conversion], progress: Callable[[str], None], attempt: int = 0,
+    remedy: str = "shorten it",
 ) -> tuple[tuple[Trial, ...], Trial, float]:  # fmt: skip
     """Every way with the rate that it needs, the one to take, and the rate to take it at.
 
@@ -61,15 +68,7 @@ def choose(
     for conversion in conversions:
         again = f", once more for a plant in between ({attempt})" if attempt else ""
         progress(f"rate for {conversion.label}{again}")
-        order = WorstFirst(family)
-
-        def met(
-            rate: float, conversion: Conversion = conversion, order: WorstFirst = order
-        ) -> bool:
-            delay = timing.delay_at(rate)
-            nominal = loops.at(conversion, rate, delay)
-            return loops.target.met(nominal) and order.all(loops.held(conversion, rate, delay))
-
+        met = partial(loops.met, conversion, timing=timing, order=WorstFirst(family))
         also = () if timing.rate_hz is None else (timing.rate_hz,)
         needed = needed_rate(met, bandwidth_hz, also)
         there = None
@@ -86,7 +85,7 @@ def choose(
             words = f"no sampling rate up to {FASTEST * bandwidth_hz:.3g} Hz keeps S_max to 5 %"
             where = " on all plants of its [robust] set" if family else ""
             raise UserError(
-                f"{run.folder}: {words} and omega_b to 3 %{where} with this delay; shorten it"
+                f"{run.folder}: {words} and omega_b to 3 %{where} with this delay; {remedy}"
             )
         return tuple(trials), least, nice_rate(least.needed_hz)
     possible = [t for t in trials if t.conversion.defined(1.0 / timing.rate_hz)]

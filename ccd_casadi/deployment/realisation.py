@@ -1,22 +1,22 @@
 """The difference equation that is deployed: block-diagonal, its order of operations fixed.
 
 Controller poles lie close to z = 1 at high sampling rates, where the coefficients of a companion
-form, or of a long cascade, lose digits. Here A is block-diagonal (control.bdschur on SLICOT's
-MB03RD, the transformation's condition bounded): blocks of one real pole or one complex pair,
-larger ones only where poles nearly coincide. Each pole then is as exact as its own block's four
-numbers.
+form, or of a long cascade, lose digits. Here A is block-diagonal: blocks of one real pole or one
+complex pair, larger ones only where poles nearly coincide. Each pole then is as exact as its own
+block's four numbers.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import schur, solve_sylvester
 
 from ccd_casadi.deployment.channels import Channel, assemble
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 
-CONDITION = 1e4  # most of the block-diagonalising transformation's entries
+CONDITION = 1e4  # most of the block-diagonalising transformation, its columns of unit length
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,8 @@ def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
     """K with A block-diagonal, and the sizes of its blocks."""
     if not len(K.A):
         return StateSpace(K.A, K.B, K.C, K.D), []
-    from control import bdschur  # it takes a second to import, and reports import this module
-
-    A, T, sizes = bdschur(K.A, condmax=CONDITION)
-    B, C = np.linalg.solve(T, K.B), K.C @ T
+    A, T, sizes = _decoupled(K.A)
+    B, C = np.asarray(np.linalg.solve(T, K.B), float), K.C @ T
     start = 0
     for size in sizes:
         states = slice(start, start + size)
@@ -75,7 +73,32 @@ def block_diagonal(K: StateSpace) -> tuple[StateSpace, list[int]]:
             C[:, states] *= np.sqrt(b / c)
         A[states, :start] = A[states, start + size :] = 0.0
         start += size
-    return StateSpace(A, B, C, K.D), [int(size) for size in sizes]
+    return StateSpace(A, B, C, K.D), sizes
+
+
+def _decoupled(A: Array) -> tuple[Array, Array, list[int]]:
+    """T⁻¹ A T, T and the sizes of its diagonal blocks: Bavely and Stewart's method (1979).
+
+    Of the real Schur form block after block is split off by a Sylvester equation, and grows by the
+    next one where T would exceed its condition.
+    """
+    S, T = schur(A, output="real")
+    n, start = len(S), 0
+    sizes: list[int] = []
+    for end in (i for i in range(1, n + 1) if i == n or S[i, i - 1] == 0.0):
+        here, rest = slice(start, end), slice(end, n)
+        if end < n:
+            split = T.copy()
+            split[:, rest] += T[:, here] @ solve_sylvester(
+                S[here, here], -S[rest, rest], -S[here, rest]
+            )
+            unit = split / np.linalg.norm(split, axis=0)
+            if not (np.isfinite(unit).all() and np.linalg.cond(unit) <= CONDITION):
+                continue
+            S[here, rest], T = 0.0, split
+        sizes.append(end - start)
+        start = end
+    return np.asarray(S, float), np.asarray(T, float), sizes
 
 
 def difference_equation(

@@ -29,7 +29,7 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import require
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED, DesignFigures
 from ccd_casadi.synthesis.weights import Weights

@@ -15,7 +15,7 @@ from scipy.linalg import eig
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import require
 from ccd_casadi.support.units import HZ
 
 NEAR = 1.5  # ratio of zero to pole frequency up to which a pair is a notch

@@ -22,12 +22,12 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
+from ccd_casadi.analysis.loop_view import phase_deg
+from ccd_casadi.drawing.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
-from ccd_casadi.reporting.bode import phase_deg
 from ccd_casadi.reporting.nyquist import FAR
-from ccd_casadi.reporting.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 
 HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there

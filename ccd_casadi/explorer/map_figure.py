@@ -11,11 +11,11 @@ from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
 from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.svg import GREY, ORANGE
 from ccd_casadi.explorer.controls import DARK
 from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.explorer.message import Change
-from ccd_casadi.reporting.page import escape
-from ccd_casadi.reporting.svg import GREY, ORANGE
 from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 280

@@ -10,6 +10,7 @@ from bokeh.models import ColumnDataSource
 from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
+from ccd_casadi.drawing.page import escape
 from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.controls import Controls
 from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
@@ -17,6 +18,7 @@ from ccd_casadi.explorer.designs import How, Look
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.landscape import field_of, run_surrogate
+from ccd_casadi.explorer.machine import machine_html
 from ccd_casadi.explorer.map_figure import MapFigure
 from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.modes import frequency_error, in_modal_form
@@ -24,8 +26,6 @@ from ccd_casadi.explorer.pins import Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.words import end_words, move_words, standing_html
-from ccd_casadi.reporting.machine import machine_html
-from ccd_casadi.reporting.page import escape
 from ccd_casadi.support.errors import UserError
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
@@ -157,10 +157,7 @@ class Page:
         look = with_sampled(look, sampled)
         self.now = Drawn(look, curves_of(look), sampled)
         session, pinned = self.session, [drawn for _, drawn in self.pins.pinned]
-        machine = machine_html(
-            look.problem, look.theta, session.start.theta, look.elements.system, look.modal,
-            session.reference,
-        )  # fmt: skip
+        machine = machine_html(look, session.start.theta, session.reference)
         self._serial += 1
         answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
         curves = self.now.curves

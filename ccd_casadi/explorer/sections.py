@@ -57,7 +57,7 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
 
 
 def designed(task: tuple[CoDesignProblem, Knobs]) -> Designed:
-    """The best certified controller at θ from the problem's anchors; a race where it has none."""
+    """The best certified controller at θ from the problem's anchors, or from many starts."""
     problem, knobs = task
     if not sections_of_problem(problem).anchors:
         problem = prepared(replace(problem, start=knobs.theta))[0]

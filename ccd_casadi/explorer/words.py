@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.drawing.page import escape
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
-from ccd_casadi.reporting.page import escape, number
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 
 def standing_html(look: Look, curves: Curves | None, sampled: AsSampled | None) -> str:

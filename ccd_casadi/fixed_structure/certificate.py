@@ -22,9 +22,9 @@ from ccd_casadi.fixed_structure.certificate_curves import (
     crossing_and_bandwidth,
     frequency_grid,
     peaks,
+    with_crossings,
 )
-from ccd_casadi.fixed_structure.certificate_norms import norms
-from ccd_casadi.fixed_structure.certificate_responses import Responses
+from ccd_casadi.fixed_structure.certificate_responses import Responses, norms
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -180,6 +180,8 @@ def judged(
         grids.append(frequency_grid(roots, sampling, bounds.omega_low, _size(free[i]), corner))
     grid, rows = alike(grids), np.arange(len(good))
     table = Responses([free[i] for i in good], [G[i] for i in good], held, sampling, bounds)
+    if len(free[0].C) > 1:
+        grid = with_crossings(table, grid)
     values = table.at(rows, grid)
     low = table.at(rows, np.full((len(good), 1), bounds.omega_low))
     rest = low if integrator else table.at(rows, REST * grid[:, :1])

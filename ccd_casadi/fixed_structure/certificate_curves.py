@@ -19,6 +19,7 @@ PER_DECADE = 60
 FLANKS = np.concatenate([[0.0], *(np.array([-1.0, 1.0]) * x for x in (0.2, 0.5, 1.0, 2.0, 5.0))])
 APART = 1e-9  # relative: grid points that are closer count as one
 NEAR = 0.9  # of the height that counts: local maxima below it lie below it between points too
+FINER = 41  # points in such a maximum's bracket of a lesser singular value
 ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 SECTIONS = 17  # of a bracket in ten: to rounding
 
@@ -62,6 +63,19 @@ def alike(grids: Sequence[Array]) -> Array:
     return np.array([np.pad(grid, (0, most - len(grid)), mode="edge") for grid in grids])
 
 
+def with_crossings(table: Responses, grid: Array) -> Array:
+    """Grids (P, k), finer where a lesser singular value has a maximum that comes near the largest.
+
+    Where it is the larger one between two points only, neither of these shows a maximum.
+    """
+    more: list[list[Array]] = [[own] for own in grid]
+    for matrix in table.singular(np.arange(len(grid)), grid):
+        for lesser in np.moveaxis(matrix, -1, 0)[1:]:
+            for i, j in zip(*_maxima(grid, lesser, NEAR * matrix[..., 0]), strict=True):
+                more[i].append(np.linspace(grid[i, j - 1], grid[i, j + 1], FINER))
+    return alike([np.unique(np.concatenate(own)) for own in more])
+
+
 def peaks(
     table: Responses, grid: Array, values: dict[str, Array]
 ) -> dict[str, tuple[Array, Array]]:
@@ -91,9 +105,9 @@ def peaks(
 
 
 def _maxima(grid: Array, value: Array, least: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Plant and place of every local maximum above `least` (P,) inside a grid."""
-    inner = value[:, 1:-1]
-    found = (inner >= value[:, :-2]) & (inner >= value[:, 2:]) & (inner > least[:, None])
+    """Plant and place of every local maximum above `least`, (P,) or (P, k), inside a grid."""
+    inner, floor = value[:, 1:-1], least[:, None] if least.ndim == 1 else least[:, 1:-1]
+    found = (inner >= value[:, :-2]) & (inner >= value[:, 2:]) & (inner > floor)
     i, j = np.nonzero(found & (grid[:, :-2] < grid[:, 2:]))
     return i, j + 1
 

@@ -1,7 +1,10 @@
 """σ_max of S, KS, T and GS of many loops at many frequencies, as the judge reads them.
 
 With A = QTQᴴ, T upper triangular (Schur), C(s - A)⁻¹B is a back substitution, for all plants and
-all s at once. Of the search's own rows and kernels nothing is used.
+all s at once. Of the search's own rows and kernels nothing is used. The peaks of S that are found
+so are confirmed by Hamiltonian matrices: a level γ above σ_max(D) is reached where that of
+`lti.norms` has an imaginary eigenvalue; between two neighbours of these σ_max stays on one side of
+γ. Where it stays below γ at all of them, just above the peak on the grid, that peak is the norm.
 """
 
 from collections.abc import Sequence
@@ -11,10 +14,13 @@ from scipy.linalg import schur
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.lti.hold import Sampling
-from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.lti.norms import hinf_norm, level_frequencies
+from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.support.arrays import Array
 
 AT_ONCE = 8192  # numbers of an array that stays in a processor's cache
+CONFIRMED = 1e-6  # relative: between the peak of S on the grid and by the Hamiltonian
+ABOVE = 1e-9  # relative: the level that is tested, over the peak on the grid
 
 
 class Triangular:
@@ -71,21 +77,18 @@ class Responses:
 
     def at(self, which: np.ndarray, omega: Array) -> dict[str, Array]:
         """Every curve (N, k) of the plants `which` (N,) at ω (N, k) in rad/s."""
-        S, g, k = self._loops(which, omega)
-        free = g if self.period is None else self.free.at(which, 1j * omega)
-        KS = _product(k, S)
-        found = {"S": _gain(S), "KS": _gain(KS)}
-        found |= {"T": _gain(_product(g, KS)), "GS": _gain(_product(S, free))}
+        matrices = self._matrices(which, omega)
+        found = {name: _gain(M) for name, M in matrices.items()}
         weights = self.bounds.weights
         if weights is not None:
             _, W_KS, W_T = np.abs(weights.responses(omega.ravel())).reshape(3, *omega.shape)
             found["weighted KS"], found["weighted T"] = W_KS * found["KS"], W_T * found["T"]
         for own in self.bounds.channels:
             if own.given:
-                found[f"S of {own.name}"] = _length(own.output, S)
+                found[f"S of {own.name}"] = _length(own.output, matrices["S"])
             if own.M_K is not None and weights is not None:
                 W = weights.M_K / own.M_K * W_KS
-                found[f"weighted KS of {own.name}"] = W * _length(own.force, KS)
+                found[f"weighted KS of {own.name}"] = W * _length(own.force, matrices["KS"])
         return found
 
     def sensitivity(
@@ -94,6 +97,17 @@ class Responses:
         """σ_max(S), or ‖rᵀS‖ of a row r, as `at`."""
         S = self._loops(which, omega)[0]
         return _gain(S) if row is None else _length(row, S)
+
+    def singular(self, which: np.ndarray, omega: Array) -> Array:
+        """(4, N, k, p) all singular values of S, KS, T and GS, the largest first."""
+        return np.stack([np.linalg.svd(M, compute_uv=False)
+                         for M in self._matrices(which, omega).values()])  # fmt: skip
+
+    def _matrices(self, which: np.ndarray, omega: Array) -> dict[str, np.ndarray]:
+        S, g, k = self._loops(which, omega)
+        free = g if self.period is None else self.free.at(which, 1j * omega)
+        KS = _product(k, S)
+        return {"S": S, "KS": KS, "T": _product(g, KS), "GS": _product(S, free)}
 
     def _loops(self, which: np.ndarray, omega: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s = 1j * omega if self.period is None else np.exp(1j * omega * self.period)
@@ -117,3 +131,52 @@ def _gain(M: np.ndarray) -> Array:
 def _length(row: Sequence[float], M: np.ndarray) -> Array:
     """‖rᵀM‖ of a row r and matrices (..., p, m)."""
     return np.asarray(np.linalg.norm(np.array(row) @ M, axis=-1))
+
+
+def norms(
+    loops: Sequence[StateSpace],
+    table: Responses,
+    peak: Array,
+    at: Array,
+    row: Sequence[float] | None = None,
+) -> tuple[Array, np.ndarray]:
+    """‖S‖∞ (P,) of every plant's loop, or of a row of it, and whether `peak` (P,) at ω (P,) is it.
+
+    `loops` are S, of sampled loops in z; one whose peak the test does not show to be the largest
+    has its norm searched.
+    """
+    found, confirmed = peak.copy(), np.ones(len(peak), bool)
+    for i, loop in enumerate(loops):
+        continuous = _over_w(loop, table.period)
+        level = peak[i] * (1.0 + ABOVE)
+        if not _highest(continuous, table, i, level, row):
+            found[i] = max(peak[i], hinf_norm(continuous)[0])
+            confirmed[i] = abs(found[i] / peak[i] - 1.0) <= CONFIRMED
+    return found, confirmed
+
+
+def _highest(
+    loop: StateSpace, table: Responses, plant: int, level: float, row: Sequence[float] | None
+) -> bool:
+    """Whether no frequency has more than `level`."""
+    if level <= np.linalg.norm(loop.D, 2) * (1.0 + CONFIRMED):
+        return False
+    edges = level_frequencies(loop, level)
+    edges = edges[edges > 0.0]
+    if not len(edges):
+        return True
+    between = np.sqrt(edges[:-1] * edges[1:])
+    w = np.concatenate([[0.5 * edges[0], 2.0 * edges[-1]], between, edges])
+    omega = w if table.period is None else 2.0 / table.period * np.arctan(w)
+    return bool((table.sensitivity(np.array([plant]), omega[None], row) <= level).all())
+
+
+def _over_w(S: StateSpace, period: float | None) -> StateSpace:
+    """S balanced; of a sampled loop over w, z = (1 + w)/(1 - w)."""
+    if period is None:
+        return StateSpace(*balanced(S.A, S.B, S.C), S.D)
+    inverse = np.linalg.inv(S.A + np.eye(len(S.A)))
+    root = np.sqrt(2.0)
+    A = inverse @ (S.A - np.eye(len(S.A)))
+    parts = balanced(A, root * inverse @ S.B, root * S.C @ inverse)
+    return StateSpace(*parts, S.D - S.C @ inverse @ S.B)

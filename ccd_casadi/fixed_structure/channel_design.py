@@ -14,7 +14,6 @@ from time import perf_counter
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.actuator_starts import actuator_starts
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.composite import CompositeProblem, answer_alike, composite_problem
@@ -32,6 +31,7 @@ from ccd_casadi.fixed_structure.sections_design import (
     in_problem_units,
     span_of,
 )
+from ccd_casadi.fixed_structure.starts import actuator_starts
 from ccd_casadi.fixed_structure.structure import Structure
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace

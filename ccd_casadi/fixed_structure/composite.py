@@ -13,9 +13,8 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.curvature import hessians
 from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of, is_decoupled
-from ccd_casadi.fixed_structure.figures import assess, to_theta
+from ccd_casadi.fixed_structure.figures import assess, hessians, to_theta
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import (
     Assessment,

@@ -1,6 +1,6 @@
-"""The largest bandwidth of a fixed structure on a set of plants: starts, race, certificate.
+"""The largest bandwidth of a fixed structure on a set of plants: starts, search, certificate.
 
-The best end of a race of local searches whose controller passes the judge (`certificate`) is the
+The best end of a multi-start search whose controller passes the judge (`certificate`) is the
 design.
 """
 
@@ -35,9 +35,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
-REDRAWS = 2  # races from the best ends, one section of each drawn anew
+REDRAWS = 2  # searches from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
-POOL = 12  # random starts tried for stability for each one that is raced
+POOL = 12  # random starts tried for stability for each one that is kept
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
@@ -105,9 +105,9 @@ def synthesise_sections(
 ) -> SectionsDesign:
     """max ω_b over the parameters of a structure, with every bound on every SISO plant.
 
-    `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they race
+    `initial`: parameters κ in SI, or controllers in SI that the structure is fitted to; they start
     beside `starts` others by rules and at random, or alone with `only_initial`. `frequencies` as in
-    `problem_for`: give them where designs at several θ are compared. The searches of a race are
+    `problem_for`: give them where designs at several θ are compared. The searches are
     spread over `workers`; their number changes nothing else. Raises PlantError for plants that
     cannot be in a set.
     """
@@ -138,7 +138,7 @@ def concluded(
     begun: float,
     tell: Progress,
 ) -> SectionsDesign:
-    """The best end of a race that the judge confirms, brought within its bounds; `spent`: loops
+    """The best end of a search that the judge confirms, brought within its bounds; `spent`: loops
     looked at before it."""
     evaluations = spent + sum(runner.evaluations for runner in runners)
     ends = finished(runners)

@@ -42,7 +42,7 @@ def synthesise_sections(
     give a free mass the slow suspension that it has, if only of its cables. With `sampling` hold
     and delay are exact. `M_K` (N/m) sets the scale of control systems; without it that of
     `bounds.weights`, or where there are none ω₀ = 10 ω_low/S_low. `initial`: controllers, or
-    parameters κ of an earlier design, that race beside `starts` others.
+    parameters κ of an earlier design, that start beside `starts` others.
 
     The `outcome` says how it ended, `controller` is K(s) in SI (e = r - y to force). Raises
     UserError for a system that is no continuous one, PlantError for one that cannot be a plant.

@@ -1,7 +1,9 @@
 """Every local peak of S, KS, T and GS on every plant against its bound, with exact derivatives.
 
 The constraints are those of `loop_problem`, their values and derivatives those of
-`kernels.loop_point`, their frequencies those that `peak_search` finds.
+`kernels.loop_point`, their frequencies those that `peak_search` finds. Their Hessians are at a
+fixed frequency those of `kernels.loop_curvature`; a peak moves as κ does: -c_xκ c_xκᵀ/c_xx is
+added, x = ln v, exact but for one difference in frequency.
 """
 
 from functools import singledispatch
@@ -18,6 +20,7 @@ from ccd_casadi.fixed_structure.loop_problem import (
     plant_of_row,
 )
 from ccd_casadi.fixed_structure.peak_search import closed_on_peaks, frequency_grid, local_peaks
+from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
 
@@ -25,6 +28,7 @@ from ccd_casadi.support.arrays import Array
 # of S = I, whose singular values ripple around 1 wherever the loop has no gain.
 RELEVANT, RELEVANT_OF_SEVERAL = -1.0, -0.4
 WITHIN, WITHIN_OF_SEVERAL = 0.5, 0.4
+STEP = 1e-5  # of ln v
 
 
 @singledispatch
@@ -112,4 +116,30 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
         if len(own):
             free = plants.form_to_theta(int(i), v[own], -x[own], right[own], free=True)
             out[own] += free.real
+    return out
+
+
+@singledispatch
+def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
+    """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
+    n, m, P = len(kappa), len(rows.v), problem.plants.count
+    out = np.zeros((m, n + 1, n + 1))
+    if not m:
+        return out
+    loop = problem.loop(kappa, tau)
+    out[:, :n, :n] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
+    (_, slope, *_), up, down = (
+        evaluate_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v * np.exp(step))
+        for step in (0.0, STEP, -STEP)
+    )
+    c_xx, c_xk = ((up[i] - down[i]) / (2.0 * STEP) for i in (1, 2))
+    end = rows.curve == Curve.CROSSING
+    fixed = end | (rows.curve == Curve.S_LOW)
+    top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
+    shift = c_xk / np.where(top, -c_xx, np.inf)[:, None]
+    out[:, :n, :n] += shift[:, :, None] * c_xk[:, None, :]
+    if end.any():
+        chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
+        out[end, :n, n] = out[end, n, :n] = chain[:, None] * c_xk[end]
+        out[end, n, n] = chain**2 * c_xx[end]
     return out

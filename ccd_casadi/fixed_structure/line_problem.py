@@ -15,8 +15,7 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
-from ccd_casadi.fixed_structure.curvature import hessians
-from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop import PlantSet
 from ccd_casadi.fixed_structure.loop_problem import (
     FIRST,

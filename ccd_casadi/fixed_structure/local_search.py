@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.curvature import hessians
-from ccd_casadi.fixed_structure.figures import assess
+from ccd_casadi.fixed_structure.figures import assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
-from ccd_casadi.optim.quasi_newton import symmetric_rank_one
+from ccd_casadi.optim.quadratic import symmetric_rank_one
 from ccd_casadi.optim.trust_region import Data, Iterate, Model, Radius, Rows, Step, minimise
 from ccd_casadi.support.arrays import Array
 

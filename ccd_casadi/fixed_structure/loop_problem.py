@@ -23,7 +23,6 @@ from ccd_casadi.fixed_structure.structure import Structure, roots
 from ccd_casadi.kernels.limits import HALF_POWER, Curve, Limit
 from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.synthesis.weights import Weights
 
 FIRST = float(np.log(0.1))  # τ, ω_b over ω₀
 PER_DECADE = 24
@@ -238,20 +237,6 @@ class Assessment:
         if self.peaks is None:
             return np.inf
         return max(0.0, float(self.peaks.value.max()))
-
-
-def log_weights(weights: Weights, omega: Array) -> tuple[Array, Array]:
-    """ln|W_KS| (m/N), ln|W_T| as rows, and their slopes to ln ω; ω in rad/s."""
-    w = weights
-    square = omega**2
-    pairs = ((w.omega_K, w.c_K * w.omega_K), (w.omega_T / w.A_l, w.omega_T / w.A_u))
-    scales = (w.c_K / w.M_K, 1.0 / w.A_u)
-    values = [
-        np.log(scale) + 0.5 * np.log((square + zero**2) / (square + pole**2))
-        for scale, (zero, pole) in zip(scales, pairs, strict=True)
-    ]
-    slopes = [square / (square + z**2) - square / (square + p**2) for z, p in pairs]
-    return np.array(values), np.array(slopes)
 
 
 def flanked(values: np.ndarray) -> Array:

@@ -1,4 +1,4 @@
-"""A race of local searches: from many starts, by successive halving, to distinct local optima.
+"""A multi-start search: local searches, by successive halving, to distinct local optima.
 
 All climb some steps, the better half goes on, and so forth. A search stops early where its steps no
 longer help, where it has come to a controller that a better one has already been at, and where it
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, Ascent, Point, ascend
+from ccd_casadi.fixed_structure.local_search import FIRST_RADIUS, PENALTY, Ascent, Point, ascend
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool, Workers
@@ -66,7 +66,7 @@ def run_race(
 ) -> list[Runner]:
     """All searches from the starts `pool` (N, n), the best first.
 
-    Those of races `before` are in the field too: they climb no more, but have to be overtaken.
+    Those of searches `before` are in the field too: they climb no more, but have to be overtaken.
     """
     field = [replace(runner, running=False) for runner in before]
     field += [Runner(started(problem, kappa)) for kappa in pool]
@@ -81,9 +81,8 @@ def run_race(
         field = _going_on(field, turn)
         lead = field[0].point
         going = sum(runner.running for runner in field)
-        tell(f"{len(running)} searches, {sum(runner.evaluations for runner in field)} loops, "
-             f"{going} go on: {np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
-             f"{lead.assessment.violation:.1g}")  # fmt: skip
+        tell(f"{np.exp(lead.tau) * scale:.2f} Hz, bounds exceeded by "
+             f"{lead.assessment.violation:.1g}; {going} of {len(running)} go on")  # fmt: skip
     return field
 
 
@@ -161,7 +160,7 @@ def _merged(problem: LoopProblem, field: Sequence[Runner]) -> list[Runner]:
 
 
 def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
-    """The field, best first, with those stopped that have lost."""
+    """The field, best first, with those stopped that lost, or will not meet the bounds."""
     running = [i for i, runner in enumerate(field) if runner.running]
     most = max(LAST, len(running) // 2) if turn < HALVINGS else len(running)
     lead, found = field[0].merit, list(field)
@@ -170,6 +169,8 @@ def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
         behind = lead - runner.merit
         lost = place >= most or behind > OVERTAKING * runner.gained
         lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
-        if lost and i:
+        missing = PENALTY * runner.point.assessment.violation
+        hopeless = turn >= HALVINGS - 1 and missing > OVERTAKING * runner.gained
+        if hopeless or (lost and i):
             found[i] = replace(runner, running=False)
     return found

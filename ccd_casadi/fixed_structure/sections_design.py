@@ -92,7 +92,7 @@ def designed(
     seed: int,
     seconds: float,
 ) -> SectionsDesign:
-    """The design at an end of a race: certified where the judge confirms what the search found."""
+    """The design at an end of the search: certified where the judge confirms what it found."""
     structure, bounds, P = problem.structure, problem.bounds, problem.plants
     kappa = structure.in_units(point.kappa, P.omega_0, P.force)
     controller = controller_of(structure, kappa)

@@ -4,6 +4,11 @@ A start has its crossover |L(jω_c)| = 1 at a chosen frequency, integrator and l
 by the rules of thumb (ω_i = ω_c/6, lead from ω_c/3 to 3ω_c, roll-off at 8ω_c), and its biquads as
 notches at the plants' resonances (`by_rules`) or anywhere (`at_random`). Only those that every
 closed loop of the set is stable with are kept, as eigenvalues say, for hundreds at once.
+
+Channels that share a sensor cannot be designed one by one: each alone would take the whole
+bandwidth. There a start is a random controller for each, with a crossover |G_i K_i| = 1 of its own,
+of which those are kept that together hold every plant stable (`actuator_starts`). Where a channel's
+plant is on its stiffness line at the crossover (a piezo) its lead is turned around into a lag.
 """
 
 from collections.abc import Sequence
@@ -12,10 +17,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ccd_casadi.fixed_structure.bounds import ShapeEnd
-from ccd_casadi.fixed_structure.loop import closed_loops, stable
-from ccd_casadi.fixed_structure.loop_problem import Problem
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.fixed_structure.decoupling import channel_plant
+from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
+from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
 from ccd_casadi.fixed_structure.structure import Kind, response, response_and_slopes
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
 FITS = 6
@@ -24,6 +33,9 @@ SKEWED = (
     (("zeros", 0.93, 0.07), ("poles", 0.8, 0.1)),
     (("zeros", 0.95, 0.07), ("poles", 1.1, 0.2)),
 )
+CROSSOVERS = (0.01, 1.0)  # over ω₀
+DRAWS = 40  # for each start that is asked for
+STIFFNESS_LINE = -1.0  # d ln|G|/d ln ω above which the stiffness holds what is moved
 
 
 def by_rules(problem: Problem, crossovers: Array) -> Array:
@@ -162,3 +174,40 @@ def fitted(problem: Problem, controller: StateSpace, rng: np.random.Generator) -
         made = least_squares(residual, inside, slope, bounds=tuple(problem.box), max_nfev=60)
         found.append(made.x)
     return np.array(found)
+
+
+def actuator_starts(
+    problem: LoopProblem,
+    structure: ChannelStructure,
+    plants: Sequence[ScaledPlant],
+    sampling: Sampling | None,
+    count: int,
+    rng: np.random.Generator,
+) -> list[Array]:
+    """Up to `count` controllers κ of the whole that are stable on all plants, in their units."""
+    draws = DRAWS * count
+    parts = []
+    for i, own in enumerate(structure.structures):
+        family = plant_set([channel_plant(plants[0], structure.decoupling, i)], sampling)
+        single = Problem(family, own, problem.bounds, problem.box[:, structure.slices[i]])
+        crossovers = np.exp(rng.uniform(np.log(CROSSOVERS[0]), np.log(CROSSOVERS[1]), draws))
+        kappa = at_random(single, crossovers, rng)
+        v = family.variable(crossovers)
+        G, slope = family.responses(np.zeros(draws, int), v)
+        lag = (slope / G)[:, 0, 0].real > STIFFNESS_LINE
+        for j in range(1, own.lead + 1):
+            pair = [own.names.index(f"lead {j} {root}") for root in ("zero", "pole")]
+            kappa[np.ix_(lag, pair)] = kappa[np.ix_(lag, pair[::-1])]
+        parts.append(with_crossover(single, kappa, crossovers))
+    first = plant_set(plants[:1], sampling, structure.decoupling)
+    every = plant_set(plants, sampling, structure.decoupling)
+    found: list[Array] = []
+    for kappa in np.hstack(parts):
+        for family in (first, every):
+            if not stable(closed_loops(family, structure, kappa)).all():
+                break
+        else:
+            found.append(kappa)
+        if len(found) == count:
+            break
+    return found

@@ -1,13 +1,18 @@
-"""The loops of a problem's design: on which plants, as they run, and what bounds them."""
+"""The loops of a problem's design: on which plants, as they run, what bounds them, and their error
+budget: on the model, and the largest error of the plants.
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
+from ccd_casadi.budget import BudgetFigures, evaluate_budget
+from ccd_casadi.budget.derivatives import variance_slopes
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
@@ -43,3 +48,36 @@ def design_view(
     bounded = kind_of(problem).bounded(weights or problem.weights, gamma, bandwidth_hz)
     loops = design_loops(problem, theta, controller)
     return loop_view(loops, bounded, bandwidth_hz=bandwidth_hz, label=label)
+
+
+@dataclass(frozen=True)
+class LoopBudget:
+    """The budget on the model, and the largest RMS error (m) and force (N) on `plants` of them.
+
+    None where the loop with the model is not stable; a plant with which it is not counts as
+    infinite.
+    """
+
+    model: BudgetFigures | None
+    plants: int
+    largest_error: float
+    largest_force: float
+    hold: Sampling | None
+
+
+def loop_budget(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace
+) -> LoopBudget | None:
+    """None for a problem without a budget; the controller in SI, as `controller.json` has it."""
+    if problem.budget is None:
+        return None
+    plants, hold = kind_of(problem).plants(theta), problem.sampling
+    model = evaluate_budget(plants[0].plant_si(), controller, problem.budget, hold)
+    found = [
+        variance_slopes(Loop(plant.plant_si(), controller, hold), problem.budget, ())
+        for plant in plants
+    ]
+    largest = np.max([np.full(3, np.inf) if item is None else item.value for item in found], axis=0)
+    return LoopBudget(
+        model, len(plants), float(np.sqrt(largest[0])), float(np.sqrt(largest[2])), hold
+    )

@@ -21,12 +21,12 @@ from surrogates.covariance import covariance
 INITIAL = (4, 4)  # designs along ln ω_S and ln ω_T
 FINE = 81  # points a side on which the interpolant is searched
 ADDED = 8  # designs that the interpolant may ask for
-BUDGET = 40  # syntheses in all, the local solve included
+BUDGET = 40  # certified syntheses in all, the local solve included
 LENGTHS = np.array([0.35, 0.6])  # correlation lengths as fractions of the box
 
 
 def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) -> InnerResult:
-    """ω_b*(θ) from derivatives, at most some forty syntheses."""
+    """ω_b*(θ) from derivatives, some forty syntheses, those apart that are not certified."""
     bounds = np.log([problem.omega_S, problem.omega_T])
     width = bounds[:, 1] - bounds[:, 0]
     grids = [np.linspace(0.0, 1.0, n) for n in INITIAL]
@@ -40,13 +40,14 @@ def search_inner(plant: ScaledPlant, weights: Weights, problem: InnerProblem) ->
         X = np.array([points[i] for i in usable])
         Y = np.array([_values(designs[i]) for i in usable])
         dY = np.array([_slopes(designs[i], width) for i in usable])
-        new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), X, designs)
+        new = _next_point(problem, fine, _interpolate(X, Y, dY, fine), np.array(points), designs)
         if new is None:
             break
         points.append(new)
         designs.append(_design(plant, weights, problem, bounds, new))
     rows = [design.figures for design in designs]
-    return refine(plant, weights, problem, rows, _starts(problem, rows), BUDGET - len(rows))
+    left = BUDGET - sum(row.certified for row in rows)
+    return refine(plant, weights, problem, rows, _starts(problem, rows), left)
 
 
 def _starts(problem: InnerProblem, rows: list[DesignFigures]) -> list[tuple[float, float]]:
@@ -106,10 +107,16 @@ def _next_point(
 ) -> Array | None:
     """The best predicted point over the connected parts of the predicted feasible set.
 
-    None when every part's best is no better than the incumbent or next to a known design.
+    Points that are nearer to an uncertified design than to any other are no part of it. None when
+    every part's best is no better than the incumbent or next to a known design.
     """
     levels = problem.levels
     excess = (predicted[1:] - levels[:, None, None]).max(axis=0)
+    certified = np.array([design.figures.certified for design in designs])
+    if not certified.all():
+        to_S, to_T = (np.square(fine[:, None] - X[:, i]) for i in range(2))
+        nearest = (to_S[:, None] + to_T[None]).argmin(axis=-1)
+        excess[~certified[nearest]] = np.inf
     inside = excess <= 0.0
     best = max(
         (np.log(d.figures.bandwidth) for d in designs if problem.feasible(d.figures)),

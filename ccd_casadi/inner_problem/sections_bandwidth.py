@@ -1,9 +1,10 @@
 """ω_b*(θ) of a fixed structure: one reproducible function of θ with its envelope gradient.
 
-A full race at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of the climbs
-from all anchors, and from nothing else: it depends neither on the order in which θ are asked for
-nor on the number of workers. Where no anchor climbs to a certified design a race of a few seeded
-starts is run at that θ, which is a function of θ too.
+A multi-start search at one θ gives anchors, the distinct best controllers. ω_b*(θ) is the best of
+the climbs from all anchors, and from nothing else: it depends neither on the order in which θ are
+asked for nor on the number of workers. Where no anchor climbs to a certified design a
+search of a few seeded starts is run at that θ, which is a function of θ too; not
+with `starts` = 0.
 """
 
 from collections.abc import Sequence
@@ -26,12 +27,12 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     sections_of_problem,
     structure_of,
     uncertain_plant,
+    warm_starts,
     with_channels,
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import worst_members
-from ccd_casadi.inner_problem.sections_warm import warm_starts
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -43,7 +44,7 @@ DISTINCT = 0.1  # relative: local optima further below the best are no anchors
 ROUNDS = 6  # of a design on the set and a search for plants that are worse
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding
-FEW = 8  # starts of the race at a θ where no anchor ends certified
+FEW = 8  # starts of the search at a θ where no anchor ends certified
 SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
 
@@ -52,7 +53,7 @@ class SectionsValue:
     """ω_b*(θ) in rad/s with its gradient (NaN where no certified design was found), the design.
 
     Of a problem that minimises the RMS error, `error` in m is what the gradient is of, `bandwidth`
-    that of the design. `syntheses`: climbs from anchors and races that it took. At a kink of the
+    that of the design. `syntheses`: climbs and multi-start searches that it took. At a kink of the
     value the gradient is that of one side, and `envelope` has the others.
     """
 
@@ -88,7 +89,7 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
             initial=initial, only_initial=True, frequencies=sections.frequencies,
         )  # fmt: skip
         spent += 1
-    if made is None or not made.certified:
+    if made is None or (sections.starts and not made.certified):
         made = synthesise(
             plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
             starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
@@ -170,7 +171,7 @@ def race(
     workers: Pool | None = None,
     only_anchors: bool = False,
 ) -> SectionsDesign:
-    """A full race at θ: the problem's starts, and its anchors beside them or alone."""
+    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone."""
     sections = sections_of_problem(problem)
     return synthesise(
         plants_of(problem, theta), structure_of(problem), bounds_of(problem),
@@ -206,11 +207,11 @@ def prepared(
     workers: Pool | None = None,
     only_anchors: bool = False,
 ) -> tuple[CoDesignProblem, SectionsDesign]:
-    """The problem with anchors and members: a full race at its start θ, worst plants added.
+    """The problem with anchors and members: searched at its start θ, worst plants added.
 
     With `only_anchors` the anchors that it has alone are where searches start. The design is the
-    race's last; where it is not certified the problem has no anchors, and each θ is raced on its
-    own. All of it is of the largest bandwidth, whatever the problem minimises.
+    search's last; where it is not certified the problem has no anchors, and each θ is searched on
+    its own. All of it is of the largest bandwidth, whatever the problem minimises.
     """
     asked = sections_of_problem(problem).minimise
     asked_for = with_range(with_sections(problem, minimise="bandwidth"))

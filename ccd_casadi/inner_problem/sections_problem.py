@@ -66,10 +66,10 @@ class SectionsProblem(ControllerProblem):
     """Structure, bounds beyond S_max and S_low, hold and delay, the uncertainty, and the search.
 
     `weighted_level` is of |W_KS KS| and |W_T T|, W_T at the lower end of ω_T; None: no bound, as
-    with `shape` and `compliance_max` (m/N). A race of `starts` searches from `seed` finds the
+    with `shape` and `compliance_max` (m/N). A search from `starts` starts and `seed` finds the
     `anchors` (κ in SI) and the `members` of the plant set (option, point of the box): from these
     on ω_b*(θ) is the best of the climbs from the anchors, on the members, whatever was asked
-    before. Both are empty before the race. `frequencies` (rad/s) bound those of K, alike at every
+    before. Both are empty before it. `frequencies` (rad/s) bound those of K, alike at every
     θ; None: by the plant at the start. `minimise` "rms_error": at a θ the search goes on from there
     to the least RMS error under the problem's budget, at `bandwidth_least` (rad/s) or more, from
     that controller and the `error_anchors` (κ in SI).

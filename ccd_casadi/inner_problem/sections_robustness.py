@@ -50,7 +50,7 @@ def worst_members(
         sections.sampling, seed=sections.seed + turn,
     )  # fmt: skip
     if progress is not None:
-        progress(f"worst of {count} plants: {np.expm1(heads[0].value):+.3%} of a bound")
+        progress(f"{np.exp(heads[0].value):.6g} of a bound at most on {count} plants")
     width = uncertain.box[1] - uncertain.box[0]
     known = list(sections.members)
     found: list[Member] = []

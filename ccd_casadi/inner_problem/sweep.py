@@ -23,6 +23,7 @@ from ccd_casadi.synthesis.weights import Weights
 
 # The local solves aim this far inside a constraint, so that what they return satisfies it.
 MARGIN = 1e-9
+NEAR = 1e-3  # of ln ω: how near to an uncertified design a local solve looks for a better one
 ACTIVE = 1e-5  # relative distance within which a constraint counts as binding
 LABELS = {
     "S_max": "peak of S",
@@ -205,6 +206,10 @@ def _merit(problem: InnerProblem, row: DesignFigures) -> float:
     return float(np.log(row.bandwidth)) - 3.0 * _violation(problem, row)
 
 
+class _Uncertified(Exception):
+    """Raised through SLSQP, which takes no point for one that has no figures."""
+
+
 def local_solve(
     plant: ScaledPlant,
     weights: Weights,
@@ -212,42 +217,63 @@ def local_solve(
     start: tuple[float, float],
     limit: int = 40,
 ) -> list[Sensitivities]:
-    """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way."""
-    bounds = np.log([problem.omega_S, problem.omega_T])
-    seen: dict[tuple[float, float], Sensitivities] = {}
+    """Maximise ln ω_b from `start` by SLSQP over (ln ω_S, ln ω_T); every design on the way.
 
-    class Uncertified(Exception):
-        pass
+    Where a step ends in an uncertified design, the search goes on from the best one so far in a
+    box that reaches half way to there.
+    """
+    bounds = np.log([problem.omega_S, problem.omega_T])
+    levels = problem.levels - MARGIN
+    seen: dict[tuple[float, float], Sensitivities] = {}
 
     def at(x: Array) -> Sensitivities:
         clipped = np.clip(x, bounds[:, 0], bounds[:, 1])
         key = (float(clipped[0]), float(clipped[1]))
         if key not in seen:
             if len(seen) >= limit:
-                raise Uncertified
+                raise _Uncertified
             point = np.clip(np.exp(clipped), *np.array([problem.omega_S, problem.omega_T]).T)
             seen[key] = evaluate(plant, weights, problem, (float(point[0]), float(point[1])))
         if not seen[key].figures.certified:
-            raise Uncertified
+            raise _Uncertified
         return seen[key]
 
-    levels = problem.levels - MARGIN
-    try:
-        minimize(
-            lambda x: -np.log(at(x).values[0]),
-            np.log(start),
-            jac=lambda x: -at(x).to_break_frequencies[0] / at(x).values[0],
-            bounds=bounds,
-            constraints={
-                "type": "ineq",
-                "fun": lambda x: levels - at(x).values[1:-1],
-                "jac": lambda x: -at(x).to_break_frequencies[1:-1],
-            },
-            method="SLSQP",
-            options={"ftol": 1e-9, "maxiter": 30},
-        )
-    except Uncertified:
-        pass  # what was reached before the edge of the certified region still counts
+    def climbed(x: Array, low: Array, high: Array) -> bool:
+        """Whether SLSQP ended without an uncertified design on the way."""
+        try:
+            minimize(
+                lambda x: -np.log(at(x).values[0]),
+                x,
+                jac=lambda x: -at(x).to_break_frequencies[0] / at(x).values[0],
+                bounds=np.column_stack([low, high]),
+                constraints={
+                    "type": "ineq",
+                    "fun": lambda x: levels - at(x).values[1:-1],
+                    "jac": lambda x: -at(x).to_break_frequencies[1:-1],
+                },
+                method="SLSQP",
+                options={"ftol": 1e-9, "maxiter": 30},
+            )
+        except _Uncertified:
+            return False
+        return True
+
+    def rank(x: tuple[float, float]) -> tuple[float, float]:
+        return _violation(problem, seen[x].figures), -seen[x].figures.bandwidth
+
+    x, low, high = np.log(start), bounds[:, 0], bounds[:, 1]
+    while len(seen) < limit:
+        ended = climbed(x, low, high)
+        certified = [key for key, design in seen.items() if design.figures.certified]
+        lost = [key for key, design in seen.items() if not design.figures.certified]
+        if not certified or not lost:
+            break
+        best = np.array(min(certified, key=rank))
+        half = 0.5 * float(np.abs(np.array(lost) - best).max(axis=1).min())
+        if half < NEAR or (ended and np.array_equal(best, x)):
+            break
+        x, low, high = best, np.maximum(bounds[:, 0], best - half), best + half
+        high = np.minimum(bounds[:, 1], high)
     return list(seen.values())
 
 

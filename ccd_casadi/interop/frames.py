@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.sampling.keys import problem_hash
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import require
 from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import require
 
 om: Any = require("openmdao.api", "openmdao")
 FREQUENCIES = ("ln_omega_S", "ln_omega_T")

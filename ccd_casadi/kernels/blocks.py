@@ -67,16 +67,6 @@ def frobenius(M):
 
 
 @compiled
-def all_finite(M):
-    """Whether no entry is infinite or undefined."""
-    for i in range(M.shape[0]):
-        for j in range(M.shape[1]):
-            if not np.isfinite(M[i, j]):
-                return False
-    return True
-
-
-@compiled
 def ascending(x, count):
     """The first `count` numbers of x in ascending order (Shell's sort)."""
     out = x[:count].copy()

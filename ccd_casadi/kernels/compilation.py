@@ -66,8 +66,8 @@ def compile_part(part: str) -> None:
     else:
         gamma.plant_gain(A, B, C, grid)
         row = np.empty(int(design.Figure.COUNT))
-        assessed = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
-        design.assess(*assessed, w, 1e5, 1e-2, row)
+        judged = (A, B, C, -np.eye(5), np.ones((5, 1)), np.zeros((1, 5)), none)
+        design.judge(*judged, w, 0.0, 1e5, 1e-2, row)
         if row[0] != design.Code.NO_BANDWIDTH:
             raise SystemExit("the compiled kernels refuse a loop that is open")
         G = frequency.prepare(A, B, C)

@@ -4,7 +4,7 @@ from math import exp, isnan, log, nan
 
 import numpy as np
 
-from ccd_casadi.kernels.blocks import all_finite, ascending, place
+from ccd_casadi.kernels.blocks import ascending, place
 from ccd_casadi.kernels.certificate import level_test, stack_norm
 from ccd_casadi.kernels.closed_loop import (
     loop_matrices,
@@ -53,49 +53,48 @@ def certificate_grid(wr, wi):
 
 
 @compiled
-def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
-    """Certify a controller against `gamma` and fill in its closed-loop figures."""
-    row[Figure.GAMMA] = gamma
-    if not (all_finite(Ak) and all_finite(Bk) and all_finite(Ck)):
-        row[Figure.CODE] = Code.NOT_FINITE.value
-        return
+def _closed(A, B, C, Ak, Bk, Ck, Dk, row):
+    """How the loop's poles end; its matrices r to e, plant and controller prepared, a grid."""
     As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
     wr, wi, info = eigenvalues(As)
     row[Figure.MAX_REAL_POLE] = wr.max()
+    code = Code.CERTIFIED.value
     if info != 0:
-        row[Figure.CODE] = Code.EIGENVALUES_FAILED.value
-        return
-    if not wr.max() < -pole_rounding(As):
-        row[Figure.CODE] = Code.UNSTABLE_LOOP.value
-        return
-    G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
-    norm, at = stack_norm(G, K, Dk, w, certificate_grid(wr, wi))
-    row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
-    if not norm <= gamma:
-        row[Figure.CODE] = Code.NORM_EXCEEDED.value
-        return
+        code = Code.EIGENVALUES_FAILED.value
+    elif not wr.max() < -pole_rounding(As):
+        code = Code.UNSTABLE_LOOP.value
+    return code, (As, Bs, Cs), (wr, wi), prepare(A, B, C), prepare(Ak, Bk, Ck)
+
+
+@compiled
+def _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop):
+    """The norm, where, whether it and the Hamiltonian stay below γ, and the least r to e."""
+    A, B, C, Ak, Bk, Ck = matrices
+    norm, at = stack_norm(G, K, Dk, w, grid)
     n, N = A.shape[0], Ak.shape[0]
-    loop, smaller = reachable_loop(weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w), n, N)
-    if not level_test(G, K, Dk, w, loop, gamma):
-        row[Figure.CODE] = Code.LEVEL_TEST_FAILED.value
-        return
+    if not norm <= gamma:
+        return norm, at, False, loop
+    whole, smaller = reachable_loop(weighted_loop(A, B, C, Ak, Bk, Ck, Dk, w), n, N)
     if smaller:
         # x = x̂ as seen from r, so the controller's own states carry S as well
-        As, Bs, Cs = loop[0], loop[1], np.zeros((C.shape[0], N))
+        Cs = np.zeros((C.shape[0], N))
         place(Cs, 0, 0, -1.0, C)
+        loop = (whole[0], whole[1], Cs)
+    return norm, at, level_test(G, K, Dk, w, whole, gamma), loop
+
+
+@compiled
+def _measured(G, K, Dk, omega_low, loop, wr, wi, row):
+    """How the figures of S end."""
     row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
-    value, at, confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
+    value, at, confirmed = peak(G, K, Dk, *loop, wr, wi)
     row[Figure.PEAK], row[Figure.PEAK_FREQUENCY] = value, at
     if not confirmed:
-        row[Figure.CODE] = Code.PEAK_NOT_CONFIRMED.value
-        return
-    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, As, Bs, Cs)
+        return Code.PEAK_NOT_CONFIRMED.value
+    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, *loop)
     if info != 0:
-        row[Figure.CODE] = Code.EIGENVALUES_FAILED.value
-    elif not np.isfinite(row[Figure.BANDWIDTH]):
-        row[Figure.CODE] = Code.NO_BANDWIDTH.value
-    else:
-        row[Figure.CODE] = Code.CERTIFIED.value
+        return Code.EIGENVALUES_FAILED.value
+    return Code.CERTIFIED.value if np.isfinite(row[Figure.BANDWIDTH]) else Code.NO_BANDWIDTH.value
 
 
 # Numba optimises a kernel anew inside every kernel that calls it. What follows only strings
@@ -103,44 +102,33 @@ def assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row):
 
 
 def judge(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
-    """Certify a controller against `gamma` and fill in its figures, δ = 0 or the four blocks.
+    """Certify a controller against `gamma` and fill in its closed-loop figures as far as it comes.
 
-    As `assess`; with δ > 0 the norm is that of [W1 I; W2 K; W3 K] S [I δG].
+    With δ > 0 the norm is that of the four blocks [W1 I; W2 K; W3 K] S [I δG].
     """
-    if delta == 0.0:
-        assess(A, B, C, Ak, Bk, Ck, Dk, w, gamma, omega_low, row)
-    else:
-        row[_CODE] = _four_block_code(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
+    row[_CODE] = _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row)
 
 
-def _four_block_code(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
-    """How it ended; the figures reached are filled in."""
+def _judged(A, B, C, Ak, Bk, Ck, Dk, w, delta, gamma, omega_low, row):
+    """How it ended."""
     row[Figure.GAMMA] = gamma
     if not (np.isfinite(Ak).all() and np.isfinite(Bk).all() and np.isfinite(Ck).all()):
         return Code.NOT_FINITE
-    As, Bs, Cs = loop_matrices(A, B, C, Ak, Bk, Ck, Dk)
-    wr, wi, info = eigenvalues(As)
-    row[Figure.MAX_REAL_POLE] = wr.max()
-    if info != 0:
-        return Code.EIGENVALUES_FAILED
-    if not wr.max() < -pole_rounding(As):
-        return Code.UNSTABLE_LOOP
-    G, K = prepare(A, B, C), prepare(Ak, Bk, Ck)
-    norm, at = four_block_norm(G, K, Dk, w, delta, certificate_grid(wr, wi))
+    code, loop, poles, G, K = _closed(A, B, C, Ak, Bk, Ck, Dk, row)
+    if code != Code.CERTIFIED:
+        return code
+    grid = certificate_grid(*poles)
+    if delta:
+        norm, at = four_block_norm(G, K, Dk, w, delta, grid)
+        whole = four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
+        held = norm <= gamma and four_block_level_test(G, K, Dk, w, delta, whole, gamma)
+    else:
+        matrices = (A, B, C, Ak, Bk, Ck)
+        norm, at, held, loop = _stack_proof(G, K, Dk, w, grid, gamma, matrices, loop)
     row[Figure.NORM], row[Figure.NORM_FREQUENCY] = norm, at
-    if not norm <= gamma:
-        return Code.NORM_EXCEEDED
-    loop = four_block_loop(A, B, C, Ak, Bk, Ck, Dk, w, delta)
-    if not four_block_level_test(G, K, Dk, w, delta, loop, gamma):
-        return Code.LEVEL_TEST_FAILED
-    row[Figure.LOW] = sensitivity_gain(G, K, Dk, omega_low)
-    row[Figure.PEAK], row[Figure.PEAK_FREQUENCY], confirmed = peak(G, K, Dk, As, Bs, Cs, wr, wi)
-    if not confirmed:
-        return Code.PEAK_NOT_CONFIRMED
-    row[Figure.BANDWIDTH], info = bandwidth(G, K, Dk, As, Bs, Cs)
-    if info != 0:
-        return Code.EIGENVALUES_FAILED
-    return Code.CERTIFIED if np.isfinite(row[Figure.BANDWIDTH]) else Code.NO_BANDWIDTH
+    if not held:
+        return Code.LEVEL_TEST_FAILED if norm <= gamma else Code.NORM_EXCEEDED
+    return _measured(G, K, Dk, omega_low, loop, *poles, row)
 
 
 def design(A, B, C, w, grid, sigma, backoff, omega_low, guess, channels=(), delta=0.0):

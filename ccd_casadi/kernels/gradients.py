@@ -35,13 +35,17 @@ from ccd_casadi.kernels.disturbance import (
     filter_solution,
     innovations_plant,
 )
-from ccd_casadi.kernels.disturbance_pullback import FourBlockPullback
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound
 from ccd_casadi.kernels.generalized_plant import generalized_plant
 from ccd_casadi.kernels.lapack import lyapunov_triangular, stable_subspace
-from ccd_casadi.kernels.pullback import MixedPullback, PlantGradients, bound_gradient
+from ccd_casadi.kernels.pullback import (
+    FourBlockPullback,
+    MixedPullback,
+    PlantGradients,
+    bound_gradient,
+)
 from ccd_casadi.kernels.riccati import NOISE, level_hamiltonian, lqr_hamiltonian, riccati_level
 from ccd_casadi.support.arrays import Array
 

@@ -1,7 +1,7 @@
 """A system as a state space, continuous or in discrete time, with its response, poles and zeros.
 
-Judges (`fixed_structure.certificate`, `deployment.sampled`) and the compiled kernels form loops
-of their own, so that they stay independent of this.
+The judge `fixed_structure.certificate` and the compiled kernels form loops of their own, and
+`deployment.simulation` and `.move` run them sample by sample: these stay independent of this.
 """
 
 from dataclasses import dataclass, field

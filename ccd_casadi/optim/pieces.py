@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.optim.quasi_newton import damped_bfgs
+from ccd_casadi.optim.quadratic import damped_bfgs
 from ccd_casadi.optim.trust_region import Iterate, Model, Radius, Rows, Step, best_step, minimise
 from ccd_casadi.support.arrays import Array
 

@@ -19,6 +19,7 @@ CURVED, SLACK = 1e-8, 1e-4  # of a step in its own units: its answer is then one
 UNBOUNDED = 1e30  # what DAQP takes for infinite
 QUIET = ("error_on_fail", "print_iter", "print_header", "print_info")
 TOLERANCES = {"primal_tol": 1e-10, "dual_tol": 1e-12, "zero_tol": 1e-13}
+LOST = 1e-8  # share of its factors below which a scalar product is rounding
 
 
 class Answer(NamedTuple):
@@ -88,3 +89,33 @@ def _interior(n: int, rows: int) -> ca.Function:
     options: dict[str, bool | str] = dict.fromkeys(QUIET, False)
     options["linear_solver"] = "qr"  # an LDL factorisation would warn on the terminal
     return ca.conic("programme", "ipqp", shapes, options)
+
+
+def damped_bfgs(H: Array, s: Array, y: Array) -> Array:
+    """H (n, n) with the curvature that a change y of the gradient along the step s shows.
+
+    Powell's damping keeps it positive definite.
+    """
+    Hs = H @ s
+    curvature = float(s @ Hs)
+    if curvature <= 1e-16 * float(np.trace(H)):
+        return H
+    if s @ y < 0.2 * curvature:
+        share = 0.8 * curvature / (curvature - float(s @ y))
+        y = share * y + (1.0 - share) * Hs
+    return np.asarray(H - np.outer(Hs, Hs) / curvature + np.outer(y, y) / float(s @ y))
+
+
+def symmetric_rank_one(H: Array, s: Array, y: Array) -> Array:
+    """H (n, n) with H s = y, which may curve either way; as it is where the denominator is lost."""
+    rest = y - H @ s
+    size = float(rest @ s)
+    if abs(size) <= LOST * float(np.linalg.norm(rest) * np.linalg.norm(s)):
+        return H
+    return np.asarray(H + np.outer(rest, rest) / size)
+
+
+def convex(H: Array, least: float) -> Array:
+    """H (n, n) with its eigenvalues raised to at least `least`."""
+    values, vectors = np.linalg.eigh(H)
+    return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)

@@ -19,8 +19,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from ccd_casadi.optim.quadratic import solve_elastic
-from ccd_casadi.optim.quasi_newton import convex
+from ccd_casadi.optim.quadratic import convex, solve_elastic
 from ccd_casadi.support.arrays import Array
 
 ROWS = 400  # of a programme at most

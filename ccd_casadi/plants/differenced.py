@@ -6,7 +6,7 @@ the step, is the cross-check: their difference bounds the error from above.
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -192,20 +192,9 @@ class DifferencedModel:
 
     def error(self, theta: Sequence[float] | Array) -> float:
         """The largest difference of both formulas, over the largest derivative of its matrix."""
-
-        def parts(item: _Values) -> tuple[Array, ...]:
-            return (*_matrices(item.system), item.scalars)
-
-        width = self.upper - self.lower
-        worst = 0.0
-        sizes = [np.abs(part).max(initial=0.0) for part in parts(self._at(theta))]
-        pairs = zip(self._slopes(theta, parts, 4), self._slopes(theta, parts, 2), strict=True)
-        for (fine, coarse), size in zip(pairs, sizes, strict=True):
-            share = width.reshape(-1, *[1] * (fine.ndim - 1))
-            gap = np.abs((fine - coarse) * share).max(initial=0.0)
-            largest = max(np.abs(fine * share).max(initial=0.0), 1e-6 * size)
-            worst = max(worst, float(gap / largest) if gap > 0.0 else 0.0)
-        return worst
+        gaps = self._gaps(theta)
+        return max((gap / max(slope, 1e-6 * size) for *_, gap, slope, size in gaps if gap > 0.0),
+                   default=0.0)  # fmt: skip
 
     def doubt(self, theta: Sequence[float] | Array) -> str:
         """Which derivative is wrong at θ, and the usual cause; empty where both formulas agree."""
@@ -219,37 +208,45 @@ class DifferencedModel:
 
     def _disagreement(self, theta: Sequence[float] | Array, share: float, leap: float) -> str:
         """The worst derivative whose two formulas differ by `share` of it, and over a step by
-        `leap` of the matrix; nothing is called again, the coarse formula uses the fine one's
-        points."""
+        `leap` of the matrix."""
+        names = ("mass", "damping", "stiffness", "input", "output")
+        worst, words = share, ""
+        for k, i, gap, slope, size in self._gaps(theta):
+            floor = max(slope, NOISE * size)
+            if not gap > worst * floor or STEP * gap <= leap * size:
+                continue
+            worst = gap / floor
+            label = names[k] if k < len(names) else "hardware_cost or a constraint"
+            place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
+            words = (
+                f"the derivative of {label} to {self.names[i]} is {100 * worst:.0f} % wrong at "
+                f"theta = {place}: two difference formulas disagree, so the plant function leaps "
+                "or bends there; usual causes are eigenvectors whose sign or order changes "
+                "between points (fix the sign, sort by shape), `if`, `abs`, `round`, or an "
+                "iteration that stops early"
+            )
+        return words
+
+    def _gaps(
+        self, theta: Sequence[float] | Array
+    ) -> Iterator[tuple[int, int, float, float, float]]:
+        """Of every matrix and parameter by number: how far both formulas differ over the box, the
+        matrix's largest derivative over the box, and its size.
+
+        Nothing is called again: the coarse formula uses the fine one's points.
+        """
 
         def parts(item: _Values) -> tuple[Array, ...]:
             return (*_matrices(item.system), item.scalars)
 
-        names = ("mass", "damping", "stiffness", "input", "output")
-        sizes = [np.abs(part).max(initial=0.0) for part in parts(self._at(theta))]
         width = self.upper - self.lower
+        sizes = [float(np.abs(part).max(initial=0.0)) for part in parts(self._at(theta))]
         pairs = zip(self._slopes(theta, parts, 4), self._slopes(theta, parts, 2), strict=True)
-        worst, words = 0.0, ""
         for k, ((fine, coarse), size) in enumerate(zip(pairs, sizes, strict=True)):
-            for i, name in enumerate(self.names):
-                gap = np.abs(fine[i] - coarse[i]) * width[i]
-                largest = np.abs(fine * width.reshape(-1, *[1] * (fine.ndim - 1))).max(initial=0.0)
-                floor = max(largest, NOISE * size)
-                if not gap.size or floor == 0.0 or not gap.max() > share * floor:
-                    continue
-                if STEP * gap.max() <= leap * size or gap.max() / floor <= worst:
-                    continue
-                worst = float(gap.max() / floor)
-                label = names[k] if k < len(names) else "hardware_cost or a constraint"
-                place = ", ".join(f"{n}={v:g}" for n, v in zip(self.names, theta, strict=True))
-                words = (
-                    f"the derivative of {label} to {name} is {100 * worst:.0f} % wrong at theta = "
-                    f"{place}: two difference formulas disagree, so the plant function leaps or "
-                    "bends there; usual causes are eigenvectors whose sign or order changes "
-                    "between points (fix the sign, sort by shape), `if`, `abs`, `round`, or an "
-                    "iteration that stops early"
-                )
-        return words
+            over_box = width.reshape(-1, *[1] * (fine.ndim - 1))
+            slope = float(np.abs(fine * over_box).max(initial=0.0))
+            for i, gap in enumerate(np.abs((fine - coarse) * over_box)):
+                yield k, i, float(gap.max(initial=0.0)), slope, size
 
     def _slopes(
         self,

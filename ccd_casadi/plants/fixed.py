@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.pictures import Drawing, ModeShapes
+from ccd_casadi.drawing.pictures import Drawing, ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool

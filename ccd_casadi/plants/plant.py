@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.pictures import Drawing, ModeShapes
+from ccd_casadi.drawing.pictures import Drawing, ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool

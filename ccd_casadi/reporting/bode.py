@@ -6,45 +6,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.analysis.loop_view import LoopView, phase_deg
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.reporting.lines import Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLACK, CYCLE
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.drawing.svg import BLACK, CYCLE
+from ccd_casadi.reporting.loops import bandwidth_level, over_hz
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import number
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
 
 
-def figure_bode(loop: LoopView, channels: Sequence[Channel] = (), *, key: str = "bode") -> str:
+def bode(loop: LoopView, channels: Sequence[Channel] = ()) -> Figure:
+    """The Bode plot of one design with its words and numbers."""
+    return Figure(_bode(loop, channels), _caption(loop, channels), (_table(loop),))
+
+
+def _bode(loop: LoopView, channels: Sequence[Channel]) -> Lines:
     """Plant, controller and L = GK: magnitude and phase, of every one of several scalar channels.
 
     All singular values, and no phase, of a loop that does not fall apart into such channels.
     """
     parts = scalar_parts(loop, channels)
     G, K = _singular_values(loop.plant), _singular_values(loop.controller)
-    x_range = (float(loop.hz[0]), float(loop.hz[-1]))
-    at = (Level(loop.bandwidth_hz, f"ω_b {number(loop.bandwidth_hz, 4)} Hz", True),)
+    at = (bandwidth_level(loop.bandwidth_hz),)
 
     def panel(label: str, values: Mapping[str, Array], **more: Any) -> Panel:
         drawn = tuple(
             Curve(loop.hz, v, name if len(values) > 1 else "", CYCLE[i % len(CYCLE)])
             for i, (name, v) in enumerate(values.items())
         )
-        return Panel("frequency (Hz)", label, drawn, log_x=True, x_range=x_range, **more)
+        return over_hz(label, drawn, loop.ends, **{"log_y": False, **more})
 
     gap = (float(G.min()) / 10.0, float(G.max()) * 10.0)  # room for the marks' words
     title = "Bode plot of the plant, the controller and the loop"
     if not parts:
         sigma = [{f"σ{i + 1}": s[:, i] for i in range(s.shape[1])} for s in (G, K)]
         marks = tuple(_marks(loop, G))
-        top = [
+        top = (
             panel("plant σ(G) (m/N)", sigma[0], log_y=True, marks=marks, y_range=gap),
             panel("controller σ(K) (N/m)", sigma[1], log_y=True, levels=at),
-        ]
-        return figure_lines([top], key=key, title=title, heights=(3.4,))
+        )
+        return Lines((top,), title, (3.4,))
     several = len(parts) > 1  # whose resonances are not marked: the words would meet
     marks = () if several else tuple(_marks(loop, G))
     look: dict[str, dict[str, Any]] = {
@@ -60,7 +65,7 @@ def figure_bode(loop: LoopView, channels: Sequence[Channel] = (), *, key: str = 
         sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **look[name]))
         angle = {channel: phase_deg(v) for channel, v in values.items()}
         phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0, legend=None))
-    return figure_lines([sizes, phases], key=key, title=title, heights=(2.9, 2.3))
+    return Lines((tuple(sizes), tuple(phases)), title, (2.9, 2.3))
 
 
 def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> dict[str, tuple[np.ndarray, ...]]:
@@ -100,8 +105,7 @@ def _marks(loop: LoopView, gains: Array) -> list[Mark]:
     return found
 
 
-def caption_bode(loop: LoopView, channels: Sequence[Channel] = ()) -> str:
-    """What to see in the Bode plot of one design."""
+def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
     scalar = loop.plant.shape[1:] == (1, 1)
     what = "" if scalar else (
         "Every channel by itself; the signs are those of the outputs that it moves together. "
@@ -125,7 +129,7 @@ def caption_bode(loop: LoopView, channels: Sequence[Channel] = ()) -> str:
     return words
 
 
-def table_bode(loop: LoopView) -> Table:
+def _table(loop: LoopView) -> Table:
     """Magnitudes, and phases of a scalar loop, at some frequencies."""
     special = [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz]
     if loop.plant.shape[1:] == (1, 1):
@@ -146,12 +150,6 @@ def table_bode(loop: LoopView) -> Table:
 
 def _singular_values(response: NDArray[np.complex128]) -> Array:
     return np.asarray(np.linalg.svd(response, compute_uv=False), dtype=float)
-
-
-def phase_deg(response: NDArray[np.complex128]) -> Array:
-    """Without jumps along the first axis, from within ±180° on."""
-    phase = np.degrees(np.unwrap(np.angle(response), axis=0))
-    return phase - 360.0 * np.round(phase[0] / 360.0)
 
 
 def _list(places: Sequence[float]) -> str:

@@ -5,20 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.budget import BudgetFigures
-from ccd_casadi.inner_problem.loop_budget import LoopBudget, loop_budget
+from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Section, Table, Words
+from ccd_casadi.drawing.svg import BLACK, CYCLE
+from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
-from ccd_casadi.reporting.page import (
-    Section,
-    Table,
-    figure_html,
-    number,
-    paragraph,
-    table_html,
-)
-from ccd_casadi.reporting.svg import BLACK, CYCLE
 from ccd_casadi.reporting.tables import ROWS, over_frequency
+from ccd_casadi.support.units import number
 
 SHOWN = 3e-2  # of the whole error: the axis of frequency starts where this much is together
 DECADES = 3.5  # of the error's axis
@@ -33,11 +26,11 @@ def budget_section(
         return []
     if found.model is None:
         words = "The loop with the model is not stable: it has no stationary error."
-        return [Section("Error budget", paragraph(words))]
-    return [Section("Error budget", _table(found, found.model) + _figure(found.model))]
+        return [Section("Error budget", (Words(words),))]
+    return [Section("Error budget", (*_table(found, found.model), _figure(found.model)))]
 
 
-def _table(found: LoopBudget, model: BudgetFigures) -> str:
+def _table(found: LoopBudget, model: BudgetFigures) -> tuple[Words, Table]:
     windowed = model.window is not None
     head = ["source", "enters as", "RMS error (µm)", "of the variance (%)"]
     head += ["MA (µm)", "MSD (µm)"] if windowed else []
@@ -73,10 +66,10 @@ def _table(found: LoopBudget, model: BudgetFigures) -> str:
     if tables:
         worst = max(item.disagreement for item in tables)
         words += f". Tables by quadrature, relative error {number(worst, 1)} by its own estimate"
-    return paragraph(words + ".") + table_html(Table(tuple(head), tuple(rows)))
+    return Words(words + "."), Table(tuple(head), tuple(rows))
 
 
-def _figure(model: BudgetFigures) -> str:
+def _figure(model: BudgetFigures) -> Figure:
     shown = [item for item in model.sources if item.cumulative[-1] > 0.0]
     hz = np.unique(np.concatenate([item.hz for item in shown]))
     parts = [
@@ -97,8 +90,7 @@ def _figure(model: BudgetFigures) -> str:
     panel = Panel("frequency (Hz)", "RMS error up to it (µm)", (*curves, total), log_x=True,
                   log_y=True, x_range=x, y_range=(top * 10.0**-DECADES, 1.5 * top),
                   legend="best")  # fmt: skip
-    svg = figure_lines([[panel]], key="error-budget", heights=(3.4,),
-                       title="Cumulative RMS error over frequency by source")  # fmt: skip
+    lines = Lines(((panel,),), "Cumulative RMS error over frequency by source", (3.4,))
     grid = np.geomspace(*x, ROWS)
     columns = (1e6 * np.sqrt(np.interp(grid, hz, part)) for part in (*parts, whole))
     head = ("Hz", *(f"{item.source.name} µm" for item in shown), "together µm")
@@ -108,4 +100,4 @@ def _figure(model: BudgetFigures) -> str:
         "source; the squares of the curves add up to the black one's. Where a curve rises is "
         "where its source is felt."
     )
-    return figure_html(svg, words, table)
+    return Figure(lines, words, (table,))

@@ -3,15 +3,15 @@
 import numpy as np
 
 from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number, paragraph
-from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table, Words
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.support.units import number
 
 POINTS = 1200  # of a curve
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 
 
-def move_html(found: OnHardware) -> str:
+def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
     shown = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
     error, force = [], []
@@ -24,22 +24,13 @@ def move_html(found: OnHardware) -> str:
         error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
         force.append(Curve(ms, m.force[at, 0], "", colour))
     end = Level(1e3 * found.profile.duration, "end of the setpoint", vertical=True)
-    svg = figure_lines(
-        [
-            [Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right")],
-            [Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,))],
-        ],
-        key="deployed-move", heights=(3.0, 2.2),
-        title="A move of output 1, sampled with hold and delay",
+    lines = Lines(
+        ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
+         (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),
+        "A move of output 1, sampled with hold and delay", (3.0, 2.2),
     )  # fmt: skip
-    head = (
-        "way",
-        "settled after, ms",
-        "peak error, µm",
-        "last error, µm",
-        "peak force, N",
-        "at the limit",
-    )
+    head = ("way", "settled after, ms", "peak error, µm", "last error, µm", "peak force, N",
+            "at the limit")  # fmt: skip
     rows = tuple(
         (
             way.words,
@@ -58,7 +49,7 @@ def move_html(found: OnHardware) -> str:
         "is one. On the plant with its soft suspension, hold and delay exact (robustness lets the "
         "rigid bodies go where that loop is stable)."
     )
-    return figure_html(svg, caption, Table(head, rows)) + paragraph(_limit_words(found))
+    return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
 
 
 def _limit_words(found: OnHardware) -> str:

@@ -1,79 +1,72 @@
 """report.html of a deployment: full, reduced and sampled loop, orders, sections."""
 
-from pathlib import Path
-
 import numpy as np
 
 from ccd_casadi.analysis.signals import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.verdict import State
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.deployment.words import against, reason_words, short_status
+from ccd_casadi.drawing.content import (
+    Block,
+    Curve,
+    Facts,
+    Figure,
+    Lines,
+    Page,
+    Panel,
+    Section,
+    Source,
+    Table,
+    Words,
+)
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.deploy_move import move_html
+from ccd_casadi.reporting.deploy_move import move_blocks
 from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.index import write_index
-from ccd_casadi.reporting.lines import Curve, Panel, figure_lines
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.reporting.page import (
-    INDEX,
-    Section,
-    Table,
-    facts_html,
-    figure_html,
-    header,
-    number,
-    page,
-    paragraph,
-    preformatted,
-    table_html,
-)
-from ccd_casadi.reporting.svg import BLACK, BLUE, GREEN, ORANGE
+from ccd_casadi.reporting.sections_page import sections_table
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
-from ccd_casadi.reporting.verdict import verdict_html, worst
-from ccd_casadi.support.units import HZ
+from ccd_casadi.reporting.verdict import head_of
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.closed_loop import responses
-from surrogates.files import write_whole
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
 
 
-def write_report(
-    path: Path, run: FinishedRun, found: Deployment, moved: OnHardware | None = None
-) -> None:
-    """One self-contained page."""
-    title = f"Controller of {run.folder.resolve().name}, deployed"
-    reason = reason_words(run, found)
+def deploy_page(
+    run: FinishedRun, found: Deployment, moved: OnHardware | None = None, index: str = ""
+) -> Page:
+    """report.html of a deployment; `index`: the page that links all of the run."""
     meta = f"{theta_words(run.result)}; S_max {run.problem.inner.S_max:g}"
-    sections = [Section("The loop", _loop(run, found)), Section("Figures", _facts(run, found))]
+    head = head_of(
+        f"Controller of {run.folder.resolve().name}, deployed", found.passed,
+        short_status(run, found), reason_words(run, found), meta, _conclusion(run, found),
+        run.result,
+    )  # fmt: skip
+    sections = [Section("The loop", (_loop(run, found),)), Section("Figures", _facts(run, found))]
     if found.sampled.stable:
-        sections.append(Section("Step of the reference", _step(run, found)))
+        sections.append(Section("Step of the reference", (_step(run, found),)))
     if moved is not None:
-        sections.append(Section("A move on the machine", move_html(moved)))
+        sections.append(Section("A move on the machine", move_blocks(moved)))
     sections += [
         Section("Sampling rate", _rates(found)),
-        Section("Orders", "\n".join(_orders(item, run) for item in found.orders)),
-        Section("As sections", "\n".join(_sections(item, run) for item in found.orders)),
-    ]
+        Section("Orders", tuple(block for item in found.orders for block in _orders(item, run))),
+        Section("As sections",
+                tuple(block for item in found.orders for block in _sections(item, run))),
+    ]  # fmt: skip
     if found.stable:
         sections.append(Section("The code", _code(found)))
-    head = header(
-        title, found.passed, short_status(run, found), reason, meta, _conclusion(run, found),
-        warned=worst(run.result) is not State.PASSED, verdict=verdict_html(run.result),
-    )  # fmt: skip
-    inside = path.resolve().parent.parent == run.folder.resolve()
-    write_whole(path, page(title, sections, head, f"../{INDEX}" if inside else ""))
-    write_index(run.folder)
+    return Page(head, tuple(sections), index)
 
 
 def _conclusion(run: FinishedRun, found: Deployment) -> str:
@@ -105,7 +98,7 @@ def _percent(value: float, reference: float) -> str:
     return f"{round(100.0 * (value / reference - 1.0), 2) + 0.0:+.2f} %"
 
 
-def _loop(run: FinishedRun, found: Deployment) -> str:
+def _loop(run: FinishedRun, found: Deployment) -> Figure:
     nyquist = 0.5 * found.rate_hz
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
     around = run.plant.grid * run.plant.omega_0 / HZ
@@ -142,10 +135,7 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         for gain, colour, line in zip(controllers, colours, lines, strict=True)
     ]
     bottom = over_hz("σ_max(K) (N/m)", drawn, (low, nyquist))
-    svg = figure_lines(
-        [[top], [bottom]], key="deployed-loop", heights=(3.4, 2.4),
-        title="Sensitivity and controller: full, reduced and sampled, over frequency",
-    )  # fmt: skip
+    title = "Sensitivity and controller: full, reduced and sampled, over frequency"
     table = over_frequency(
         ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
         hz, *gains, *controllers,
@@ -157,10 +147,10 @@ def _loop(run: FinishedRun, found: Deployment) -> str:
         f"{controllers[0][-1]:.3g}): "
         "that is what sensor noise and unmodelled resonances meet."
     )
-    return figure_html(svg, caption, table)
+    return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption, (table,))
 
 
-def _facts(run: FinishedRun, found: Deployment) -> str:
+def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
     full, small, sampled = run.figures, found.reduced_figures, found.sampled
     S_max = run.problem.inner.S_max
 
@@ -192,10 +182,10 @@ def _facts(run: FinishedRun, found: Deployment) -> str:
         "The controller is unstable by itself (its loop is not): close the loop at rest, and open "
         "it when the actuator saturates."
     )
-    return facts_html(rows) + (paragraph(words) if unstable else "")
+    return (Facts(tuple(rows)), *([Words(words)] if unstable else []))
 
 
-def _step(run: FinishedRun, found: Deployment) -> str:
+def _step(run: FinishedRun, found: Deployment) -> Figure:
     direction = found.orders[0].channel.outputs[:, 0]
     seconds = PERIODS * HZ / run.figures.bandwidth
     G, delay = run.plant.plant_si(), found.delay
@@ -213,15 +203,12 @@ def _step(run: FinishedRun, found: Deployment) -> str:
         curves.append(Curve(1e3 * t, y, label, colour, line))
     where = "" if len(direction) == 1 else f", channel {found.orders[0].channel.name}"
     panel = Panel("time (ms)", f"y{where} (of the step)", tuple(curves), legend="lower right")
-    svg = figure_lines(
-        [[panel]], key="deployed-step", title="Step of the reference", heights=(3.0,)
-    )
     table = over_time(("ms", "y"), 1e3 * t, y)
     caption = f"Overshoot of the sampled loop {100.0 * (float(y.max()) - 1.0):.1f} %."
-    return figure_html(svg, caption, table)
+    return Figure(Lines(((panel,),), "Step of the reference", (3.0,)), caption, (table,))
 
 
-def _rates(found: Deployment) -> str:
+def _rates(found: Deployment) -> tuple[Block, ...]:
     rows = tuple(
         (
             trial.conversion.label,
@@ -235,16 +222,16 @@ def _rates(found: Deployment) -> str:
             f"The loop was designed for {number(found.trials[0].needed_hz)} Hz with Tustin's rule, "
             "hold and delay in it."
         )
-        return paragraph(words)
+        return (Words(words),)
     words = (
         "The least rate from which on the loop keeps S_max to 5 % and ω_b to 3 %, hold and delay "
         "included. The lead makes up for the phase of hold and delay, and raises the gain at half "
         "the sampling rate."
     )
-    return paragraph(words) + table_html(Table(("method", "needed rate, Hz", ""), rows))
+    return Words(words), Table(("method", "needed rate, Hz", ""), rows)
 
 
-def _orders(item: ChannelOrders, run: FinishedRun) -> str:
+def _orders(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
     head = ("order", "method", "peak of S", "ω_b, Hz", "|S| at ω_low", "norm/γ", "")
     rows = []
     for row in item.rows:
@@ -257,23 +244,27 @@ def _orders(item: ChannelOrders, run: FinishedRun) -> str:
         ))  # fmt: skip
     if item.designed is not None:
         words = f"Channel {item.channel.name}: {item.chosen.order} states, as designed."
-        return paragraph(words)
+        return (Words(words),)
     words = (
         f"Channel {item.channel.name}: of {item.rows[0].order} states {item.chosen.order} are "
         f"enough ({item.chosen.method.value}) for S_max to 0.5 %, S_low, 99 % of ω_b and no gain "
         f"above twice its bound; {item.strict.order} keep S_max itself."
     )
-    table = table_html(Table(head, tuple(rows)))
-    return paragraph(words) + f'<div class="scroll">{table}</div>'
+    return Words(words), Table(head, tuple(rows))
 
 
-def _sections(item: ChannelOrders, run: FinishedRun) -> str:
+def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
     K = item.chosen.controller
     if K.D.shape != (1, 1):
         words = "This controller does not fall apart into scalar channels: no sections."
-        return paragraph(words)
+        return (Words(words),)
     if item.designed is not None:
-        return _as_designed(item)
+        structure, kappa = item.designed
+        words = (
+            f"Channel {item.channel.name}: gain {number(gain_of(kappa), 6)} N/m; the sections as "
+            "they were designed."
+        )
+        return Words(words), sections_table(section_words(structure, kappa))
     found = sections_of(K, run.figures.bandwidth)
     rows = tuple(
         (s.kind, *_root(s.zero), *_root(s.pole), _depth(s.depth_db)) for s in found.sections
@@ -284,20 +275,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> str:
         f"{number(found.gain_at_bandwidth, 6)} N/m at ω_b; every section has the gain 1 at s = 0. "
         "A negative ζ, or a negative frequency of a single root, is one in the right half plane."
     )
-    return paragraph(words) + table_html(Table(head, rows))
-
-
-def _as_designed(item: ChannelOrders) -> str:
-    assert item.designed is not None
-    structure, kappa = item.designed
-    parts = section_words(structure, kappa)
-    rows = tuple((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in parts)
-    words = (
-        f"Channel {item.channel.name}: gain {number(gain_of(kappa), 6)} N/m; the sections as they "
-        "were designed."
-    )
-    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
-    return paragraph(words) + table_html(Table(head, rows))
+    return Words(words), Table(head, rows)
 
 
 def _depth(value: float | None) -> str:
@@ -310,7 +288,7 @@ def _root(root: Root | None) -> tuple[str, str]:
     return number(root.hz, 5), "" if root.damping is None else number(root.damping, 4)
 
 
-def _code(found: Deployment) -> str:
+def _code(found: Deployment) -> tuple[Block, ...]:
     K = found.realisation
     sizes = f"{K.blocks.count(1)} of one state, {K.blocks.count(2)} of two"
     larger = len(K.blocks) - K.blocks.count(1) - K.blocks.count(2)
@@ -324,4 +302,4 @@ def _code(found: Deployment) -> str:
         "(IEC 61131-3). controller_takeover starts without a jump, controller_forward gives the "
         "feedforward of a setpoint:"
     )
-    return paragraph(words) + preformatted(f"{COMPILE}\n./controller_test")
+    return Words(words), Source(f"{COMPILE}\n./controller_test")

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ, number, shown_unit
 
 Fact = tuple[str, str, str]
 _FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
@@ -141,7 +141,8 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
     found = [
         ("Margins", f"phase {shown('phase_margin_deg', '°')}",
          f"{gain}, {rest}; the least of the plants that the controller is made for"),
-        ("Crossover |L| = 1", shown("crossover_hz", " Hz"), "of the model"),
+        ("Crossover |L| = 1", shown("crossover_hz", " Hz"),
+         "of the model" if "step_overshoot" in r else "of the first plant"),
     ]  # fmt: skip
     if "step_overshoot" in r:
         settled = "does not settle" if r["settling_ms"] is None else (

@@ -5,24 +5,22 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.pareto import Front, FrontPoint
+from ccd_casadi.drawing.content import Lines, Picture, Place, Steps
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.glance import machine
-from ccd_casadi.reporting.lines import Panel, figure_lines
 from ccd_casadi.reporting.loops import S_panel, synthesised_loop
-from ccd_casadi.reporting.page import number
-from ccd_casadi.reporting.steps import steps_html
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 MOST = 12  # designs: each is synthesised and drawn
 
 
-def front_walk(run: FinishedRun, front: Front) -> str:
-    """HTML; empty where no point has a design. Of a fixed structure the machine alone is drawn."""
+def front_walk(run: FinishedRun, front: Front) -> tuple[Steps, ...]:
+    """Nothing where no point has a design. Of a fixed structure the machine alone is drawn."""
     problem = run.problem
     points = [point for point in front.points if np.isfinite(point.bandwidth)]
     if not points:
-        return ""
+        return ()
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST, len(points))).round().astype(int))
     shown = [points[i] for i in chosen]
     loops = [_loop(problem, point) for point in shown if np.isfinite(point.omega_S)]
@@ -30,24 +28,25 @@ def front_walk(run: FinishedRun, front: Front) -> str:
     lows = [float(loop.gains[0].min()) for loop in loops]
     steps = []
     for i, point in enumerate(shown):
-        row: list[Panel | str | None] = [_machine(problem, point)]
+        row: list[Place] = [_machine(problem, point)]
         if loops:
             top = 1.5 * max(problem.inner.S_max, *tops)
             row.append(S_panel(loops[i], y_range=(0.5 * min(lows), top), marks=()))
-        drawn = figure_lines([row], key=f"walk{i}", title="A design of the front")
-        steps.append((_words(problem, point), drawn))
+        steps.append((_words(problem, point), Lines((tuple(row),), "A design of the front")))
     own = float(run.result["hardware_cost"])
     first = int(np.argmin([abs(point.hardware_cost - own) for point in shown]))
-    return steps_html(steps, first, "lightest to heaviest")
+    return (Steps(tuple(steps), first, "lightest to heaviest"),)
 
 
 def _loop(problem: CoDesignProblem, point: FrontPoint) -> LoopView:
     return synthesised_loop(problem, point.theta, point.omega_S, point.omega_T, "")
 
 
-def _machine(problem: CoDesignProblem, point: FrontPoint) -> str:
+def _machine(problem: CoDesignProblem, point: FrontPoint) -> Place:
     drawing = plant_of(problem).drawing
-    return machine(problem, point.theta) if drawing is None else drawing({"": point.theta}).svg
+    if drawing is None:
+        return machine(problem, point.theta)
+    return Picture(drawing({"": point.theta}).svg)
 
 
 def _words(problem: CoDesignProblem, point: FrontPoint) -> str:

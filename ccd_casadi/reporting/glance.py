@@ -5,17 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.drawing.content import Figure, Lines, Modes, Picture, Place, Section, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.lines import Panel, figure_lines
 from ccd_casadi.reporting.loops import S_panel, marked
-from ccd_casadi.reporting.machine import lumped, lumped_svg, modes_html, surface_modes_html
+from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.moves import MovePanels
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
-from ccd_casadi.reporting.page import Section, figure_html, number
 from ccd_casadi.reporting.tables import over_frequency
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.classical_margins import least_margins
 
 HEIGHT = 3.0  # inches of a row
@@ -26,10 +25,10 @@ def glance(
 ) -> Section:
     """Of a design on the plants that it is made for."""
     S_max, several = problem.inner.S_max, len(view.open) > 1
-    rows: list[list[Panel | str | None]] = [
-        [machine(problem, theta), S_panel(view)],
-        [nyquist_panel(loci(view), S_max, HEIGHT), move.panels[-1]],
-    ]
+    rows: tuple[tuple[Place, ...], ...] = (
+        (machine(problem, theta), S_panel(view)),
+        (nyquist_panel(loci(view), S_max, HEIGHT), move.panels[-1]),
+    )
     peak = float(view.sizes[0].max())
     on = (
         f", and its loop on {counted(len(view.open), 'plant')} of the set (blue: the model; band, "
@@ -41,13 +40,13 @@ def glance(
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
         f"from -1 in the Nyquist plot.{_margins(view)} {move.caption}"
     )
-    svg = figure_lines(rows, key="glance", title="At a glance", heights=(HEIGHT, HEIGHT))
     head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]
     if view.scalar:
         L = view.open[0, :, 0, 0]
         head, columns = [*head, "Re L", "Im L"], [*columns, L.real, L.imag]
     table = over_frequency(head, view.hz, *columns, special=marked(view))
-    return Section("At a glance", figure_html(svg, words, table, move.table))
+    lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
+    return Section("At a glance", (Figure(lines, words, (table, move.table)),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:
@@ -71,13 +70,10 @@ def _margins(view: LoopView) -> str:
     )
 
 
-def machine(problem: CoDesignProblem, theta: Sequence[float]) -> str:
+def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:
     """Masses and springs with their modes, the first modes of a surface, or a table of modes."""
-    stage = surface_modes_html(problem, theta)
-    if stage:
-        return stage
-    system = mechanics(plant_of(problem), theta)
-    modal, found = modal_plant(system, problem.suspension), lumped(system)
-    if found is None:
-        return modes_html(modal)
-    return lumped_svg(found, modal, float(np.abs(found.masses).max()))
+    plant = plant_of(problem)
+    if plant.shapes is not None:
+        return Modes(plant.shapes(theta, SHOWN_MODES))
+    system = mechanics(plant, theta)
+    return lumped_machine(system, modal_plant(system, problem.suspension))

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.codesign.formulation import Iterate
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLUE, ORANGE
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
+from ccd_casadi.drawing.svg import BLUE, ORANGE
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 LEAST_SPAN = 1e-3  # half the least height of a panel, relative
 LEAST_ERROR = 1e-16  # an exact agreement still has a place on the logarithmic axis
@@ -57,8 +56,13 @@ def _finite(values: list[float]) -> Array:
     return np.where(np.isfinite(array), array, np.nan)
 
 
-def figure_history(history: History, *, key: str = "history") -> str:
+def history_figure(history: History, names: Sequence[str], *, lifted: bool) -> Figure:
     """ω_b and J predicted and true over the rounds, and the error below on a logarithmic axis."""
+    table = _table(history, names)
+    return Figure(_lines(history), _caption(history, lifted), (table,))
+
+
+def _lines(history: History) -> Lines:
     rounds = np.arange(1.0, len(history.error) + 1.0)
     span = (0.7, len(rounds) + 0.3)
 
@@ -85,12 +89,12 @@ def figure_history(history: History, *, key: str = "history") -> str:
         y_range=_error_range(history),
         whole_x=True,
     )
-    top = [
+    top = (
         pair(history.predicted_hz, history.true_hz, "bandwidth ω_b (Hz)"),
         pair(history.predicted_objective, history.objective, "objective J (–)"),
-    ]
+    )
     title = "Predicted and true bandwidth and objective, and their difference, by round"
-    return figure_lines([top, [error]], key=key, title=title, heights=(2.6, 2.2))
+    return Lines((top, (error,)), title, (2.6, 2.2))
 
 
 def _value_range(predicted: Array, truth: Array) -> tuple[float, float]:
@@ -107,7 +111,7 @@ def _error_range(history: History) -> tuple[float, float]:
     return min([*known, history.tolerance]) / 4.0, max([*known, history.tolerance]) * 8.0
 
 
-def caption_history(history: History, *, lifted: bool) -> str:
+def _caption(history: History, lifted: bool) -> str:
     """How the error fell, in numbers."""
     known = history.error[np.isfinite(history.error)]
     rounds = len(history.error) - 1
@@ -133,24 +137,19 @@ def caption_history(history: History, *, lifted: bool) -> str:
     return words.strip()
 
 
-def table_history(history: History, names: Sequence[str]) -> Table:
+def _table(history: History, names: Sequence[str]) -> Table:
     """One row a round."""
     count = len(history.error)
     head = ("round", *names, "ω_b predicted Hz", "ω_b true Hz", "J predicted", "J true", "error")
+    columns = (
+        history.predicted_hz, history.true_hz, history.predicted_objective, history.objective,
+        history.error,
+    )  # fmt: skip
     rows = tuple(
         (
             str(i + 1) if i + 1 < count else "verified",
             *history.theta[i],
-            *(
-                float(column[i])
-                for column in (
-                    history.predicted_hz,
-                    history.true_hz,
-                    history.predicted_objective,
-                    history.objective,
-                    history.error,
-                )
-            ),
+            *(float(column[i]) for column in columns),
         )
         for i in range(count)
     )

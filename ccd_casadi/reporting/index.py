@@ -6,9 +6,11 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.reporting.page import INDEX, Section, Table, escape, page, table_html
+from ccd_casadi.drawing.content import INDEX, Links, Page, Section, Table
+from ccd_casadi.drawing.paint import painted
+from ccd_casadi.drawing.stored import write_page
 from ccd_casadi.reporting.sections_page import conclusion_of
-from ccd_casadi.reporting.verdict import refreshed, run_header
+from ccd_casadi.reporting.verdict import refreshed, run_head
 from surrogates.files import write_whole
 
 PAGES = {
@@ -18,7 +20,8 @@ PAGES = {
     "*/report.html": "a deployment: order, rate, code, the move on the machine",
 }
 FILES = {
-    "result.json": "every figure of the run", "controller.json": "the controller, SI",
+    "result.json": "every figure of the run", "report.json": "what the pages show",
+    "controller.json": "the controller, SI",
     "case.toml": "the case as it was solved", "samples.sqlite": "every synthesis and design",
     "surrogate.json": "the surrogate", "insight.json": "the figures of insight.html",
     "robustness.json": "the figures of robustness.html", "plant.py": "the plant's own code",
@@ -28,6 +31,17 @@ FILES = {
 def index_of(folder: Path) -> str:
     """What a page in this folder links as the page of all pages; empty where it holds no run."""
     return INDEX if (folder / "result.json").exists() else ""
+
+
+def index_above(folder: Path, run: Path) -> str:
+    """The same of a page in a folder of its own below the run's."""
+    return f"../{INDEX}" if folder.resolve().parent == run.resolve() else ""
+
+
+def publish(folder: Path, path: Path, page: Page) -> None:
+    """Write a page about the run in `folder` with what it shows, and the run's index anew."""
+    write_page(path, page)
+    write_index(folder)
 
 
 def write_index(folder: Path) -> None:
@@ -47,20 +61,19 @@ def write_index(folder: Path) -> None:
         now = refreshed(text, result, whole=place == folder / "report.html")
         if now != text:
             write_whole(place, now)
-    items = "\n".join(
-        f'<li><a href="{quote(place.relative_to(folder).as_posix())}">{escape(_title(place))}</a>'
-        f": {escape(words)}</li>"
+    links = tuple(
+        (quote(place.relative_to(folder).as_posix()), _title(place), words)
         for place, words in pages.items()
     )
     files = tuple((n, words) for n, words in FILES.items() if (folder / n).exists())
     name = folder.resolve().name
     lead = conclusion_of(result)
-    head = run_header(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
-    sections = [
-        Section("Pages", f"<ul>{items}</ul>"),
-        Section("Files", table_html(Table(("file", "what it is"), files))),
-    ]
-    write_whole(folder / INDEX, page(f"Run: {name}", sections, head, index=""))
+    head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
+    sections = (
+        Section("Pages", (Links(links),)),
+        Section("Files", (Table(("file", "what it is"), files),)),
+    )
+    write_whole(folder / INDEX, painted(Page(head, sections, index="")))
 
 
 def _pages(folder: Path) -> dict[Path, str]:

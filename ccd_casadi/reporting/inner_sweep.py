@@ -6,13 +6,12 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
+from ccd_casadi.drawing.content import Figure, SweepMap, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.lifted_maximum import fields
-from ccd_casadi.reporting.maps import SweepMap
-from ccd_casadi.reporting.page import Table, number
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 
 LEAST_ROWS = 9
@@ -95,7 +94,12 @@ def _interpolated(rows: Array, low: Array, axes: list[Array]) -> Array | None:
     return np.moveaxis(between(points), -1, 0)
 
 
-def caption_sweep(sweep: SweepMap, bounds: Mapping[str, float]) -> str:
+def sweep_figure(sweep: SweepMap, bounds: Mapping[str, float]) -> Figure:
+    """The map with its words and numbers."""
+    return Figure(sweep, _caption(sweep, bounds), (_table(sweep),))
+
+
+def _caption(sweep: SweepMap, bounds: Mapping[str, float]) -> str:
     """How many syntheses, how many feasible, and what S_max costs."""
     inside = sweep.rows[:, 5] > 0.5
     given = [f"{name} = {bound:g}" for name, bound in bounds.items()]
@@ -119,7 +123,7 @@ def caption_sweep(sweep: SweepMap, bounds: Mapping[str, float]) -> str:
     return words
 
 
-def table_sweep(sweep: SweepMap) -> Table:
+def _table(sweep: SweepMap) -> Table:
     """Every synthesis at the optimum."""
     head = ("ω_S Hz", "ω_T Hz", "ω_b Hz", "‖S‖∞", "|S(ω_low)|", "feasible")
     return Table(

@@ -1,26 +1,85 @@
-"""What a designer asks of an optimum: the trade-off, what it answers to, what limits it."""
+"""insight.html: the trade-off around a design, what it answers to, what limits it."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.codesign.insight import bandwidth_of, natural_hz
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.pareto import Front
 from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.drawing.content import (
+    Block,
+    Bullets,
+    Curve,
+    Figure,
+    Lines,
+    Mark,
+    Page,
+    Panel,
+    Section,
+    Table,
+    Words,
+)
+from ccd_casadi.drawing.svg import CYCLE, GREY
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis
-from ccd_casadi.reporting.lines import Curve, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import CYCLE, GREY
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_words
+from ccd_casadi.reporting.front_walk import front_walk
+from ccd_casadi.reporting.limits import limit_blocks
+from ccd_casadi.reporting.loops import run_view
+from ccd_casadi.reporting.sections_page import binding_words
+from ccd_casadi.reporting.verdict import head_of
+from ccd_casadi.support.units import HZ, number, shown_unit
 
 ROUNDING = 1e-9  # of the box: a doubled parameter that moves θ by less does not move it
 RULE = (3.0, 5.0)  # first resonance over bandwidth, as the rule of thumb of the field asks for
 
 
-def figure_front(
-    problem: CoDesignProblem, front: Front, design: tuple[float, float, str], *, key: str = "front"
-) -> str:
+def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: str = "") -> Page:
+    """insight.html; `index`: the page that it links as that of the whole run."""
+    problem = run.problem
+    bandwidth_hz = bandwidth_of(run) / HZ
+    cost = float(run.result["hardware_cost"])
+    rule = rule_sentence(bandwidth_hz, natural_hz(run))
+    verified = sum(point.verified for point in front.points)
+    whole = verified == len(front.points)
+    head = head_of(
+        f"Insight: {run.case.path.parent.name}",
+        whole,
+        "verified" if whole else "not all verified",
+        f"{verified} of {len(front.points)} points of the front",
+        f"around the design of {run.folder.name}/result.json",
+        f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
+        f"of {cost_words(run.result)}. {rule}",
+        run.result,
+    )
+    drawn = front_figure(problem, front, (cost, bandwidth_hz, "this run's design"))
+    answers = [Words(text) for text in response_sentences(responses)]
+    sections = (
+        Section("Weight against bandwidth", (drawn, *front_walk(run, front))),
+        Section("What each parameter of the case would change",
+                (*answers, table_responses(problem, responses))),
+        Section("What limits the bandwidth", _limits(run, rule)),
+    )
+    return Page(head, sections, index)
+
+
+def _limits(run: FinishedRun, rule: str) -> tuple[Block, ...]:
+    """The shares of γ; of a fixed structure, which has no γ, the bounds that hold it."""
+    if run.result.get("gamma") is None:
+        held = binding_words(run.problem, run.result)
+        without = (
+            "A fixed structure has no γ, and no weights' frequencies to move: what holds ω_b are "
+            "the bounds above."
+        )
+        return Bullets(tuple(held)), Words(without), Words(rule)
+    return limit_blocks(run_view(run), rule)
+
+
+def front_figure(
+    problem: CoDesignProblem, front: Front, design: tuple[float, float, str]
+) -> Figure:
     """Bandwidth over hardware cost, and where each θ lies in its bounds along the curve.
 
     `design` is (f, ω_b in Hz, words) of the run's own optimum.
@@ -47,10 +106,11 @@ def figure_front(
     )
     bottom = Panel(cost_axis(problem), "place of θ in its bounds (–)", parts, y_range=(-0.05, 1.05))
     title = "Largest bandwidth at each hardware cost, and the hardware that reaches it"
-    return figure_lines([[top], [bottom]], key=key, title=title, heights=(3.3, 2.8))
+    lines = Lines(((top,), (bottom,)), title, (3.3, 2.8))
+    return Figure(lines, _caption(front), (_table(problem, front),))
 
 
-def caption_front(front: Front) -> str:
+def _caption(front: Front) -> str:
     """How many points, how well they are known, and what the trade-off comes to."""
     points = front.points
     verified = sum(point.verified for point in points)
@@ -77,7 +137,7 @@ def caption_front(front: Front) -> str:
     return words
 
 
-def table_front(problem: CoDesignProblem, front: Front) -> Table:
+def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
     shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     heads = (f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, shown, strict=True))

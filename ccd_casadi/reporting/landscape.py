@@ -2,15 +2,14 @@
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Landscape, Table
+from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
-from ccd_casadi.reporting.maps import Landscape
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 from surrogates.quality import Missed
 
@@ -207,7 +206,7 @@ def caption_disagreement(
     )
 
 
-def tables_landscape(land: Landscape) -> list[Table]:
+def tables_landscape(land: Landscape) -> tuple[Table, ...]:
     """The grid, thinned, and the true samples."""
     tables = []
     first, second = land.names
@@ -223,5 +222,4 @@ def tables_landscape(land: Landscape) -> list[Table]:
         )
         tables.append(Table(head, body))
     head = (axis_label(first, land.units[0]), axis_label(second, land.units[1]), "true ω_b* (Hz)")
-    tables.append(Table(head, tuple(tuple(map(float, row)) for row in land.truths)))
-    return tables
+    return (*tables, Table(head, tuple(tuple(map(float, row)) for row in land.truths)))

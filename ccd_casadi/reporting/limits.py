@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
-from ccd_casadi.reporting.page import Table, number
+from ccd_casadi.drawing.content import Block, Table, Words
+from ccd_casadi.support.units import number
 
 PARTS = ("|S|", "|KS|", "|T|")
 
@@ -69,3 +70,8 @@ def limit_sentences(loop: LoopView) -> list[str]:
 
 def _nearest(values: Sequence[float], hz: float) -> float:
     return min(values, key=lambda v: abs(np.log(v / hz)), default=np.nan)
+
+
+def limit_blocks(loop: LoopView, *more: str) -> tuple[Block, ...]:
+    """The sentences, `more` of them, and the table."""
+    return (*map(Words, (*limit_sentences(loop), *more)), table_limits(loop))

@@ -5,22 +5,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import NAMES, LoopView
+from ccd_casadi.analysis.loop_view import NAMES, LoopView, phase_deg
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.reporting.bode import phase_deg
-from ccd_casadi.reporting.lines import Band, Curve, Level, Mark, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import BLACK, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
     from ccd_casadi.codesign.verified import Verified
 
-Areas = tuple[tuple[np.ndarray, str], ...]  # corners x + iy, colours
 UNITS = {"S": "–", "KS": "N/m", "T": "–"}
 PEAK = 1.05  # |S| of a local maximum that is worth a word
 
@@ -51,6 +49,14 @@ def view_of(verified: "Verified") -> LoopView:
     return design_view(
         verified.problem, verified.theta, verified.controller,
         bandwidth_hz=verified.bandwidth / HZ, **bounds,
+    )  # fmt: skip
+
+
+def run_view(run: FinishedRun) -> LoopView:
+    """The loop of a finished run over frequency."""
+    return design_view(
+        run.problem, run.theta, run.controller, weights=run.weights, gamma=run.figures.gamma,
+        bandwidth_hz=float(run.result["bandwidth_hz"]),
     )  # fmt: skip
 
 
@@ -132,31 +138,32 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
     return over_hz(label, curves, ends, levels=tuple(bare), **{**found, **more})
 
 
-def figure_gains(views: Sequence[LoopView], *, key: str = "gains", bounds: bool = True) -> str:
+def figure_gains(views: Sequence[LoopView], *, bounds: bool = True) -> Lines:
     """S over the full width, KS and T below it; of one design L and GS where these are asked."""
     S, *others = gain_panels(views, bounds=bounds)
     more = _open_loop(views[0]) if len(views) == 1 else []
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
     heights = (3.3, *[2.7] * (1 + len(more)))
-    return figure_lines([[S], others, *more], key=key, title=title, heights=heights)
+    return Lines(((S,), tuple(others), *more), title, heights)
 
 
-def _open_loop(view: LoopView) -> list[list[Panel]]:
+def _open_loop(view: LoopView) -> list[tuple[Panel, ...]]:
     """L of one channel on several plants as a Bode plot, and |GS| where it is bounded."""
-    rows: list[list[Panel]] = []
+    rows: list[tuple[Panel, ...]] = []
     at = (Level(view.bandwidth_hz, "", True),)  # as above
     if view.scalar and len(view.open) > 1:
         L = view.open[:, :, 0, 0]
         phase = phase_deg(L.T).T
-        rows.append([
+        rows.append((
             _of_plants(view, "|L| (–)", np.abs(L), (Level(1.0, "1", colour=GREY), *at)),
             _of_plants(view, "phase of L (deg)", phase, (Level(-180.0, "", colour=GREY), *at),
                        log_y=False, y_step=90.0),
-        ])  # fmt: skip
+        ))  # fmt: skip
     most = view.bounded.compliance_max
     if most is not None:
         level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
-        rows.append([_of_plants(view, f"{view.named('GS')} (µm/N)", 1e6 * view.sizes[3], (level,))])
+        GS = 1e6 * view.sizes[3]
+        rows.append((_of_plants(view, f"{view.named('GS')} (µm/N)", GS, (level,)),))
     return rows
 
 
@@ -172,27 +179,22 @@ def _of_plants(
 
 def forbidden(
     S_max: float, S_low: float, low_hz: float, low: float, high: float, top: float
-) -> Areas:
+) -> tuple[Area, ...]:
     """Where |S| may not be, over Hz: above S_max, and above S_low up to `low_hz`."""
-    return (
-        (_box(low, high, S_max, top), ORANGE),
-        (_box(low, low_hz, S_low, min(S_max, top)), ORANGE),
-    )
+    return _box(low, high, S_max, top), _box(low, low_hz, S_low, min(S_max, top))
 
 
-def above(hz: Array, bound: Array, top: float) -> Areas:
+def above(hz: Array, bound: Array, top: float) -> tuple[Area, ...]:
     """Where a gain may not be, over Hz: above a bound that is NaN where nothing is asked."""
     asked = np.isfinite(bound) & (bound < top)
     if not asked.any():
         return ()
     x, y = hz[asked], bound[asked]
-    ends = np.array([complex(x[-1], top), complex(x[0], top)])
-    return ((np.concatenate([x + 1j * y, ends]), ORANGE),)
+    return (Area(np.append(x, [x[-1], x[0]]), np.append(y, [top, top])),)
 
 
-def _box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
-    return np.array([complex(x, y) for x, y in (
-        (left, bottom), (right, bottom), (right, top), (left, top))])  # fmt: skip
+def _box(left: float, right: float, bottom: float, top: float) -> Area:
+    return Area(np.array([left, right, right, left]), np.array([bottom, bottom, top, top]))
 
 
 def _high_peaks(view: LoopView) -> list[tuple[float, float]]:
@@ -211,13 +213,13 @@ def _peak_marks(tops: Sequence[tuple[float, float]], colour: str) -> list[Mark]:
     return marks
 
 
-def gains_html(view: LoopView, key: str = "gains") -> str:
-    """The figure of one design with its words and numbers."""
-    return figure_html(figure_gains([view], key=key), caption_gains(view), table_gains(view))
+def gains(view: LoopView) -> Figure:
+    """S, KS and T of one design with their words and numbers."""
+    return Figure(figure_gains([view]), _caption(view), (table_gains(view),))
 
 
-def caption_gains(view: LoopView) -> str:
-    """What to see in the gains of one design, in numbers."""
+def _caption(view: LoopView) -> str:
+    """What to see, in numbers."""
     S_max, plants = view.bounded.S_max, len(view.open)
     tops = _high_peaks(view)
     words = ""

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.drawing import svg
+from ccd_casadi.drawing.content import Picture, Table
+from ccd_casadi.drawing.page import escape
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.reporting import svg
-from ccd_casadi.reporting.page import escape, number
-from ccd_casadi.reporting.turntable import still
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ
+from ccd_casadi.support.units import HZ, number
 
 # in a page's own theme, where it has one
 BLUE, GREEN, ORANGE = (
@@ -132,50 +131,26 @@ def _text(x: float, y: float, words: str, anchor: str = "middle") -> str:
     return f'<text {place} fill="currentColor">{escape(words)}</text>'
 
 
-def machine_html(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    start: Sequence[float],
-    system: Mechanics,
-    modal: ModalPlant,
-    reference: float,
-) -> str:
-    """The machine at θ: its drawing beside that of the start, masses and springs, or its modes.
+def lumped_machine(
+    system: Mechanics, modal: ModalPlant, reference: float | None = None
+) -> Picture | Table:
+    """Masses and springs with their modes, or a table of the modes.
 
-    `system` and `modal` are of θ, or of what stands for it; `reference`: see `lumped_svg`.
+    `reference`: see `lumped_svg`; the largest mass by itself.
     """
-    plant = plant_of(problem)
-    if plant.drawing is not None:
-        drawn = plant.drawing({"this design": theta, "the start": start})
-        return f'<div style="background:#fff;color:#1a1a1a">{drawn.svg}</div>'
     found = lumped(system)
     if found is None:
-        return modes_html(modal)
-    return lumped_svg(found, modal, reference)
+        return modes_table(modal)
+    return Picture(lumped_svg(found, modal, reference or float(np.abs(found.masses).max())))
 
 
-def modes_html(modal: ModalPlant) -> str:
-    """A table of the modes: frequency, damping ratio, how they are driven and measured."""
+def modes_table(modal: ModalPlant) -> Table:
+    """Of each mode: frequency, damping ratio, how it is driven and measured."""
     b, c = np.linalg.norm(modal.B, axis=1), np.linalg.norm(modal.C, axis=0)
     rows = []
     for i in np.argsort(modal.natural, kind="stable"):
         omega = float(modal.natural[i])
         hz = "rigid" if modal.rigid[i] else f"{number(omega / HZ, 4)} Hz"
         zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
-        share = (b[i] / b.max(), c[i] / c.max())
-        rows.append(f"<tr><td>{hz}<td>{zeta}<td>{share[0]:.2g}<td>{share[1]:.2g}")
-    head = "<tr><th>mode<th>damping<th>driven<th>measured"
-    return f"<table>{head}{''.join(rows)}</table>"
-
-
-def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
-    """The first flexible modes on the plant's surface; empty for a plant that has none."""
-    plant = plant_of(problem)
-    if plant.shapes is None:
-        return ""
-    shapes = plant.shapes(theta, SHOWN_MODES)
-    parts = []
-    for mode in shapes.modes:
-        words = f"{number(mode.frequency, 4)} Hz"
-        parts.append(f'<div style="flex:1 1 85px">{words}{still(shapes, mode, words)}</div>')
-    return f'<div style="display:flex;flex-wrap:wrap">{"".join(parts)}</div>'
+        rows.append((hz, zeta, f"{b[i] / b.max():.2g}", f"{c[i] / c.max():.2g}"))
+    return Table(("mode", "damping", "driven", "measured"), tuple(rows))

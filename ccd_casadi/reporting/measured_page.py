@@ -3,41 +3,40 @@
 from collections import defaultdict
 from collections.abc import Mapping
 from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ccd_casadi.cases.measured_case import MeasuredCase
+from ccd_casadi.drawing.content import (
+    Curve,
+    Facts,
+    Figure,
+    Head,
+    Level,
+    Lines,
+    Page,
+    Section,
+    Words,
+)
+from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.fixed_structure.measured_loop import between, controller_response
 from ccd_casadi.lti.closed_loop import largest, open_alone, sensitivity
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.reporting.facts import Fact, loop_facts
-from ccd_casadi.reporting.lines import Curve, Level, figure_lines
 from ccd_casadi.reporting.loops import bandwidth_level, forbidden, over_hz, sensitivity_panel
 from ccd_casadi.reporting.nyquist import FAR, nyquist_panel
-from ccd_casadi.reporting.page import (
-    Section,
-    facts_html,
-    figure_html,
-    header,
-    number,
-    page,
-    paragraph,
-)
-from ccd_casadi.reporting.sections_page import controller_html
-from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE
+from ccd_casadi.reporting.sections_page import controller_blocks
 from ccd_casadi.reporting.tables import over_frequency
-from ccd_casadi.support.units import HZ
-from surrogates.files import write_whole
+from ccd_casadi.support.units import HZ, number
 
 HEIGHT = 3.0  # inches of a row
 
 
-def write_measured(
-    folder: Path, case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]
-) -> Path:
-    """Write `folder`/report.html of a stable design; `answer` is what `inner` prints of it."""
+def measured_page(
+    case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]
+) -> Page:
+    """report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
     lines = f"{len(case.responses[0].hz)} lines of {case.file}"
     basis = " and by the poles of the closed loop" if answer.get("models") else "; no model"
@@ -45,22 +44,21 @@ def write_measured(
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
         f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}{basis}."
     )
-    head = header(
-        f"Controller on {case.file}", good, "verified" if good else "not verified",
-        answer["reason"], f"{case.path.name} · {lines}", lead,
+    head = Head(
+        f"Controller on {case.file}", "good" if good else "bad",
+        "verified" if good else "not verified", answer["reason"], f"{case.path.name} · {lines}",
+        lead,
     )  # fmt: skip
-    sections = [
-        Section("The loop on the lines", _loop_html(case, controller, answer)),
-        Section("The figures", facts_html(_facts(case, answer))
-                + paragraph(f"What this rests on: {answer['words']}.")),
-        Section("The controller", controller_html(answer)),
-    ]  # fmt: skip
-    path = folder / "report.html"
-    write_whole(path, page(f"Controller on {case.file}", sections, head, index=""))
-    return path
+    figures = Facts(tuple(_facts(case, answer))), Words(f"What this rests on: {answer['words']}.")
+    sections = (
+        Section("The loop on the lines", (_loop(case, controller, answer),)),
+        Section("The figures", figures),
+        Section("The controller", controller_blocks(answer)),
+    )
+    return Page(head, sections, index="")
 
 
-def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> str:
+def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> Figure:
     """|S| and the Nyquist plot, |G| and |L|, |KS| and |T|: values at the lines, joined straight.
 
     Of several channels the largest singular values, and the loops opened one at a time.
@@ -84,21 +82,19 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
     top = 2.5 * max(bounds.S_max, *(float(curve.y.max()) for curve in curves["S"]))
     at = bandwidth_level(answer["bandwidth_hz"])
     shown = [np.where(np.abs(L) <= FAR, L, np.nan) for L in loci]
-    rows = [
-        [sensitivity_panel(
+    rows = (
+        (sensitivity_panel(
             (*curves["at most"], *curves["S"]), ends, bounds.S_max, (at,), "|S| (–)",
             y_range=(0.5 * float(size.min()), top),
             forbidden=forbidden(bounds.S_max, bounds.S_low, bounds.omega_low / HZ, *ends, top)),
-         nyquist_panel(shown, bounds.S_max, HEIGHT)],
-        [over_hz("|G| measured (m/N)", curves["G"], ends),
-         over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))],
-        [over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
-         over_hz("|T| (–)", curves["T"], ends, levels=(at,))],
-    ]  # fmt: skip
-    svg = figure_lines(rows, key="measured", title="The loop on the measured lines",
-                       heights=(HEIGHT, 2.6, 2.6))  # fmt: skip
+         nyquist_panel(shown, bounds.S_max, HEIGHT)),
+        (over_hz("|G| (m/N)", curves["G"], ends),
+         over_hz("|L| (–)", curves["L"], ends, levels=(Level(1.0, "1"), at))),
+        (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
+         over_hz("|T| (–)", curves["T"], ends, levels=(at,))),
+    )  # fmt: skip
     words = (
-        "Every bound is asked for on every line: S out of the shaded area, L out of the disk. "
+        "Every bound is required on every line: S out of the shaded area, L out of the disk. "
         "Grey: what |S| may reach between two lines, if GK bends there as around them. A resonance "
         "that fits between two lines is not seen."
     )
@@ -108,7 +104,8 @@ def _loop_html(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, 
         curves["T"][0].y,
         special=[answer["bandwidth_hz"], answer["sensitivity_peak_hz"]],
     )  # fmt: skip
-    return figure_html(svg, words, table)
+    lines = Lines(rows, "The loop on the measured lines", (HEIGHT, 2.6, 2.6))
+    return Figure(lines, words, (table,))
 
 
 def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:

@@ -2,39 +2,17 @@
 
 import numpy as np
 
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
-from ccd_casadi.reporting.page import Table, escape, figure_html, number
-from ccd_casadi.reporting.turntable import REACH, data, legend, still
+from ccd_casadi.drawing.content import Figure, Modes, Table
+from ccd_casadi.drawing.pictures import ModeShapes
+from ccd_casadi.drawing.turntable import REACH
+from ccd_casadi.support.units import number
 
 SHOWN = 6
 
 
-def mode_shape_figure(shapes: ModeShapes) -> str:
-    """The modes with their frequencies in Hz, as a figure's HTML.
-
-    Without the page's script, and on paper, the pictures stand still.
-    """
-    views = "\n".join(
-        f'<div class="view"><p>{escape(_title(mode))}</p>'
-        f'<div class="drawn">{still(shapes, mode, _title(mode))}</div></div>'
-        for mode in shapes.modes
-    )
-    scale = legend("displacement as a share of each mode's largest (–)")
-    body = (
-        f'<div class="turntable">\n<div class="views">\n{views}\n</div>\n{scale}\n'
-        f'<script type="application/json">{data(shapes)}</script>\n</div>'
-    )
-    return figure_html(body, _caption(shapes), table_modes(shapes))
-
-
-def _title(mode: ModeShape) -> str:
-    pair = ", a pair" if len(mode.numbers) > 1 else ""
-    words = f": {mode.words}" if mode.words else ""
-    return f"{_places(mode)}{words}{pair}, {number(mode.frequency, 4)} Hz"
-
-
-def _places(mode: ModeShape) -> str:
-    return " and ".join(map(str, mode.numbers))
+def mode_shape_figure(shapes: ModeShapes) -> Figure:
+    """The modes with their frequencies in Hz, to be turned."""
+    return Figure(Modes(shapes, turning=True), _caption(shapes), (table_modes(shapes),))
 
 
 def _caption(shapes: ModeShapes) -> str:
@@ -64,7 +42,7 @@ def table_modes(shapes: ModeShapes) -> Table:
     head = ("mode", "shape", "frequency (Hz)", "largest displacement (1/√kg)")
     rows = [
         (
-            _places(mode), mode.words, mode.frequency,
+            mode.places, mode.words, mode.frequency,
             float(np.linalg.norm(mode.displacement, axis=1).max()), *mode.more.values(),
         )
         for mode in shapes.modes

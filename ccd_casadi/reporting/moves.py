@@ -5,22 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_figures import force_step
+from ccd_casadi.analysis import loop_figures
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
+from ccd_casadi.drawing.svg import GREY
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, figure_html, number
-from ccd_casadi.reporting.svg import GREY
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.units import counted, number
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
@@ -75,27 +74,26 @@ def move_panels(
     return MovePanels(tuple(panels), caption, over_time(heads, *columns))
 
 
-def move_html(found: MovePanels) -> str:
-    """What `move_panels` found, as a figure."""
-    svg = figure_lines([list(found.panels)], key="move", heights=(3.2,), title="Error of a move")
-    return figure_html(svg, found.caption, found.table)
+def move_figure(found: MovePanels) -> Figure:
+    """What `move_panels` found."""
+    return Figure(Lines((found.panels,), "Error of a move", (3.2,)), found.caption, (found.table,))
 
 
-def force_step_html(loops: Sequence[Loop], bandwidth_hz: float) -> str:
+def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     """The position of every plant after a step of force at the actuator."""
     slow = min(float(-loop.poles.real.max()) for loop in loops)
     times = np.geomspace(0.02 / (2.0 * np.pi * bandwidth_hz), SETTLED / slow, STEPS)
-    steps = [force_step(loop, times) for loop in loops]
+    steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
     panel = _over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
-    svg = figure_lines([[panel]], key="force", heights=(3.2,), title="A step of force")
     head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
     )  # fmt: skip
     words = f"A force of 1 N at the actuator moves {on}."
-    return figure_html(svg, words, over_time(head, 1e3 * t, *_columns(y)))
+    lines = Lines(((panel,),), "A step of force", (3.2,))
+    return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
 
 
 def _over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:

@@ -9,29 +9,20 @@ from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.cases.sections import Case
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.drawing.content import Block, Facts, Head, Heading, Table, Words
+from ccd_casadi.drawing.page import CSS
+from ccd_casadi.drawing.paint import block_html, head_html
 from ccd_casadi.fixed_structure import SectionsDesign
-from ccd_casadi.fixed_structure.modal_fit import ModalFit
-from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
 from ccd_casadi.reporting.facts import theta_table
-from ccd_casadi.reporting.loops import gains_html, view_of
-from ccd_casadi.reporting.page import (
-    CSS,
-    Table,
-    escape,
-    facts_html,
-    header,
-    number,
-    paragraph,
-    table_html,
-)
-from ccd_casadi.reporting.sections_page import conclusion_of, controller_html
-from ccd_casadi.reporting.verdict import run_header
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.reporting.loops import gains, run_view, view_of
+from ccd_casadi.reporting.sections_page import conclusion_of, controller_blocks
+from ccd_casadi.reporting.verdict import run_head
+from ccd_casadi.support.units import HZ, number, shown_unit
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
@@ -49,8 +40,11 @@ def html_of(item: object) -> str:
     raise TypeError(f"{type(item).__name__} has no form in a notebook")
 
 
-def _cell(*parts: str) -> str:
-    body = "\n".join(parts)
+def _cell(*parts: Head | Block) -> str:
+    body = "\n".join(
+        head_html(part) if isinstance(part, Head) else block_html(part, f"nb{next(_figures)}")
+        for part in parts
+    )
     # the page's own rules, nested: `h1` is `.ccd h1` in here
     return f'<div class="ccd"><style>.ccd {{{_OWN}{CSS}{_SMALL}}}</style>\n{body}\n</div>'
 
@@ -58,20 +52,14 @@ def _cell(*parts: str) -> str:
 @html_of.register
 def _(item: Solution) -> str:
     result, own = item.result, item.verified
-    parts = [_result_head(result)]
-    if own is not None:
-        parts = _design_parts(own.problem, result, view_of(own))
-    return _cell(*parts)
+    if own is None:
+        return _cell(_result_head(result))
+    return _cell(*_design_parts(own.problem, result, view_of(own)))
 
 
 @html_of.register
 def _(item: FinishedRun) -> str:
-    view = design_view(
-        item.problem, item.theta, item.controller, weights=item.weights, gamma=item.figures.gamma,
-        bandwidth_hz=float(item.result["bandwidth_hz"]),
-    )  # fmt: skip
-    parts = _design_parts(item.problem, item.result, view)
-    return _cell(*parts)
+    return _cell(*_design_parts(item.problem, item.result, run_view(item)))
 
 
 @html_of.register
@@ -101,76 +89,65 @@ def _(item: CoDesignProblem) -> str:
         facts.append(("Robust set", shifts, f"made on the plant: {item.robust.design_at}"))
     source = item.source
     name = source.model or f"{source.file}:{source.function}"
-    head = f"<h1>{escape(f'A co-design problem: {name}')}</h1>"
-    table = table_html(Table(("θ", "unit", "lower", "upper", "start"), tuple(rows)))
-    return _cell(head, table, facts_html(facts))
+    table = Table(("θ", "unit", "lower", "upper", "start"), tuple(rows))
+    return _cell(Heading(f"A co-design problem: {name}"), table, Facts(tuple(facts)))
 
 
 @html_of.register
 def _(item: InnerResult) -> str:
     if item.optimum is None:
         words = f"{item.shortfall}; {item.syntheses} syntheses"
-        return _cell(header("The inner problem", False, "infeasible", "", "", words))
+        return _cell(Head("The inner problem", "bad", "infeasible", "", "", words))
     binds = ", ".join(item.active) or "nothing"
     words = f"The largest bandwidth of {item.syntheses} syntheses; {binds} binds."
-    return _cell(_design("The inner problem", item.optimum.figures, words))
+    return _cell(*_design("The inner problem", item.optimum.figures, words))
 
 
 @html_of.register
 def _(item: Sensitivities) -> str:
-    return _cell(_design("One synthesis, with derivatives", item.figures))
+    return _cell(*_design("One synthesis, with derivatives", item.figures))
 
 
 @html_of.register
 def _(item: Design) -> str:
     order = f"A controller of {len(item.controller.A)} states."
-    return _cell(_design("One synthesis", item.figures, order))
+    return _cell(*_design("One synthesis", item.figures, order))
 
 
 @html_of.register
 def _(item: SectionsDesign) -> str:
     title, outcome = "A controller of fixed structure", item.outcome.name.lower()
     spent = f"{item.starts} starts, {number(item.seconds, 2)} s"
-    parts = [header(title, item.certified, outcome, item.words, spent, "")]
-    if item.controller is not None:
-        hz = f"{number(item.bandwidth / HZ)} Hz"
-        parts.append(facts_html([("Bandwidth ω_b", hz, "on every plant")]))
-        parts.append(controller_html({"controller": sections_dict(item.structure, item.kappa)}))
-    return _cell(*parts)
+    head = Head(title, "good" if item.certified else "bad", outcome, item.words, spent, "")
+    if item.controller is None:
+        return _cell(head)
+    found = Facts((("Bandwidth ω_b", f"{number(item.bandwidth / HZ)} Hz", "on every plant"),))
+    made = {"controller": sections_dict(item.structure, item.kappa)}
+    return _cell(head, found, *controller_blocks(made))
 
 
-@html_of.register
-def _(item: ModalFit) -> str:
-    n, off = len(item.hz), 100.0 * item.deviations
-    rows = zip(item.hz, off[:n], item.damping, off[n : 2 * n], item.gains[:n], off[2 * n : 3 * n],
-               strict=True)  # fmt: skip
-    head = ("Hz", "± %", "damping ratio", "± %", "gain 1/kg", "± %")
-    words = f"{item.lines} lines; what is not fitted is {100.0 * item.noise:.3g} % of |G|."
-    table = table_html(Table(head, tuple(tuple(map(float, row)) for row in rows)))
-    return _cell(f"<h1>{n} modes of a measured response</h1>", table, paragraph(words))
-
-
-def _result_head(result: Mapping[str, Any]) -> str:
-    return run_header("Co-design", result, "", conclusion_of(result))
+def _result_head(result: Mapping[str, Any]) -> Head:
+    return run_head("Co-design", result, "", conclusion_of(result))
 
 
 def _design_parts(
     problem: CoDesignProblem, result: Mapping[str, Any], view: LoopView
-) -> list[str]:
-    parts = [_result_head(result), table_html(theta_table(problem, result))]
+) -> list[Head | Block]:
+    parts: list[Head | Block] = [_result_head(result), theta_table(problem, result)]
     if "sections" in result.get("controller", {}):
-        parts.append(controller_html(result))
-    return [*parts, gains_html(view, f"notebook-{next(_figures)}")]
+        parts += controller_blocks(result)
+    return [*parts, gains(view)]
 
 
-def _design(title: str, figures: DesignFigures, words: str = "") -> str:
-    head = header(title, figures.certified, figures.outcome.value, "", "", "")
+def _design(title: str, figures: DesignFigures, words: str = "") -> tuple[Head | Block, ...]:
+    badge = "good" if figures.certified else "bad"
+    head = Head(title, badge, figures.outcome.value, "", "", "")
     if not figures.certified:
-        return head + paragraph(words)
+        return head, Words(words)
     certificate = figures.certificate
     norm = f"{number(certificate.norm, 6)} ≤ {number(certificate.norm_bound, 6)}"
     peak = f"at {number(figures.sensitivity_peak_frequency / HZ)} Hz"
-    facts = [
+    facts = (
         ("Bandwidth ω_b", f"{number(figures.bandwidth / HZ)} Hz", ""),
         ("Weights", f"ω_S {number(figures.omega_S / HZ)} Hz",
          f"ω_T {number(figures.omega_T / HZ)} Hz"),
@@ -178,5 +155,5 @@ def _design(title: str, figures: DesignFigures, words: str = "") -> str:
         ("|S| at ω_low", number(figures.sensitivity_low), ""),
         ("Norm against its bound", norm, f"γ_opt {number(figures.gamma_opt, 6)}"),
         ("Slowest pole", f"{number(certificate.max_real_pole, 4)} 1/s", ""),
-    ]  # fmt: skip
-    return head + facts_html(facts) + paragraph(words)
+    )  # fmt: skip
+    return head, Facts(facts), Words(words)

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ccd_casadi.reporting.lines import BOTTOM, LEFT, RIGHT, TOP, Curve, Mark, Panel
-from ccd_casadi.reporting.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
+from ccd_casadi.drawing.content import Area, Curve, Mark, Panel
+from ccd_casadi.drawing.lines import BOTTOM, LEFT, RIGHT, TOP
+from ccd_casadi.drawing.svg import BLUE, GREEN, GREY, ORANGE, WIDTH
 
 SHOWN = (-3.2, 1.6)  # of the real axis
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
@@ -27,7 +28,8 @@ def nyquist_panel(loci: Sequence[np.ndarray], S_max: float, height: float) -> Pa
     half = 0.5 * (SHOWN[1] - SHOWN[0]) * tall / wide  # a circle is round
     return Panel(
         "Re L (–)", "Im L (–)", tuple(curves), marks=(Mark(-1.0, 0.0, marker="+"),),
-        x_range=SHOWN, y_range=(-half, half), legend="lower right", forbidden=((disk, ORANGE),),
+        x_range=SHOWN, y_range=(-half, half), legend="lower right",
+        forbidden=(Area(disk.real, disk.imag),),
     )  # fmt: skip
 
 

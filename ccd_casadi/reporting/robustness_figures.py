@@ -4,10 +4,9 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
+from ccd_casadi.drawing.content import Band, Curve, Level, Lines, Panel, Table
+from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.loops import over_hz
-from ccd_casadi.reporting.page import Table
-from ccd_casadi.reporting.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
 from ccd_casadi.robust.perturbed import Line
 from ccd_casadi.robust.structured import StructuredBound
@@ -19,7 +18,7 @@ SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
 
 
-def gains(found: Study) -> str:
+def gains(found: Study) -> Lines:
     """S and T in one panel, GS and KS in one each."""
     ends = (float(found.hz[0]), float(found.hz[-1]))
 
@@ -30,11 +29,11 @@ def gains(found: Study) -> str:
         )
         return over_hz(label, drawn, ends)
 
-    rows = [
-        [panel("σ_max (–)", (0, "S"), (1, "T"))],
-        [panel("σ_max(GS) (µm/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))],
-    ]
-    return figure_lines(rows, key="responses", title="S, T, GS and KS over frequency")
+    rows = (
+        (panel("σ_max (–)", (0, "S"), (1, "T")),),
+        (panel("σ_max(GS) (µm/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))),
+    )
+    return Lines(rows, "S, T, GS and KS over frequency")
 
 
 def gains_table(found: Study) -> Table:
@@ -47,7 +46,7 @@ def gains_table(found: Study) -> Table:
     )  # fmt: skip
 
 
-def perturbed(run: FinishedRun, found: Study) -> str:
+def perturbed(run: FinishedRun, found: Study) -> Lines:
     """Peak and bandwidth over the shift, and over the damping."""
     S_max = run.problem.inner.S_max
     rows = []
@@ -64,12 +63,12 @@ def perturbed(run: FinishedRun, found: Study) -> str:
         span = (1.0, max(top, 1.1 * S_max))
         lost = _unstable(factor * x, peak, factor * np.array(line.stable), span)
         faster = Curve(factor * x, bandwidth, colour=ORANGE, marker=".")
-        rows.append([
+        rows.append((
             Panel(label, "‖S‖∞ (–)", (curve,), bands=lost, levels=limit, x_range=ends,
                   y_range=span),
             Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
-        ])  # fmt: skip
-    return figure_lines(rows, key="perturbed", title="Peak of S and bandwidth off the model")
+        ))  # fmt: skip
+    return Lines(tuple(rows), "Peak of S and bandwidth off the model")
 
 
 def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
@@ -99,7 +98,7 @@ def shown_peak(run: FinishedRun, found: Study) -> float:
     return float(min(1.02 * max(largest, S_max), SHOWN_PEAK * S_max))
 
 
-def tolerances(run: FinishedRun, found: Study) -> str:
+def tolerances(run: FinishedRun, found: Study) -> Lines:
     """Empirical distributions of peak and bandwidth over the random plants."""
     judged = found.tolerances.judged
     peak = np.sort([item.peak for item in judged if item.stable])
@@ -107,14 +106,14 @@ def tolerances(run: FinishedRun, found: Study) -> str:
     share = (np.arange(peak.size) + 1.0) / max(len(judged), 1)
     S_max = run.problem.inner.S_max
     limit = (Level(S_max, "S_max", vertical=True), Level(1.0, "all"))
-    panels = [
+    panels = (
         Panel("‖S‖∞ (–)", "share of the plants (–)", (Curve(peak, share),),
               levels=limit, x_range=(min(*peak, S_max, 1e9), shown_peak(run, found)),
               y_range=(0.0, 1.08)),
         Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
               y_range=(0.0, 1.08)),
-    ]  # fmt: skip
-    return figure_lines([panels], key="tolerances", title="Peak and bandwidth of random hardware")
+    )  # fmt: skip
+    return Lines((panels,), "Peak and bandwidth of random hardware")
 
 
 def tolerance_table(found: Study) -> Table:
@@ -129,7 +128,7 @@ def tolerance_table(found: Study) -> Table:
     return Table(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), tuple(rows))
 
 
-def structured(bound: StructuredBound) -> str:
+def structured(bound: StructuredBound) -> Lines:
     """1/μ is what is allowed of complex errors; the level is what is allowed of real ones."""
     panel = Panel(
         "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
@@ -139,7 +138,7 @@ def structured(bound: StructuredBound) -> str:
         log_x=True, log_y=True,
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
     )  # fmt: skip
-    return figure_lines([[panel]], key="structured", title="Structured singular value")
+    return Lines(((panel,),), "Structured singular value")
 
 
 def structured_table(bound: StructuredBound) -> Table:
@@ -154,7 +153,7 @@ def shown_until(found: Move) -> float:
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 
-def move(found: Move, key: str) -> str:
+def move(found: Move) -> Lines:
     """Setpoint, error and forces over time, the first part of the tail included."""
     shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
@@ -171,14 +170,13 @@ def move(found: Move, key: str) -> str:
     )
     error = Curve(t, scale * found.error[pick], colour=ORANGE)
     near = window if found.window < 3.0 * found.peak_error else ()
-    rows = [
-        [Panel("time (ms)", "position (mm)", (Curve(t, 1e3 * found.position[pick]),)),
-         Panel("time (ms)", "acceleration (m/s²)", (Curve(t, found.acceleration[pick]),))],
-        [Panel("time (ms)", f"error ({unit})", (error,),
-               levels=(end, *near)),
-         Panel("time (ms)", "force (N)", forces)],
-    ]  # fmt: skip
-    return figure_lines(rows, key=key, title="Position, acceleration, error and force of a move")
+    rows = (
+        (Panel("time (ms)", "position (mm)", (Curve(t, 1e3 * found.position[pick]),)),
+         Panel("time (ms)", "acceleration (m/s²)", (Curve(t, found.acceleration[pick]),))),
+        (Panel("time (ms)", f"error ({unit})", (error,), levels=(end, *near)),
+         Panel("time (ms)", "force (N)", forces)),
+    )  # fmt: skip
+    return Lines(rows, "Position, acceleration, error and force of a move")
 
 
 def move_table(found: Move) -> Table:

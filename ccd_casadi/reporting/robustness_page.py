@@ -1,66 +1,40 @@
 """robustness.html: what the design survives, in figures with the numbers behind them."""
 
-from pathlib import Path
-
 import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.drawing.content import Facts, Figure, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
-from ccd_casadi.reporting.index import index_of, write_index
-from ccd_casadi.reporting.page import (
-    Section,
-    Table,
-    facts_html,
-    figure_html,
-    header,
-    number,
-    page,
-    paragraph,
-    table_html,
-)
-from ccd_casadi.reporting.verdict import verdict_html
+from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
 from ccd_casadi.robust.study import Study
-from ccd_casadi.support.units import HZ, metres, shown
-from surrogates.files import write_whole
+from ccd_casadi.support.units import HZ, metres, number, shown
 
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
-def write_robustness(folder: Path, run: FinishedRun, found: Study, seed: int) -> Path:
-    """Write robustness.html, atomically."""
-    path = folder / "robustness.html"
-    write_whole(path, robustness_html(run, found, seed, index_of(folder)))
-    write_index(folder)
-    return path
-
-
-def robustness_html(run: FinishedRun, found: Study, seed: int, index: str = "") -> str:
-    """The page's text; `index`: the page that it links as that of the whole run."""
-    title = f"Robustness: {run.case.path.parent.name}"
+def robustness_page(run: FinishedRun, found: Study, seed: int, index: str = "") -> Page:
+    """robustness.html; `index`: the page that links all of the run."""
     lead, *others = conclusion(run, found)
-    head = header(
-        title,
-        found.survives,
+    head = head_of(
+        f"Robustness: {run.case.path.parent.name}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; nothing is said of others",
-        f"{theta_words(run.result)} · seed {seed}",
-        lead,
-        verdict=verdict_html(run.result),
-    )
-    sections = [
-        Section("In short", "\n".join(paragraph(words) for words in others)),
+        f"{theta_words(run.result)} · seed {seed}", lead, run.result,
+    )  # fmt: skip
+    sections = (
+        Section("In short", tuple(map(Words, others))),
         _margins(found),
         _gains(run, found),
         _perturbed(run, found),
         _tolerances(run, found),
         *_structured(found),
         *([_move(found)] if found.moves else []),
-    ]
-    return page(title, sections, head, index)
+    )
+    return Page(head, sections, index)
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
@@ -199,7 +173,7 @@ def _margins(found: Study) -> Section:
         "Gains are factors: the nearest above and below 1 at which stability is lost. A disk "
         "margin covers gain and phase errors at once."
     )
-    return Section("Margins", table_html(Table(head, tuple(rows))) + paragraph(words))
+    return Section("Margins", (Table(head, tuple(rows)), Words(words)))
 
 
 def _gains(run: FinishedRun, found: Study) -> Section:
@@ -228,15 +202,14 @@ def _gains(run: FinishedRun, found: Study) -> Section:
             ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
         ]
     )
-    facts = [(name, ", ".join(number(float(v), 4) for v in values), unit)
-             for name, values, unit in rms]  # fmt: skip
-    drawn = figure_html(
+    facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
+                  for name, values, unit in rms)  # fmt: skip
+    drawn = Figure(
         figures.gains(found), "Sensitivity, complementary sensitivity, position by a force at the "
-        "actuators (GS), and force by sensor noise (KS).", figures.gains_table(found),
+        "actuators (GS), and force by sensor noise (KS).", (figures.gains_table(found),),
     )  # fmt: skip
-    body = drawn + facts_html(tops) + paragraph(found.statics.words)
-    if facts:
-        body += "<h3>White noise (one-sided density)</h3>" + facts_html(facts)
+    white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
+    body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
     return Section("Disturbance and noise", body)
 
 
@@ -246,17 +219,16 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
         "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
         f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
-    drawn = figure_html(
-        figures.perturbed(run, found), caption,
-        figures.line_table("shift", found.shift), figures.line_table("damping ×", found.damping),
-    )  # fmt: skip
+    tables = (figures.line_table("shift", found.shift),
+              figures.line_table("damping ×", found.damping))  # fmt: skip
+    drawn = Figure(figures.perturbed(run, found), caption, tables)
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
     )  # fmt: skip
     head = ("mode Hz", "shift %", "stable", "ω_b Hz", "‖S‖∞")
-    modes = "<h3>One mode at a time</h3>" + table_html(Table(head, rows)) if rows else ""
-    return Section("Plants off the model", drawn + modes)
+    modes = (Heading("One mode at a time"), Table(head, rows)) if rows else ()
+    return Section("Plants off the model", (drawn, *modes))
 
 
 def _tolerances(run: FinishedRun, found: Study) -> Section:
@@ -281,15 +253,15 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
     words = (
         f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
     )
-    drawn = figure_html(figures.tolerances(run, found), caption, figures.tolerance_table(found))
-    return Section("Hardware tolerances", drawn + paragraph(words))
+    drawn = Figure(figures.tolerances(run, found), caption, (figures.tolerance_table(found),))
+    return Section("Hardware tolerances", (drawn, Words(words)))
 
 
 def _structured(found: Study) -> list[Section]:
     bound = found.structured
     if found.overrun is not None:
         words = f"Not computed within {found.overrun:g} s. Give it longer with --limit."
-        return [Section("Structured singular value", paragraph(words))]
+        return [Section("Structured singular value", (Words(words),))]
     if bound is None:
         return []
     caption = (
@@ -298,8 +270,8 @@ def _structured(found: Study) -> list[Section]:
         "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
         f"shown, {bound.stiffness:.4g}."
     )
-    drawn = figure_html(figures.structured(bound), caption, figures.structured_table(bound))
-    return [Section("Structured singular value", drawn)]
+    drawn = Figure(figures.structured(bound), caption, (figures.structured_table(bound),))
+    return [Section("Structured singular value", (drawn,))]
 
 
 def _move(found: Study) -> Section:
@@ -309,11 +281,7 @@ def _move(found: Study) -> Section:
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [
-        figure_html(
-            figures.move(move, f"move{i}"),
-            f"{_moved(found, i)}{_cut(move)}",
-            figures.move_table(move),
-        )
+        Figure(figures.move(move), f"{_moved(found, i)}{_cut(move)}", (figures.move_table(move),))
         for i, move in enumerate(found.moves)
     ]
     words = (
@@ -321,4 +289,4 @@ def _move(found: Study) -> Section:
         f"plant {plant}. It reaches {number(found.setpoint.velocity)} m/s, "
         f"{number(found.setpoint.acceleration)} m/s² and {number(found.setpoint.jerk)} m/s³."
     )
-    return Section("A move", paragraph(words) + "\n".join(moves))
+    return Section("A move", (Words(words), *moves))

@@ -1,13 +1,15 @@
 """The run report of a controller of fixed structure: its sections, and every plant's loop."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ccd_casadi.codesign.verified_sections import VerifiedSections
+from ccd_casadi.drawing.content import Block, Table, Words
 from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.sections_words import SectionWords
 from ccd_casadi.reporting.facts import (
     Fact,
     binding,
@@ -16,18 +18,9 @@ from ccd_casadi.reporting.facts import (
     loop_facts,
     theta_words,
 )
-from ccd_casadi.reporting.page import (
-    Table,
-    number,
-    paragraph,
-    table_html,
-)
-from ccd_casadi.support.units import HZ, counted
+from ccd_casadi.support.units import HZ, counted, number
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
-
-if TYPE_CHECKING:
-    pass
 
 
 def conclusion_of(result: Mapping[str, Any]) -> str:
@@ -51,7 +44,7 @@ def _plants(result: Mapping[str, Any]) -> str:
     return f"each of {counted(designed, 'plant')}, judged again on {again} of the box"
 
 
-def bandwidths_html(verified: "VerifiedSections") -> str:
+def bandwidths_table(verified: VerifiedSections) -> Table:
     """Every ω_b of the one controller: which plant, and whether sampled."""
     design, problem = verified.design, verified.problem
     assert design.certificate is not None
@@ -68,8 +61,7 @@ def bandwidths_html(verified: "VerifiedSections") -> str:
         )  # fmt: skip
         rows.append(("the model", "continuous", found.bandwidth))
     head = ("-3 dB of S with this controller, on", "loop", "Hz")
-    table = Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
-    return table_html(table)
+    return Table(head, tuple((on, loop, number(omega / HZ, 5)) for on, loop, omega in rows))
 
 
 def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
@@ -95,63 +87,30 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     return [*over_theta, *over_kappa, *ends]
 
 
-def beside_html(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
-    """What the structure, robustness, hold and delay cost, by mixed sensitivity at the same θ."""
-    found, sections = result["full_order"], sections_of_problem(problem)
-    model, on_set, sampled = found["on_model"], found["on_set"], sections.sampling is not None
+def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[Block, ...]:
+    """What bounds every controller at θ, and what the set, hold and delay cost this structure."""
+    costs, gap = result["costs"], result["gap"] or {}
+    sampled = sections_of_problem(problem).sampling is not None
 
     def hz(value: float | None) -> str:
-        return "none found" if value is None else f"{number(value, 4)} Hz"
+        return "not known" if value is None else f"{number(value, 4)} Hz"
 
-    count = result["certificate"]["plants"]
-    whole = f"{counted(count, 'plant')} of the set"
+    loop = "sampled" if sampled else "continuous"
+    whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
     rows = [
-        ("the model alone", "sampled" if sampled else "continuous",
-         "–" if sampled else hz(model["bandwidth_hz"]), hz(found["sections_on_model_hz"])),
-    ]  # fmt: skip
-    if sampled:
-        rows.insert(0, ("the model alone", "continuous", hz(model["bandwidth_hz"]), "–"))
-        with_set = "–" if on_set is None else hz(on_set["bandwidth_hz"])
-        rows.append((whole, "continuous", with_set,
-                     hz(found["sections_continuous_hz"])))  # fmt: skip
-    own = "–" if sampled or on_set is None else hz(on_set["bandwidth_hz"])
-    rows.append((whole, "sampled" if sampled else "continuous", own,
-                 hz(result["bandwidth_hz"])))  # fmt: skip
-    head = ("designed for", "loop", "mixed sensitivity, full order", "sections")
-    words = [f"Full order on the model: {_judged_words(model)}"]
-    if on_set is not None:
-        words.append(f"On the set (resonance shifts and damping): {_judged_words(on_set)}")
-    words.append(
-        "Full order keeps S_max and |S| at ω_low as the sections do, and no bound on KS, T, GS or "
-        "the shape. The sections' other rows are ends of climbs from the design, no races: at "
-        "least that is reached."
+        ("no controller of any order exceeds", "the model alone", loop, hz(gap.get("outside_hz"))),
+        ("sections", "the model alone", loop, hz(costs["on_model_hz"])),
+        *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
+        ("sections: the design", whole, loop, hz(result["bandwidth_hz"])),
+    ]
+    words = (
+        "The first row is a certified bound under the same bounds on S, KS, T and GS. The others "
+        "are ends of climbs from the design, without other starts: at least that is reached."
     )
-    if found["stacked_norm"] is not None and found["gamma_opt"] is not None:
-        ratio = found["stacked_norm"] / found["gamma_opt"]
-        words.append(
-            f"With the weights of the full-order design on the model no controller at all has a "
-            f"stacked norm ‖[W_S S; W_KS KS; W_T T]‖∞ below γ_opt = {number(found['gamma_opt'])}; "
-            f"the sections, which were not designed for it, have {number(found['stacked_norm'])}, "
-            f"{number(ratio, 3)} times that (continuous loop)."
-        )
-    return table_html(Table(head, tuple(rows))) + "".join(paragraph(text) for text in words)
+    return Table(("", "designed for", "loop", "ω_b"), tuple(rows)), Words(words)
 
 
-def _judged_words(full: Mapping[str, Any]) -> str:
-    """A full-order design as the judge sees it on the set of the sections."""
-    if full["bandwidth_hz"] is None:
-        return f"{full['words']}."
-    words = f"{number(full['bandwidth_hz'], 4)} Hz, order {full['order']}, "
-    words += f"{full['words']}; judged on {counted(full['plants'], 'plant')} of the set it is "
-    if full["unstable"]:
-        words += f"unstable on {full['unstable']}"
-    else:
-        words += "stable on all"
-    worst = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in full["over"].items())
-    return f"{words}; largest figures over the sections' bounds where it is stable: {worst}."
-
-
-def sections_facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
+def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
     certificate, robust, inner = r["certificate"], r["robust"], problem.inner
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
     sampling = sections_of_problem(problem).sampling
@@ -194,7 +153,7 @@ def sections_facts(problem: CoDesignProblem, r: dict[str, Any]) -> list[Fact]:
         ("Optimality (KKT residual)", number(kkt, 2),
          f"over {_over(r['kkt'])}; {number(r['controller']['kkt_residual'], 2)} over the "
          "controller"),
-        ("A full race at this θ", optima or "–",
+        ("A multi-start search at this θ", optima or "–",
          f"local optima (searches); {counted(r['rounds'], 'round')} of the outer problem"),
         ("Price", f"{r['syntheses']} syntheses", f"{number(r['seconds'], 3)} s"),
     ]  # fmt: skip
@@ -219,14 +178,10 @@ def _over(kkt: Mapping[str, Any]) -> str:
     return f"θ and controller together, at a kink of J ({alone} with one side's gradient)"
 
 
-def controller_html(result: Mapping[str, Any]) -> str:
+def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
-    rows = tuple(
-        (s["kind"], s["zero_hz"], s["zero_damping"], s["pole_hz"], s["pole_damping"])
-        for s in controller["sections"]
-    )
-    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    found = [SectionWords(**item) for item in controller["sections"]]
     gains = (
         f"Gain {number(controller['gain'], 6)} N/m"
         if "gain" in controller
@@ -239,4 +194,11 @@ def controller_html(result: Mapping[str, Any]) -> str:
         f"{gains}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
-    return paragraph(words) + table_html(Table(head, rows))
+    return Words(words), sections_table(found)
+
+
+def sections_table(found: Sequence[SectionWords]) -> Table:
+    """Zeros and poles of a controller's sections."""
+    head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ")
+    rows = ((s.kind, s.zero_hz, s.zero_damping, s.pole_hz, s.pole_damping) for s in found)
+    return Table(head, tuple(rows))

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
+from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import predicted
-from ccd_casadi.reporting.lines import Band, Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import GREEN, GREY, axis_label
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ, number, shown_unit
 from surrogates import GaussianProcess
 
 SLICE = 61
@@ -67,8 +66,14 @@ def slices_data(
     return found
 
 
-def figure_slices(slices: list[Slice], best_hz: float, *, key: str = "slices") -> str:
-    """One small panel a parameter, the same vertical axis in all."""
+def slices_figure(slices: list[Slice], best_hz: float, extra: str, *, lifted: bool) -> Figure:
+    """One small panel a parameter; `extra` ends the caption."""
+    caption = _caption(slices, best_hz, lifted) + extra
+    return Figure(_lines(slices, best_hz), caption, _tables(slices))
+
+
+def _lines(slices: list[Slice], best_hz: float) -> Lines:
+    """The same vertical axis in all."""
     values = [best_hz]
     for item in slices:
         values += [v for v in (*item.bandwidth_hz, *item.near[:, 1]) if np.isfinite(v)]
@@ -79,10 +84,9 @@ def figure_slices(slices: list[Slice], best_hz: float, *, key: str = "slices") -
     ]
     per_row = 1 if len(panels) == 1 else 4 if len(panels) % 3 else 3
     panels += [None] * (-len(panels) % per_row)
-    rows = [panels[i : i + per_row] for i in range(0, len(panels), per_row)]
-    heights = [3.2 if len(rows) == 1 else 2.5] * len(rows)
-    title = "Largest bandwidth along each parameter through the optimum"
-    return figure_lines(rows, key=key, title=title, heights=heights)
+    rows = tuple(tuple(panels[i : i + per_row]) for i in range(0, len(panels), per_row))
+    heights = (3.2 if len(rows) == 1 else 2.5,) * len(rows)
+    return Lines(rows, "Largest bandwidth along each parameter through the optimum", heights)
 
 
 def _panel(item: Slice, y_range: tuple[float, float], legend: bool) -> Panel:
@@ -106,7 +110,7 @@ def _panel(item: Slice, y_range: tuple[float, float], legend: bool) -> Panel:
     )
 
 
-def caption_slices(slices: list[Slice], best_hz: float, *, lifted: bool = False) -> str:
+def _caption(slices: list[Slice], best_hz: float, lifted: bool) -> str:
     """Along which parameter the bandwidth changes most, and how sure the surrogate is."""
     spans = [(float(np.nanmax(s.bandwidth_hz) - np.nanmin(s.bandwidth_hz)), s) for s in slices
              if np.isfinite(s.bandwidth_hz).any()]  # fmt: skip
@@ -126,20 +130,14 @@ def caption_slices(slices: list[Slice], best_hz: float, *, lifted: bool = False)
     return words + "."
 
 
-def tables_slices(slices: list[Slice]) -> list[Table]:
+def _tables(slices: list[Slice]) -> tuple[Table, ...]:
     """Every slice, thinned."""
-    return [
-        Table(
-            (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)"),
-            tuple(
-                (float(s.theta[i]), float(s.bandwidth_hz[i]), float(1.96 * s.deviation_hz[i]))
-                for i in range(0, len(s.theta), TABLE_STEP)
-            ),
-        )
-        if np.isfinite(s.bandwidth_hz).any()
-        else Table(
-            (axis_label(s.name, s.unit), "true ω_b (Hz)"),
-            tuple((float(a), float(b)) for a, b in s.near),
-        )
-        for s in slices
-    ]
+    found = []
+    for s in slices:
+        head: tuple[str, ...] = (axis_label(s.name, s.unit), "true ω_b (Hz)")
+        columns = s.near.T
+        if np.isfinite(s.bandwidth_hz).any():
+            head = (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)")
+            columns = np.array([s.theta, s.bandwidth_hz, 1.96 * s.deviation_hz])[:, ::TABLE_STEP]
+        found.append(Table(head, tuple(tuple(map(float, row)) for row in columns.T)))
+    return tuple(found)

@@ -6,20 +6,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Section, Table, Words
+from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    plant_of,
-    scaled_plant,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.reporting.page import Section, Table, figure_html, number, paragraph, table_html
-from ccd_casadi.reporting.svg import BLUE, GREY, ORANGE
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ, number, shown_unit
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -61,7 +55,7 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
     found = true_inner(problem, problem.start)
     if found.optimum is None:
         words = f"The hardware that the run began with has no feasible loop: {found.shortfall}."
-        return [Section(HEADING, paragraph(words))]
+        return [Section(HEADING, (Words(words),))]
     made = synthesise(
         scaled_plant(problem, problem.start),
         problem.weights.at(found.optimum.figures.omega_S, found.optimum.figures.omega_T),
@@ -71,14 +65,9 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
         _side(problem, "start", ORANGE, problem.start, made),
         _side(problem, "optimum", BLUE, verified.theta, verified.design),
     )
-    svg = figure_lines(
-        [[_gains(problem, sides)], [_plants(sides), _pole_map(sides)]],
-        key="start", title=HEADING, heights=HEIGHTS,
-    )  # fmt: skip
-    body = figure_html(svg, _caption(sides), _poles_table(sides)) + table_html(
-        _table(problem, sides)
-    )
-    return [Section(HEADING, body)]
+    rows = ((_gains(problem, sides),), (_plants(sides), _pole_map(sides)))
+    figure = Figure(Lines(rows, HEADING, HEIGHTS), _caption(sides), (_poles_table(sides),))
+    return [Section(HEADING, (figure, _table(problem, sides)))]
 
 
 def _side(

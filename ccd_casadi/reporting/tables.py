@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.reporting.page import Table
+from ccd_casadi.drawing.content import Table
 from ccd_casadi.support.arrays import Array
 
 ROWS = 40

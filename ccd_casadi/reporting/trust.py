@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.page import Table, number
-from ccd_casadi.reporting.svg import BLUE, GREY
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
+from ccd_casadi.drawing.svg import BLUE, GREY
+from ccd_casadi.support.units import number
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
@@ -22,12 +22,12 @@ AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–", 
 LEAST_BAND = 3.0  # standardised residuals shown at least, either way
 
 
-def figure_trust(qualities: Sequence[Quality], *, key: str = "trust") -> str:
+def trust_figure(qualities: Sequence[Quality]) -> Figure:
     """A column for each output: predicted without the sample over true, and residuals below."""
-    above = [_predicted(q) for q in qualities]
-    below = [_residuals(q) for q in qualities]
+    above = tuple(_predicted(q) for q in qualities)
+    below = tuple(_residuals(q) for q in qualities)
     title = "samples predicted without themselves, and their standardised residuals"
-    return figure_lines([above, below], key=key, title=title, heights=[3.3, 2.6])
+    return Figure(Lines((above, below), title, (3.3, 2.6)), _caption(qualities), _data(qualities))
 
 
 def _predicted(q: Quality) -> Panel:
@@ -59,7 +59,7 @@ def _residuals(q: Quality) -> Panel:
     )
 
 
-def caption_trust(qualities: Sequence[Quality]) -> str:
+def _caption(qualities: Sequence[Quality]) -> str:
     """What is drawn, and the figures to read off it."""
     n = len(qualities[0].true)
     parts = [
@@ -84,7 +84,8 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
         ),
         tuple(
             (
-                WORDS[q.name], len(q.true), *(f"{number(e, 3)} {q.unit}" for e in _errors(q)),
+                WORDS[q.name], len(q.true),
+                *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max, q.kfold.rms)),
                 number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look,
                 q.at_design,
             )
@@ -93,11 +94,7 @@ def table_trust(qualities: Sequence[Quality]) -> Table:
     )  # fmt: skip
 
 
-def _errors(q: Quality) -> tuple[float, ...]:
-    return q.loo.rms, q.loo.max, q.kfold.rms
-
-
-def data_trust(qualities: Sequence[Quality]) -> tuple[Table, ...]:
+def _data(qualities: Sequence[Quality]) -> tuple[Table, ...]:
     """The numbers behind the figure."""
     return tuple(
         Table(

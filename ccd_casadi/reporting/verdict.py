@@ -1,16 +1,16 @@
 """The verdict of a run as every command and page shows it: five lines, each with sign and words."""
 
 import re
-import textwrap
+import sys
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from ccd_casadi.codesign.verdict import State
-from ccd_casadi.reporting.page import escape, header, typeset
+from ccd_casadi.drawing.content import Head, VerdictLine
+from ccd_casadi.drawing.paint import head_html
+from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
-SIGNS = {State.PASSED: "✓", State.WARNED: "!", State.FAILED: "✕", State.UNKNOWN: "?"}
-BADGES = {State.PASSED: "good", State.WARNED: "warn", State.FAILED: "bad", State.UNKNOWN: "open"}
 STATUS = {
     "verified": "verified",
     "not_verified": "not verified",
@@ -18,18 +18,9 @@ STATUS = {
 }
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
-WIDTH = 100  # of a terminal line
 
 
-class Shown(NamedTuple):
-    """One line of a stored verdict."""
-
-    name: str
-    state: State
-    words: str
-
-
-def lines_of(result: Mapping[str, Any]) -> tuple[Shown, ...]:
+def lines_of(result: Mapping[str, Any]) -> tuple[VerdictLine, ...]:
     """The lines of result.json; none of a run that has no design, or is older than verdicts."""
     verdict = result.get("verdict")
     if not isinstance(verdict, Mapping):
@@ -38,7 +29,7 @@ def lines_of(result: Mapping[str, Any]) -> tuple[Shown, ...]:
     for name in LINES:
         line = verdict.get(name)
         if isinstance(line, Mapping) and line.get("state") in set(State):
-            found.append(Shown(name, State(line["state"]), str(line.get("words", ""))))
+            found.append(VerdictLine(name, str(line["state"]), str(line.get("words", ""))))
     return tuple(found)
 
 
@@ -52,9 +43,8 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     found = []
     for line in lines_of(result):
-        head = f"{line.name:14s}{line.state.value:9s}"
-        found += textwrap.wrap(
-            line.words, WIDTH, initial_indent=head, subsequent_indent=" " * len(head)
+        found.append(
+            wrapped(f"{line.name:14s}{line.state:9s}{line.words}", columns(sys.stdout))
         )
     return found
 
@@ -62,29 +52,34 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
 def short(result: Mapping[str, Any]) -> str:
     """What did not pass, in a few words: `survives warned`."""
     return ", ".join(
-        f"{line.name} {line.state.value}"
+        f"{line.name} {line.state}"
         for line in lines_of(result)
         if line.state in (State.FAILED, State.WARNED)
     )
 
 
-def run_header(title: str, result: Mapping[str, Any], meta: str, lead: str) -> str:
+def head_of(
+    title: str, good: bool, status: str, reason: str, meta: str, lead: str,
+    result: Mapping[str, Any],
+) -> Head:  # fmt: skip
+    """The head of a page about a run; the badge is not green where the run's verdict warns."""
+    badge = "bad" if not good else "good" if worst(result) is State.PASSED else "warn"
+    return Head(title, badge, status, reason, meta, lead, lines_of(result))
+
+
+def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
     reason = head_words(result) if good else str(result.get("reason") or "")
     reason = f"{reason.rstrip('.')}. {advice(result)}".strip()
-    return header(
-        title, good, STATUS.get(result["status"], "not verified"), reason, meta, lead,
-        warned=worst(result) is not State.PASSED, verdict=verdict_html(result),
-    )  # fmt: skip
+    status = STATUS.get(result["status"], "not verified")
+    return head_of(title, good, status, reason, meta, lead, result)
 
 
 def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
     """A page with the verdict as it is now; of the run's own page (`whole`) the badge too."""
-    places = [(TABLE, verdict_html(result))]
-    if whole:
-        places.append((BADGE, run_header("", result, "", "")))
-    for place, source in places:
+    source = head_html(run_head("", result, "", ""))
+    for place in (TABLE, BADGE) if whole else (TABLE,):
         old, new = place.search(text), place.search(source)
         if old is not None and new is not None:
             text = text[: old.start()] + new[0] + text[old.end() :]
@@ -94,26 +89,26 @@ def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
 def advice(result: Mapping[str, Any]) -> str:
     """What to do with the design, in a sentence; nothing of a run without a verdict."""
     states = {line.name: line.state for line in lines_of(result)}
-    failed = [name for name, state in states.items() if state is State.FAILED]
+    failed = [name for name, state in states.items() if state == State.FAILED]
     if not states:
         return ""
     if failed or result.get("status") != "verified":
         return f"Do not build this: {', '.join(failed) or 'it is not verified'}."
-    if states.get("survives") is State.WARNED:
+    if states.get("survives") == State.WARNED:
         return (
             "Do not build this loop as it is: a plant a little off its model is not survived. "
             "Next: a [robust] set in the case."
         )
-    warned = [name for name, state in states.items() if state is State.WARNED]
+    warned = [name for name, state in states.items() if state == State.WARNED]
     if warned:
         return f"Look at {', '.join(warned)} before it is built."
-    return "Next: deploy." if states.get("deployable") is State.UNKNOWN else ""
+    return "Next: deploy." if states.get("deployable") == State.UNKNOWN else ""
 
 
 def head_words(result: Mapping[str, Any]) -> str:
     """What stands beside the badge of a verified run: never more than its lines say."""
     warned, failed = (
-        [line.name for line in lines_of(result) if line.state is state]
+        [line.name for line in lines_of(result) if line.state == state]
         for state in (State.WARNED, State.FAILED)
     )
     if failed:
@@ -122,14 +117,3 @@ def head_words(result: Mapping[str, Any]) -> str:
         checks = ", ".join(result.get("checks", {})).replace("_", " ")
         return f"all checks passed: {checks}"
     return f"with warnings: {', '.join(warned)}"
-
-
-def verdict_html(result: Mapping[str, Any]) -> str:
-    """The five lines as a table; nothing where there is no verdict."""
-    rows = "\n".join(
-        f'<tr><th scope="row">{escape(line.name)}</th><td><span class="badge {BADGES[line.state]}">'
-        f"{SIGNS[line.state]} {escape(line.state.value)}</span></td>"
-        f"<td>{escape(typeset(line.words))}</td></tr>"
-        for line in lines_of(result)
-    )
-    return f'<table class="wide verdict"><tbody>{rows}</tbody></table>' if rows else ""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_lyapunov
 
 from ccd_casadi.lti.closed_loop import ClosedLoop, largest, responses_of
+from ccd_casadi.lti.grid import climbed
 from ccd_casadi.lti.norms import hinf_norm
-from ccd_casadi.lti.peaks import climbed
 from ccd_casadi.support.arrays import Array
 
 REST = 1e-3  # of the lowest frequency of a grid: what counts as constant

@@ -5,7 +5,9 @@ only units in flight. What a polish asks for one after the other (`truth`) and w
 end is stored whole (`kept`), with the controller, as it is made.
 """
 
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -31,10 +33,13 @@ from ccd_casadi.sampling.units import design_unit, frequencies, inner_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import say
+from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.derivatives import Sensitivities
 
 T = TypeVar("T")
 CHUNK = 8  # single designs a unit at most
+WORTH = 1e-4  # of J: a better design is worth a line of progress
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ class Sampler:
         return self.spent.total
 
     def raced(self, key: str) -> None:
-        """Count a race once, as one synthesis."""
+        """Count a multi-start search once, as one synthesis."""
         with self.spent.on("races"):
             self.spent.once(f"race {key}", 1)
 
@@ -103,7 +108,7 @@ class Sampler:
                 self.store.put_unit(samples, unit, self.hash)
                 payloads[key] = payload
                 progress.advance()
-        found = []
+        found, before = [], len(self.trace)
         for key, theta in zip(keys, points, strict=True):
             known = payloads[key]
             assert known is not None
@@ -118,6 +123,7 @@ class Sampler:
             ):
                 self.nearest = sample
             self._spend(key, sample.syntheses, theta, sample.bandwidth, sample.value)
+        self.report(before)
         return found
 
     def quantities(self, X: Array, label: str = "sampling") -> list[QuantitySample]:
@@ -139,9 +145,11 @@ class Sampler:
                 self.store.put(samples, self.hash)
                 known |= {sample.key: sample for sample in samples}
                 progress.advance(len(samples))
+        before = len(self.trace)
         for x, key in zip(points, keys, strict=True):
             sample = known[key]
             self._spend(key, 1, x[:count], sample.bandwidth if self._meets(sample) else np.nan)
+        self.report(before)
         inner = self.problem.inner
         return [quantity_sample(x, known[k], inner) for x, k in zip(points, keys, strict=True)]
 
@@ -162,7 +170,10 @@ class Sampler:
         key = self._design_key(point)
         sample = sample_of(key, point[:-2], design.figures, 0.0, design)
         self.store.put([sample], self.hash)
+        before = len(self.trace)
         self._spend(key, 1, sample.theta, sample.bandwidth if self._meets(sample) else np.nan)
+        if self.spent.purpose != "polish":  # which reports its end
+            self.report(before)
         return design
 
     def _spend(
@@ -183,6 +194,17 @@ class Sampler:
         if np.isfinite(value) and not unmet(self.problem, theta):
             J = objective(self.problem, theta, value)
         self.trace.append(TraceEntry(self.syntheses, theta, float(bandwidth), float(J)))
+
+    def report(self, before: int) -> None:
+        """On stderr: the best design, if it is one of those after the first `before`."""
+        J = np.array([entry.objective for entry in self.trace])
+        if self.quiet or np.isnan(J[before:]).all():
+            return
+        best = before + int(np.nanargmin(J[before:]))
+        if np.isnan(J[:before]).all() or J[best] < np.nanmin(J[:before]) - WORTH * abs(J[best]):
+            bandwidth = self.trace[best].bandwidth / HZ
+            with suppress(OSError, ValueError):  # a stream that fails ends the printing
+                say(f"best so far: J {J[best]:.6g}, {bandwidth:.4g} Hz", sys.stderr)
 
     def _meets(self, sample: Sample) -> bool:
         return sample.certified and self.problem.inner.excess(sample) <= 0.0

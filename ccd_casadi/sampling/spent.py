@@ -4,6 +4,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+# The words of the keys of `spent` in result.json that do not say it themselves.
+SHOWN = {"races": "multi-start searches", "box_look": "global check"}
+
 
 class Spent:
     """Counts of true syntheses; `purpose` is what is being done."""
@@ -45,7 +48,7 @@ class Spent:
 def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]:
     """Of result.json: all syntheses, by purpose, and those without which the design was not there.
 
-    A look over the box that `moved` the design is part of the way to it.
+    A global check over the box that `moved` the design is part of the way to it.
 
     >>> spent_entry({"samples": 24, "box_look": 600})["syntheses_to_optimum"]
     24
@@ -60,16 +63,16 @@ def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]
 
 
 def was_moved(result: Mapping[str, Any]) -> bool:
-    """Whether a run's design is one that the look over the box led to."""
+    """Whether a run's design is one that the global check over the box led to."""
     return bool(result.get("box_look", {}).get("moved"))
 
 
 def cost_words(result: Mapping[str, Any]) -> str:
-    """`700 syntheses (30 samples, 17 rounds, 653 box look), 6.1 s`.
+    """`700 syntheses (30 samples, 17 rounds, 653 global check), 6.1 s`.
 
     >>> cost_words({"syntheses": 9, "spent": {"races": 2, "box_look": 7}, "seconds": 1.25})
-    '9 syntheses (2 races, 7 box look), 1.2 s'
+    '9 syntheses (2 multi-start searches, 7 global check), 1.2 s'
     """
-    parts = [f"{count} {name.replace('_', ' ')}" for name, count in result["spent"].items()]
+    parts = [f"{count} {SHOWN.get(name, name)}" for name, count in result["spent"].items()]
     inside = f" ({', '.join(parts)})" if parts else ""
     return f"{result['syntheses']} syntheses{inside}, {result['seconds']:.1f} s"

@@ -16,12 +16,7 @@ from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    scaled_plant,
-    true_design,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
@@ -136,7 +131,7 @@ class MixedBaseline(Baseline):
 
 
 class SectionsBaseline(Baseline):
-    """Climbs from the anchors; climbs and races are what it spends."""
+    """Climbs from the anchors; climbs and multi-start searches are what it spends."""
 
     gradients = (Gradient.TOTAL,)
     swept = False

@@ -1,64 +1,48 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.analysis.loop_view import LoopView
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.codesign.verdict import State
+from ccd_casadi.drawing.content import Figure, Head, Page, Section, Source, Table, Verdict, Words
+from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, table_gains
-from ccd_casadi.reporting.maps import figure_landscape
-from ccd_casadi.reporting.page import (
-    Section,
-    Table,
-    figure_html,
-    header,
-    number,
-    page,
-    paragraph,
-    preformatted,
-    table_html,
-)
 from ccd_casadi.reporting.solve_page import stage_sections
-from ccd_casadi.reporting.svg import axis_label
 from ccd_casadi.reporting.true_samples import read_truths
-from ccd_casadi.reporting.verdict import verdict_html, worst
+from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.methods import (
-    LABELS,
-    caption_cost,
-    caption_histories,
-    figure_cost,
-    figure_histories,
-    table_cost,
-    table_histories,
-    theta_paths,
-)
+from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import shown_unit
-from surrogates.files import write_whole
+from ccd_casadi.support.units import number, shown_unit
 
 
-def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Path:
-    """Write `report.html` into the folder, whole or not at all."""
-    problem = comparison.problem
-    found = answer["conclusions"]
-    sections = [
-        Section("What it shows", "\n".join(paragraph(text) for text in found["sentences"])),
-        Section("The methods", _methods(problem, answer)),
-        Section("Cost", _cost(comparison)),
-    ]
+def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Page:
+    """report.html of a comparison; reads the folder's samples."""
+    problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
+    sections = [
+        Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
+        for method in comparison.methods
+        if lines_of(method.figures)
+    ]
+    sections += [
+        Section("What it shows", tuple(map(Words, found["sentences"]))),
+        Section("The methods", _methods(problem, answer)),
+        Section("Cost", (cost_figure(comparison.methods),)),
+    ]
     if len(problem.names) == 2:
-        sections.append(Section("Paths over the landscape", _paths(folder, comparison, best)))
+        paths = _paths(folder, comparison, best)
+        sections.append(Section("Paths over the landscape", (paths,)))
     if best is not None:
-        sections.append(
-            Section("Sensitivity, baseline against co-design", _loops(comparison, best))
-        )
+        loops = _loops(comparison, best)
+        sections.append(Section("Sensitivity, baseline against co-design", (loops,)))
         sections += stage_sections(
             problem,
             {
@@ -67,40 +51,26 @@ def write_comparison_report(folder: Path, comparison: Comparison, answer: dict[s
                 if comparison.method(name).figures.get("theta")
             },
         )
-    for name, descent in histories(comparison).items():
-        body = figure_html(
-            figure_histories(problem, descent, key=f"history{len(sections)}"),
-            caption_histories(descent),
-            table_histories(problem, descent),
-        )
-        sections.append(Section(f"History: {name}", body))
-    sections.append(Section("The case", preformatted(case_to_toml(comparison.case))))
+    sections += [
+        Section(f"History: {name}", (descent_figure(problem, descent),))
+        for name, descent in histories(comparison).items()
+    ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    sections.append(Section("Versions", paragraph(f"{versions}; seed {answer['seed']}.")))
-    verified = all(
-        method.figures["status"] == "verified" for method in comparison.methods if method.solution
-    )
-    head = header(
+    sections += [
+        Section("The case", (Source(case_to_toml(comparison.case)),)),
+        Section("Versions", (Words(f"{versions}; seed {answer['seed']}."),)),
+    ]
+    ours = [method.figures for method in comparison.methods if method.solution]
+    verified = all(figures["status"] == "verified" for figures in ours)
+    warned = any(worst(figures) is not State.PASSED for figures in ours)
+    head = Head(
         f"Comparison: {comparison.case.path.name}",
-        verified,
-        "verified" if verified else "not verified",
-        "",
+        "bad" if not verified else "warn" if warned else "good",
+        "verified" if verified else "not verified", "",
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
         found["sentences"][0],
-        warned=any(
-            worst(method.figures) is not State.PASSED
-            for method in comparison.methods
-            if method.solution
-        ),
-    )
-    for method in reversed(comparison.methods):
-        lines = verdict_html(method.figures)
-        if lines:
-            sections.insert(0, Section(f"Verdict: {LABELS[method.name]}", lines))
-    path, title = folder / "report.html", f"Comparison: {comparison.case.path.name}"
-    text = page(title, sections, head, index="")
-    write_whole(path, text)
-    return path
+    )  # fmt: skip
+    return Page(head, tuple(sections), index="")
 
 
 def histories(comparison: Comparison) -> dict[str, Descent]:
@@ -124,7 +94,7 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
     return found
 
 
-def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
+def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:
     """All methods in one table, the paper's figures below them."""
     shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
     factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
@@ -176,26 +146,22 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> str:
             )
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
-        "Syntheses are those to the optimum; what a formulation then spends on a look over the box "
-        "for a better one stands beside them. A descent's are those of its best run; all runs are "
+        "Syntheses are those to the optimum; what the global check over the box adds to them "
+        "stands beside them. A descent's are those of its best run; all runs are "
         "in compare.json."
     )
     if not baseline_of(problem).swept:
         words = (
             "Each formulation ends with a polish and a KKT certificate on the true problem. A "
-            "synthesis is a climb from the anchors, or a race; the descent and the sequential "
-            "designs climb from the best formulation's anchors. Left out: the descent with K held "
-            "fixed and the landscape over the weights' frequencies, which sections do not have."
+            "synthesis is a climb from the anchors, or a multi-start search; the descent and the "
+            "sequential designs climb from the best formulation's anchors. Left out: the descent "
+            "with K held fixed and the landscape over the weights' frequencies, which sections "
+            "do not have."
         )
-    return f'<div class="scroll">{table_html(Table(head, tuple(rows)))}</div>{paragraph(words)}'
+    return Table(head, tuple(rows)), Words(words)
 
 
-def _cost(comparison: Comparison) -> str:
-    methods = comparison.methods
-    return figure_html(figure_cost(methods), caption_cost(methods), table_cost(methods))
-
-
-def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
+def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     """The landscape from the lifted surrogates, the way of each iterative method over it."""
     problem = comparison.problem
     lifted = comparison.method("lifted")
@@ -219,11 +185,11 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> str:
         "Colours: ω_b*(θ) predicted by the lifted surrogates; dots: the nested formulation's true "
         "samples in the same colours. " + "; ".join(ends) + "."
     )
-    svg = figure_landscape(land, theta_paths(walked), optimum)
-    return figure_html(svg, caption, *tables_landscape(land))
+    land = replace(land, paths=theta_paths(walked), optimum=optimum)
+    return Figure(land, caption, tables_landscape(land))
 
 
-def _loops(comparison: Comparison, best: str) -> str:
+def _loops(comparison: Comparison, best: str) -> Figure:
     """σ_max(S) of the sequential baseline against the best co-design (the paper's figure 11)."""
     loops = [
         _loop(comparison.problem, comparison.method(name))
@@ -235,8 +201,8 @@ def _loops(comparison: Comparison, best: str) -> str:
         for loop in loops
     )
     caption = f"Largest singular values of the closed loop. {words}."
-    svg = figure_gains(loops, bounds=False)
-    return figure_html(svg, caption, *(table_gains(loop) for loop in loops))
+    lines = figure_gains(loops, bounds=False)
+    return Figure(lines, caption, tuple(table_gains(loop) for loop in loops))
 
 
 def _loop(problem: CoDesignProblem, method: Method) -> LoopView:

@@ -12,7 +12,7 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.codesign.formulations import formulation_of
 from ccd_casadi.codesign.run import co_design
-from ccd_casadi.codesign.solution import Solution
+from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.lti.state_space import StateSpace
@@ -70,8 +70,8 @@ def compare(
     """Run every method, each with a store and a count of its own.
 
     With a controller of fixed structure the descents and the sequential designs climb from the
-    anchors of the best formulation, and its race is not counted as theirs; the descent with K held
-    fixed sweeps weights, which sections do not have, and is left out.
+    anchors of the best formulation, and its search is not counted as theirs; the descent with K
+    held fixed sweeps weights, which sections do not have, and is left out.
     """
     began = perf_counter()
     methods = [

@@ -38,9 +38,9 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
 
 
 def _beside(figures: dict[str, Any]) -> str:
-    """The look over the box that every formulation ends with, and no descent."""
+    """The global check over the box that every formulation ends with, and no descent."""
     beside = figures["syntheses"] - figures["syntheses_to_optimum"]
-    return f", and {beside} that looked over the box for a better one" if beside else ""
+    return f", and {beside} in the global check over the box" if beside else ""
 
 
 def _descent(

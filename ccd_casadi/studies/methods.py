@@ -4,12 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table, ThetaPath
+from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import cost_axis
-from ccd_casadi.reporting.lines import Curve, Level, Panel, figure_lines
-from ccd_casadi.reporting.maps import ThetaPath
-from ccd_casadi.reporting.page import Table
-from ccd_casadi.reporting.svg import CYCLE, axis_label
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Method
 from ccd_casadi.studies.steepest_descent import Descent
@@ -43,7 +41,7 @@ def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.array(spent, float), np.array(objective), np.array(bandwidth)
 
 
-def figure_cost(methods: Sequence[Method], *, key: str = "cost") -> str:
+def cost_figure(methods: Sequence[Method]) -> Figure:
     """Least J and its bandwidth against true syntheses, every method on the same axes."""
     curves_J, curves_b = [], []
     for i, method in enumerate(methods):
@@ -55,12 +53,12 @@ def figure_cost(methods: Sequence[Method], *, key: str = "cost") -> str:
         curves_J.append(Curve(*_steps(spent, objective), label, colour, marker=marker))
         curves_b.append(Curve(*_steps(spent, bandwidth), "", colour, marker=marker))
     x = "true syntheses spent (–)"
-    panels = [
-        [Panel(x, "least J so far (–)", tuple(curves_J), log_x=True, legend="upper right")],
-        [Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True)],
-    ]
-    title = "Objective and bandwidth against the number of true syntheses"
-    return figure_lines(panels, key=key, title=title, heights=(3.6, 2.6))
+    rows = (
+        (Panel(x, "least J so far (–)", tuple(curves_J), log_x=True, legend="upper right"),),
+        (Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
+    )
+    lines = Lines(rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6))
+    return Figure(lines, _cost_caption(methods), (_cost_table(methods),))
 
 
 def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +66,7 @@ def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
 
 
-def caption_cost(methods: Sequence[Method]) -> str:
+def _cost_caption(methods: Sequence[Method]) -> str:
     """Where each method's line ends."""
     ends = []
     for method in methods:
@@ -78,7 +76,7 @@ def caption_cost(methods: Sequence[Method]) -> str:
     return "Further left is cheaper, lower is better. The lines end at: " + "; ".join(ends) + "."
 
 
-def table_cost(methods: Sequence[Method]) -> Table:
+def _cost_table(methods: Sequence[Method]) -> Table:
     """Every improvement of every method."""
     rows = []
     for method in methods:
@@ -87,7 +85,7 @@ def table_cost(methods: Sequence[Method]) -> Table:
     return Table(("method", "syntheses", "least J", "bandwidth (Hz)"), tuple(rows))
 
 
-def figure_histories(problem: CoDesignProblem, descent: Descent, *, key: str) -> str:
+def descent_figure(problem: CoDesignProblem, descent: Descent) -> Figure:
     """θ, J, hardware cost and bandwidth over the iterations of a descent (figures 9 and 10)."""
     items = descent.iterates
     steps = np.arange(len(items), dtype=float)
@@ -112,12 +110,13 @@ def figure_histories(problem: CoDesignProblem, descent: Descent, *, key: str) ->
     bounds = tuple(
         Level(value, "") for value in sorted({*problem.lower, *problem.upper}) if len(units) == 0
     )
-    rows = [[Panel(x, y, parameters, levels=bounds, whole_x=True)], lower]
+    rows = ((Panel(x, y, parameters, levels=bounds, whole_x=True),), tuple(lower))
     title = "Parameters, objective, bandwidth and hardware cost over the iterations"
-    return figure_lines(rows, key=key, title=title, heights=(2.8, 2.5))
+    lines = Lines(rows, title, (2.8, 2.5))
+    return Figure(lines, _descent_caption(descent), (_descent_table(problem, descent),))
 
 
-def caption_histories(descent: Descent) -> str:
+def _descent_caption(descent: Descent) -> str:
     """From where to where, and why it ended."""
     items = descent.iterates
     first, last = items[0], items[-1]
@@ -129,7 +128,7 @@ def caption_histories(descent: Descent) -> str:
     )
 
 
-def table_histories(problem: CoDesignProblem, descent: Descent) -> Table:
+def _descent_table(problem: CoDesignProblem, descent: Descent) -> Table:
     """One row an iterate."""
     swept = baseline_of(problem).swept
     head = (
@@ -150,10 +149,10 @@ def table_histories(problem: CoDesignProblem, descent: Descent) -> Table:
     return Table(head, rows)
 
 
-def theta_paths(methods: Sequence[Method]) -> list[ThetaPath]:
+def theta_paths(methods: Sequence[Method]) -> tuple[ThetaPath, ...]:
     """Each method's way over the two parameters."""
-    return [
+    return tuple(
         ThetaPath(LABELS[method.name], np.array(method.path))
         for method in methods
         if len(method.path)
-    ]
+    )

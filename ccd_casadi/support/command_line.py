@@ -15,6 +15,7 @@ from ccd_casadi.support.errors import PlantError, UserError
 from ccd_casadi.support.interrupts import begun, ctrl_c_noticed, was_ctrl_c
 from ccd_casadi.support.options import ExitCode as ExitCode
 from ccd_casadi.support.options import Parser, one_line, usable_cores, whole
+from ccd_casadi.support.terminal import say
 from ccd_casadi.support.threads import threads_permitted
 from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
@@ -127,15 +128,15 @@ def run(
             code = main(options)
         sys.stdout.flush()  # here, where a reader that went away can still be dealt with
     except PlantError as error:  # at some θ: what evaluates a plant knows of no case file
-        print(one_line(f"{_place(options)}: plant: {error}"), file=sys.stderr)
+        say(one_line(f"{_place(options)}: plant: {error}"), sys.stderr)
         return ExitCode.BAD_INPUT
     except UserError as error:
-        print(one_line(error), file=sys.stderr)
+        say(one_line(error), sys.stderr)
         return ExitCode.BAD_INPUT
     except WorkerLost as error:
-        print(f"interrupted: {one_line(error)}; {_RESUMABLE}", file=sys.stderr)
+        say(f"interrupted: {one_line(error)}; {_RESUMABLE}", sys.stderr)
     except MemoryError:
-        print(f"{_place(options)}: {_NO_MEMORY}", file=sys.stderr)
+        say(f"{_place(options)}: {_NO_MEMORY}", sys.stderr)
         return ExitCode.BAD_INPUT
     except BrokenPipeError:
         # The reader of stdout went away; point it elsewhere so that the exit stays quiet.
@@ -143,12 +144,12 @@ def run(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:  # the disk is full, or a file became unreadable
         where = error.filename or _place(options)
-        print(one_line(f"{where}: {error.strerror or error}; {_DISK}"), file=sys.stderr)
+        say(one_line(f"{where}: {error.strerror or error}; {_DISK}"), sys.stderr)
         return ExitCode.BAD_INPUT
     except BaseException as error:
         if not was_ctrl_c(error):
             raise
-        print(f"interrupted: {_RESUMABLE}", file=sys.stderr)
+        say(f"interrupted: {_RESUMABLE}", sys.stderr)
     return int(code)
 
 

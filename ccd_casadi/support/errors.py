@@ -1,5 +1,8 @@
 """The base of every error that a user can cause and mend, and its one line."""
 
+from importlib import import_module
+from typing import Any
+
 
 class UserError(ValueError):
     """One line that says what is wrong and what to change; commands print it and exit with 2."""
@@ -15,3 +18,16 @@ def described(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     except Exception:
         return type(error).__name__
+
+
+class MissingPackage(UserError):
+    """An optional package is not installed; the line says which, and how to get it."""
+
+
+def require(package: str, extra: str) -> Any:
+    """Import a package of the extra `ccd-casadi[extra]`. Raises MissingPackage without it."""
+    try:
+        return import_module(package)
+    except ImportError:
+        words = f"is not installed; install it with pip install 'ccd-casadi[{extra}]'"
+        raise MissingPackage(f"{package}: {words}") from None

@@ -6,33 +6,51 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from itertools import repeat
 from math import isfinite
-from types import UnionType
-from typing import Any, Union, cast, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+DIGITS = 7  # of the numbers of an array that is listed
 
-def plain(value: Any) -> Any:
+
+def plain(value: Any, listed: bool = False) -> Any:
     """What JSON holds of a value: of a dataclass its name and fields, of an array (of float64)
     shape and bytes, of an enumeration the name, of NaN and infinity their words.
 
+    `listed`: of an array the numbers, to seven digits, None for those that are not finite.
+
     >>> plain((1.5, float("inf"), {"x": np.array([0.0])}))
     [1.5, 'inf', {'x': [[1], 'AAAAAAAAAAA=']}]
+    >>> plain(np.array([1.0, 2.0 / 3.0, np.nan]), listed=True)
+    [1.0, 0.6666667, None]
     """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, np.ndarray) and listed:
+        return [_rounded(item) for item in value.tolist()]
     if isinstance(value, np.ndarray):
         return [list(value.shape), b64encode(value.astype("<f8").tobytes()).decode()]
     if isinstance(value, Enum):
         return value.name
     if is_dataclass(value):
-        found = {item.name: plain(getattr(value, item.name)) for item in fields(value)}
+        found = {item.name: plain(getattr(value, item.name), listed) for item in fields(value)}
         return {"": type(value).__name__, **found}
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(item, listed) for key, item in value.items()}
     if isinstance(value, tuple):
-        return [plain(item) for item in value]
+        return [plain(item, listed) for item in value]
     if isinstance(value, float):
         return float(value) if isfinite(value) else repr(float(value))
     return value
+
+
+def _rounded(item: Any) -> Any:
+    if isinstance(item, list):
+        return [_rounded(each) for each in item]
+    if isinstance(item, float):
+        return float(f"{item:.{DIGITS}g}") if isfinite(item) else None
+    return item
 
 
 def restored(kind: Any, data: Any) -> Any:
@@ -43,16 +61,23 @@ def restored(kind: Any, data: Any) -> Any:
     (1.5, inf)
     """
     origin, args = get_origin(kind), get_args(kind)
+    if kind is Any or origin is Literal:
+        return data
+    if np.ndarray in (kind, origin) and not (len(data) == 2 and isinstance(data[1], str)):
+        return np.array(data, float if origin else None)
     if origin is np.ndarray:
         return np.frombuffer(b64decode(data[1]), "<f8").astype(float).reshape(data[0])
     if origin in (Union, UnionType):
-        named = {item.__name__: item for item in args}
-        return None if data is None else restored(named[data[""]], data)
+        named = {cast(Any, item).__name__: item for item in args if is_dataclass(item)}
+        if data is None and NoneType in args:
+            return None
+        one = named[data[""]] if named else next(item for item in args if item is not NoneType)
+        return restored(one, data)
     if origin is tuple:
         endless = args[1:] == (...,)
         kinds = repeat(args[0], len(data)) if endless else args
         return tuple(restored(*item) for item in zip(kinds, data, strict=True))
-    if origin is dict:
+    if origin in (dict, Mapping):
         return {str(key): restored(args[1], item) for key, item in dict(data).items()}
     if is_dataclass(kind):
         hints, build = get_type_hints(kind), cast(Any, kind)

@@ -5,12 +5,13 @@ log gets a plain line every few seconds, and a stream that fails ends the printi
 notebook it is on stdout, since stderr is painted there as a failure.
 """
 
-import os
 import sys
 import time
+from types import TracebackType
 from typing import Self, TextIO
 
 from ccd_casadi.support.notebook import in_notebook
+from ccd_casadi.support.terminal import columns
 
 WIDTH = 24
 CELL = 100  # characters of a line in a notebook
@@ -20,8 +21,9 @@ class Progress:
     """`with Progress(total, label) as bar: bar.advance()`; nothing is printed if quiet or empty.
 
     On a terminal, and in a notebook's cell, one line is rewritten a few times a second; elsewhere
-    a plain line is printed every few seconds and at the end. A stream that fails ends the printing,
-    not the work.
+    a plain line is printed every few seconds and at the end. Work that ends before its total ends
+    the bar, and a single step leaves no line behind. A stream that fails ends the printing, not the
+    work.
     """
 
     def __init__(
@@ -42,7 +44,15 @@ class Progress:
             self._show(end="")
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:  # fmt: skip
+        if kind is None and self.done:
+            single, self.total = self.total == 1, self.done
+            if single and not self.cell:
+                self._write("\r\x1b[2K" if self.terminal else "")
+                return
         self._show(end="\n")
 
     def advance(self, count: int = 1, note: str = "") -> None:
@@ -71,19 +81,18 @@ class Progress:
         text = self.line()
         if self.terminal:
             # a line that wraps could not be rewritten in place; a cell knows "\r" and no more
-            wide = CELL if self.cell else self._columns() - 1
+            wide = CELL if self.cell else columns(self.stream) - 1
             text = f"\r{text[:wide]:{wide}s}" if self.cell else "\r\x1b[2K" + text[:wide]
+        self._write(text + end)
+
+    def _write(self, text: str) -> None:
+        if self.silent:
+            return
         try:
-            self.stream.write(text + end)
+            self.stream.write(text)
             self.stream.flush()
         except (OSError, ValueError):
             self.silent = True  # closed, or a broken pipe
-
-    def _columns(self) -> int:
-        try:
-            return os.get_terminal_size(self.stream.fileno()).columns or 80
-        except (OSError, ValueError):
-            return 80
 
 
 def duration(seconds: float) -> str:

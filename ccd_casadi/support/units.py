@@ -1,6 +1,7 @@
 """Units and numbers in words: SI inside, and the one factor that is everywhere."""
 
 import math
+from typing import Any
 
 HZ = 2.0 * math.pi  # rad/s in one hertz
 
@@ -48,3 +49,22 @@ def counted(number: int, noun: str) -> str:
     ('1 plant', '5 plants')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def number(value: Any, digits: int = 5) -> str:
+    """A number to `digits` significant digits; a dash where there is none.
+
+    >>> number(72.0451741), number(1.5e-9, 3), number(None), number(1800.0)
+    ('72.045', '1.5e-09', '–', '1800')
+    """
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return str(value)
+    size = abs(float(value))
+    if 1.0 <= size < 1e7:
+        # never fewer digits than the whole part has: 110023 stays 110023
+        digits = max(digits, len(str(int(size))))
+    return f"{float(value):.{digits}g}"

@@ -11,10 +11,10 @@ import pickle
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -25,69 +25,6 @@ _SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that th
 
 class WorkerLost(RuntimeError):
     """Workers died again and again on one task (killed, or out of memory), or never came back."""
-
-
-class Overrun(RuntimeError):
-    """The call did not return within its time, or its process died."""
-
-
-class Ahead:
-    """A process that gets ready while this one is at work, for a task at the end of it.
-
-    It begins with `ready()`, imports as a rule. A context manager; leaving it ends the process.
-    """
-
-    def __init__(self, ready: Callable[[], object]) -> None:
-        track_resources()
-        with interrupts_held():
-            self._worker = WorkerProcess()
-        self._worker.send(pickle.dumps((called, ready)))
-        self._waiting = 1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with interrupts_held():
-            self._worker.end()
-
-    def begin(self, function: Callable[[T], object], task: T) -> None:
-        """Let it go on with this task."""
-        self._worker.send(pickle.dumps((function, task)))
-        self._waiting += 1
-
-    def alive(self) -> bool:
-        """Whether the process is there."""
-        return self._worker.process.is_alive()
-
-    def answer(self, seconds: float | None = None) -> tuple[bool, Any]:
-        """(True, what the next task came to) or (False, what it raised).
-
-        Raises WorkerLost if the process died, and Overrun after so many seconds.
-        """
-        with suppress(OSError):  # it is dead: its answer says so
-            if not self._worker.pipe.poll(seconds):
-                raise Overrun(f"no answer within {seconds:g} s")
-        answer = self._worker.answer()
-        if answer is None:
-            raise WorkerLost(f"a worker process died (exit code {self._worker.exit_code()})")
-        self._waiting -= 1
-        found: tuple[bool, Any] = pickle.loads(answer)  # our own child wrote it, into its pipe
-        return found
-
-    def result(self) -> Any:
-        """What the last task came to. Raises WorkerLost if it died, and what the task raised."""
-        value = None
-        while self._waiting:
-            done, value = self.answer()
-            if not done:
-                raise value
-        return value
-
-
-def called(function: Callable[[], object]) -> None:
-    """A task of a call without arguments whose result is of no use."""
-    function()
 
 
 class WorkerProcess:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.grid import climbed
 from ccd_casadi.lti.norms import gains, hinf_norm
-from ccd_casadi.lti.peaks import climbed
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 

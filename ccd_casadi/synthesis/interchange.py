@@ -10,7 +10,7 @@ Ts (s, 0 for continuous time), InputName, OutputName, InputUnit, OutputUnit, and
 theta_names, theta_units. `ss(K.A, K.B, K.C, K.D, K.Ts)` makes it a system.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -137,8 +137,9 @@ def write_mat(path: Path, design: DesignFile) -> None:
 def read_mat(path: Path) -> DesignFile:
     """Every struct with A, B, C, D in a .mat file, ours or another's, and θ where it is there.
 
-    Names and units may be missing: they are then u1, …; Ts defaults to 0. Nothing in the file is
-    executed. Raises UserError naming file and variable where something is missing or damaged.
+    A file with the matrices themselves is one system without a name. Names and units may be
+    missing: they are then u1, …; Ts defaults to 0. Nothing in the file is executed. Raises
+    UserError naming file and variable where something is missing or damaged.
     """
     try:
         with path.open("rb") as stream:
@@ -152,11 +153,7 @@ def read_mat(path: Path) -> DesignFile:
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
         raise UserError(f"{path}: is no readable .mat file: {_one_line(error)}") from None
-    systems = {
-        name: _system(path, name, value)
-        for name, value in content.items()
-        if isinstance(value, np.ndarray) and value.dtype.names and "A" in value.dtype.names
-    }
+    systems = {name: _system(path, name, struct) for name, struct in _structs(path, content)}
     if not systems:
         raise UserError(f"{path}: holds no struct with A, B, C, D; save one for each system")
     names = _strings(content.get("theta_names"))
@@ -168,14 +165,22 @@ def read_mat(path: Path) -> DesignFile:
     return DesignFile(systems, theta, dict(zip(names, units, strict=False)))
 
 
-def _system(path: Path, name: str, value: np.ndarray) -> NamedSystem:
-    if value.size != 1:
-        raise UserError(f"{path}: {name}: is an array of structs; save one struct")
-    struct = {key: value.ravel()[0][key] for key in value.dtype.names or ()}
+def _structs(path: Path, content: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Each struct with an A; a file that has A, B and C themselves is one, without a name."""
+    if {"A", "B", "C"} <= set(content):
+        yield "", {"D": np.zeros((len(content["C"]), content["B"].shape[1])), **content}
+    for name, value in content.items():
+        if isinstance(value, np.ndarray) and "A" in (value.dtype.names or ()):
+            if value.size != 1:
+                raise UserError(f"{path}: {name}: is an array of structs; save one struct")
+            yield name, {key: value.ravel()[0][key] for key in value.dtype.names or ()}
+
+
+def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
     missing = [part for part in PARTS if part not in struct]
     if missing:
         raise UserError(f"{path}: {name}: has no {missing[0]}")
-    A, B, C, D = (_matrix(path, f"{name}.{part}", struct[part]) for part in PARTS)
+    A, B, C, D = (_matrix(path, f"{name}.{part}".lstrip("."), struct[part]) for part in PARTS)
     n, m, p = A.shape[0], D.shape[1], D.shape[0]
     if A.shape != (n, n) or B.shape != (n, m) or C.shape != (p, n):
         sizes = ", ".join(str(part.shape) for part in (A, B, C, D))

@@ -13,8 +13,7 @@ from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gradients import DesignPlant, Loop, peak_gradients
 from ccd_casadi.kernels.sensitivity import sensitivity_gain, sensitivity_gains
 from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.grid import around, frequency_grid
-from ccd_casadi.lti.peaks import climbed, local_maxima
+from ccd_casadi.lti.grid import around, climbed, frequency_grid, local_maxima
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array

@@ -63,8 +63,8 @@ def design(
 ) -> SectionsDesign:
     """The largest bandwidth on 17 temperatures with each of the PZT's gains.
 
-    First a race on nine temperatures at its nominal gain, then from its end on all. The benchmark's
-    three temperatures alone are not enough: a controller for these was unstable between them.
+    First a search on nine temperatures at its nominal gain, then from its end on all. The three
+    of the benchmark alone are not enough: a controller for these was unstable between them.
     """
     first = synthesise(
         scaled(np.linspace(-1.0, 1.0, 9).tolist(), [1.0]), structure, BOUNDS, sampling=SAMPLING,

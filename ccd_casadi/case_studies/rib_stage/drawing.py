@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, axis_lengths, bays, mass
-from ccd_casadi.plants.pictures import Drawing
-from ccd_casadi.reporting.page import escape, number
-from ccd_casadi.reporting.svg import BLACK, LONGEST_LABEL
+from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.pictures import Drawing
+from ccd_casadi.drawing.svg import BLACK, LONGEST_LABEL
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import number
 
 WIDTH = 960.0  # of the drawing; a page column shows a unit as about a pixel
 TALLER = 3.0  # heights in the cut against lengths

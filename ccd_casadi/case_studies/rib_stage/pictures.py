@@ -11,7 +11,7 @@ from ccd_casadi.case_studies.rib_stage.model import RibStage, discretisation, mo
 from ccd_casadi.case_studies.rib_stage.modes import sector_of
 from ccd_casadi.case_studies.rib_stage.symmetry import mirror_signs, swap_displacements
 from ccd_casadi.case_studies.rib_stage.truncation import ModeCount
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.support.arrays import Array
 
 QUADRANTS = ((False, False), (True, False), (True, True), (False, True))

@@ -13,9 +13,9 @@ from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
 from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
+from ccd_casadi.drawing.pictures import Drawing
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.ordered import Ordered
-from ccd_casadi.plants.pictures import Drawing
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.process_pool import Pool

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import require
 
 STIFF, INERT = 2, 4  # orders of quadrature that are exact for K and for M
 AXES = range(3)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.plants.cad.elements import Body
 from ccd_casadi.plants.eigenpairs import (
     Pencil,
@@ -24,7 +25,6 @@ from ccd_casadi.plants.eigenpairs import (
     flexible_modes,
     orthonormal,
 )
-from ccd_casadi.plants.pictures import ModeShape, ModeShapes
 from ccd_casadi.support.arrays import Array
 
 EXTRA = 2  # modes solved beyond those kept: the resolvent converges the faster

@@ -7,17 +7,16 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
+from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.cad.elements import Body, Material
 from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
 from ccd_casadi.plants.ordered import Ordered
-from ccd_casadi.plants.pictures import ModeShapes
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import PlantError, require
 
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")  # of the rigid body, about its centre of gravity
 

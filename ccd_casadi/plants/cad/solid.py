@@ -18,8 +18,7 @@ import numpy as np
 from ccd_casadi.plants.cad.boundary import Boundary, boundary_of, edge_points, paired
 from ccd_casadi.plants.cad.extension import extended
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.optional_packages import require
+from ccd_casadi.support.errors import PlantError, require
 
 TRIANGLE, TETRAHEDRON = 2, 4  # gmsh's numbers of linear elements
 MODEL = "ccd_casadi"

@@ -21,9 +21,9 @@ import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.optional_packages import require
-from ccd_casadi.synthesis.backends.attempt import Attempt
+from ccd_casadi.support.errors import require
 from ccd_casadi.synthesis.backends.standard_plant import (
+    Attempt,
     StandardPlant,
     balance,
     with_d22,

@@ -1,23 +1,50 @@
 """Mixed sensitivity by any back end, every design judged by the same certificate."""
 
+import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.deadline import Overrun, Runner
-from ccd_casadi.support.optional_packages import MissingPackage
-from ccd_casadi.synthesis.backends.attempt import Attempt
-from ccd_casadi.synthesis.backends.registry import LMI, SLICOT, Backend
-from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, mixed_sensitivity
+from ccd_casadi.support.errors import MissingPackage, require
+from ccd_casadi.synthesis.backends import lmi, slicot
+from ccd_casadi.synthesis.backends.standard_plant import (
+    Attempt,
+    Solver,
+    StandardPlant,
+    mixed_sensitivity,
+)
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
+
+@dataclass(frozen=True)
+class Backend:
+    """A name, what it needs, and where its solver is."""
+
+    name: str
+    title: str
+    needs: tuple[str, ...]
+    extra: str
+
+    def solver(self) -> Solver:
+        """Its solver. Raises MissingPackage where a package that it needs is not installed."""
+        for package in self.needs:
+            require(package, self.extra)
+        return slicot.solve if self.name == "slicot" else lmi.solve
+
+
+SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot")
+LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi")
+
+
 RICCATI = "riccati"
-TITLES = {RICCATI: "one Riccati (ours)"} | {item.name: item.title for item in (SLICOT, LMI)}
 _GENERAL = {item.name: item for item in (SLICOT, LMI)}
+TITLES = {RICCATI: "one Riccati (ours)"} | {key: item.title for key, item in _GENERAL.items()}
 
 
 @dataclass(frozen=True)
@@ -104,4 +131,43 @@ def every_backend(
             except MissingPackage as missing:
                 result = BackendResult(backend, np.nan, None, str(missing), 0.0)
             found.append(result)
+    return found
+
+
+AGREE = 1e-3  # relative: what an interior-point method is good for
+BELOW = 1e-6  # relative: a claim this far below the bound is wrong
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the certificate says of one back end, and whether its claim and design hold."""
+
+    result: BackendResult
+    holds: bool | None  # None: it made no claim
+    words: str
+
+
+def verdicts(results: Sequence[BackendResult]) -> list[Verdict]:
+    """Judge every claim by the certificates and by the bound γ_jω of the package's own design."""
+    ours = next(item for item in results if item.backend == RICCATI)
+    bound = ours.design.figures.gamma_lower_bound if ours.design is not None else math.nan
+    proven = [item.gamma_opt for item in results if item.certified and item.gamma_opt > 0.0]
+    lowest = min(
+        (g for g in proven if not g < bound * (1.0 - BELOW)), default=math.nan
+    )  # fmt: skip
+    found = []
+    for item in results:
+        if item.design is None:
+            found.append(Verdict(item, None, item.reason))
+        elif item.gamma_opt < bound * (1.0 - BELOW):
+            short = 100.0 * (1.0 - item.gamma_opt / bound)
+            words = f"wrong: claims {short:.2g} % less than any controller reaches ({bound:.6g})"
+            found.append(Verdict(item, False, words))
+        elif not item.certified:
+            found.append(Verdict(item, False, f"not certified: {item.reason}"))
+        elif item.gamma_opt > lowest * (1.0 + AGREE):
+            over = 100.0 * (item.gamma_opt / lowest - 1.0)
+            found.append(Verdict(item, False, f"certified, but {over:.2g} % above the least"))
+        else:
+            found.append(Verdict(item, True, "certified"))
     return found

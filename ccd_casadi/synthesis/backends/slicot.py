@@ -12,9 +12,8 @@ import warnings
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.optional_packages import require
-from ccd_casadi.synthesis.backends.attempt import Attempt
-from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, balance
+from ccd_casadi.support.errors import require
+from ccd_casadi.synthesis.backends.standard_plant import Attempt, StandardPlant, balance
 
 STARTS = (1e3, 1e6)  # finite γ to bisect from; the second where the first is too low
 BISECT, SUBOPTIMAL = 1, 4  # SB10AD's jobs

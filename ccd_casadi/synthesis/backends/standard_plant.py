@@ -4,6 +4,7 @@
 """
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -119,3 +120,22 @@ def with_d22(K: StateSpace, D22: Array) -> StateSpace:
     E = np.linalg.inv(np.eye(D22.shape[0]) + D22 @ K.D)
     DE = K.D @ E
     return StateSpace(K.A - K.B @ E @ D22 @ K.C, K.B @ E, K.C - DE @ D22 @ K.C, DE)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """γ_opt as the back end has it, and a controller that is to reach `gamma`, e or y to u.
+
+    `controller` is None where there is none; `reason` then says why.
+    """
+
+    gamma_opt: float
+    gamma: float
+    controller: StateSpace | None
+    reason: str = ""
+
+
+class Solver(Protocol):
+    """H∞ synthesis for any standard plant at gamma_backoff times its own γ_opt."""
+
+    def __call__(self, plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt: ...

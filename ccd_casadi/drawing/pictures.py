@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.units import number
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,18 @@ class ModeShape:
     numbers: tuple[int, ...]
     words: str = ""
     more: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def places(self) -> str:
+        """`4 and 5`."""
+        return " and ".join(map(str, self.numbers))
+
+    @property
+    def title(self) -> str:
+        """`4 and 5: bent tilt, a pair, 950.6 Hz`."""
+        pair = ", a pair" if len(self.numbers) > 1 else ""
+        words = f": {self.words}" if self.words else ""
+        return f"{self.places}{words}{pair}, {number(self.frequency, 4)} Hz"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,11 @@
 """Maps over two variables: the landscape of ω_b*(θ) and the inner problem's (ω_S, ω_T)."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.reporting.svg import (
+from ccd_casadi.drawing.content import Landscape, SweepMap, ThetaPath
+from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
     CYCLE,
@@ -28,74 +27,7 @@ if TYPE_CHECKING:
 MAP_WIDTH = 8.4  # inches
 
 
-@dataclass(frozen=True)
-class Landscape:
-    """ω_b*(θ) in Hz on a grid of two parameters (NaN: infeasible), and what is known of it.
-
-    `bandwidth_hz` (len(first), len(second)), empty where there is no surrogate. `truths` are
-    rows (θ₁, θ₂, Hz), `designs` rows (θ₁, θ₂). `forbidden` is where some λ(θ) > 0. `region` is
-    a trust region (low₁, high₁, low₂, high₂).
-    """
-
-    names: tuple[str, str]
-    units: tuple[str, str]
-    first: Array
-    second: Array
-    bandwidth_hz: Array
-    truths: Array
-    designs: Array
-    truth_label: str = "true ω_b*(θ), same colours"
-    forbidden: Array | None = None
-    region: tuple[float, float, float, float] | None = None
-
-    @property
-    def outside(self) -> np.ndarray:
-        """The grid's points outside the trust region: no surrogate speaks of them."""
-        if self.region is None or not self.bandwidth_hz.size:
-            return np.zeros(self.bandwidth_hz.shape, dtype=bool)
-        a, b, c, d = self.region
-        first = (self.first >= a) & (self.first <= b)
-        second = (self.second >= c) & (self.second <= d)
-        return ~(first[:, None] & second[None, :])
-
-
-@dataclass(frozen=True)
-class ThetaPath:
-    """A method's way over θ, rows (θ₁, θ₂); numbered where `numbered`."""
-
-    label: str
-    theta: Array
-    numbered: bool = False
-
-
-@dataclass(frozen=True)
-class SweepMap:
-    """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
-
-    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low`, the largest ln(figure/bound) of the bounds
-    that `others` names, lie on the grid of
-    `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
-    where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
-    """
-
-    rows: Array
-    omega_S: Array
-    omega_T: Array
-    bandwidth_hz: Array
-    peak: Array
-    low: Array
-    optimum: tuple[float, float, float]
-    source: str
-    others: str = "S_low"
-
-
-def figure_landscape(
-    land: Landscape,
-    paths: Sequence[ThetaPath] = (),
-    optimum: tuple[float, float] | None = None,
-    *,
-    key: str = "landscape",
-) -> str:
+def figure_landscape(land: Landscape, key: str) -> str:
     """Filled contours of ω_b*(θ) with true samples, paths and the optimum."""
     from matplotlib.patches import Rectangle
 
@@ -103,7 +35,8 @@ def figure_landscape(
         figure, axes = _map_axes()
         axes.grid(False)
         axes.set_facecolor("#eeeeee")
-        shown = land.bandwidth_hz if land.bandwidth_hz.size else land.truths[:, 2]
+        truths = land.truths.reshape(-1, 3)
+        shown = land.bandwidth_hz if land.bandwidth_hz.size else truths[:, 2]
         filled, norm = _contours(axes, land.first, land.second, land.bandwidth_hz, shown)
         if land.outside.any():
             pale = np.where(land.outside, 1.0, np.nan)
@@ -114,14 +47,14 @@ def figure_landscape(
         if len(land.designs):
             axes.plot(*land.designs.T, ".", color="white", markersize=3.5, markeredgecolor=GREY,
                       markeredgewidth=0.4, label="sampled designs", linestyle="none")  # fmt: skip
-        if len(land.truths):
-            known = land.truths[np.isfinite(land.truths[:, 2])]
+        if len(truths):
+            known = truths[np.isfinite(truths[:, 2])]
             dots = axes.scatter(
                 known[:, 0], known[:, 1], c=known[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
                 edgecolors="white", linewidths=0.9, label=land.truth_label, zorder=3, clip_on=False,
             )  # fmt: skip
             filled = filled or dots
-            lost = land.truths[~np.isfinite(land.truths[:, 2])]
+            lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
                 axes.plot(lost[:, 0], lost[:, 1], "x", color=GREY, label="infeasible θ")
         if land.region is not None:
@@ -129,11 +62,12 @@ def figure_landscape(
             axes.add_patch(Rectangle((a, c), b - a, d - c, fill=False, edgecolor=BLACK,
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
                                      label="last trust region"))  # fmt: skip
-        for i, path in enumerate(paths):
+        for i, path in enumerate(land.paths):
             _path(axes, path, CYCLE[(i + 1) % len(CYCLE)])
-        if optimum is not None:
-            axes.plot([optimum[0]], [optimum[1]], "*", color=ORANGE, markersize=15, clip_on=False,
-                      markeredgecolor="white", markeredgewidth=0.9, zorder=7, linestyle="none",
+        if land.optimum is not None:
+            a, b = land.optimum
+            axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
+                      markeredgecolor="white", markeredgewidth=0.9, linestyle="none",
                       label="verified optimum")  # fmt: skip
         axes.set_xlim(land.first[0], land.first[-1])
         axes.set_ylim(land.second[0], land.second[-1])
@@ -145,7 +79,7 @@ def figure_landscape(
         return to_svg(figure, key, "Landscape of the largest bandwidth over the two parameters")
 
 
-def figure_sweep(sweep: SweepMap, *, key: str = "sweep") -> str:
+def figure_sweep(sweep: SweepMap, key: str) -> str:
     """ω_b over (ω_S, ω_T) at one θ; what S_max and S_low forbid is hatched."""
     with style():
         figure, axes = _map_axes()

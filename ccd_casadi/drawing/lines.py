@@ -1,126 +1,52 @@
-"""Line figures from plain data: panels of curves with bands, reference lines and marked points."""
+"""Line figures: panels of curves with bands, reference lines and marked points."""
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.reporting.labels import Labels, inside
-from ccd_casadi.reporting.svg import (
-    BLACK,
-    BLUE,
-    GREY,
-    WIDTH,
-    log_axis,
-    new_figure,
-    place,
-    style,
-    to_svg,
-)
-from ccd_casadi.support.arrays import Array
+from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.labels import Labels, inside
+from ccd_casadi.drawing.page import table_html
+from ccd_casadi.drawing.svg import WIDTH, log_axis, new_figure, place, style, to_svg
+from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
 
 LEAST_POINTS = 8  # of a curve that values are read off
 LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
 
 
-@dataclass(frozen=True)
-class Curve:
-    """y over x; `line` and `marker` as in matplotlib, either may be empty."""
+def figure_lines(figure: Lines, key: str) -> str:
+    """Rows of panels as HTML, a picture each; `key` is unique in the page.
 
-    x: Array
-    y: Array
-    label: str = ""
-    colour: str = BLUE
-    line: str = "-"
-    marker: str = ""
-    width: float = 1.3
-
-
-@dataclass(frozen=True)
-class Band:
-    """The area between low and high over x."""
-
-    x: Array
-    low: Array
-    high: Array
-    label: str = ""
-    colour: str = BLUE
-
-
-@dataclass(frozen=True)
-class Mark:
-    """A marked point and its words, beside it in points (dx, dy)."""
-
-    x: float
-    y: float
-    text: str = ""
-    marker: str = "o"
-    colour: str = BLACK
-    offset: tuple[float, float] = (0.0, 7.0)
-
-
-@dataclass(frozen=True)
-class Level:
-    """A thin line across the panel at `value`, with its words at the end."""
-
-    value: float
-    text: str
-    vertical: bool = False
-    colour: str = GREY
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One pair of axes. Labels carry the unit; ranges default to the data."""
-
-    x_label: str
-    y_label: str
-    curves: tuple[Curve, ...] = ()
-    bands: tuple[Band, ...] = ()
-    marks: tuple[Mark, ...] = ()
-    levels: tuple[Level, ...] = ()
-    log_x: bool = False
-    log_y: bool = False
-    x_range: tuple[float, float] | None = None
-    y_range: tuple[float, float] | None = None
-    whole_x: bool = False
-    y_step: float | None = None
-    legend: Corner | None = "best"
-    title: str = ""
-    forbidden: tuple[tuple[np.ndarray, str], ...] = ()  # corners x + iy of an area, its colour
-
-
-def figure_lines(
-    rows: Sequence[Sequence[Panel | str | None]],
-    *,
-    key: str,
-    title: str,
-    heights: Sequence[float] | None = None,
-) -> str:
-    """Rows of panels as HTML, a picture each; heights in inches.
-
-    HTML stands as it is in a panel's place, None is an empty one. As pictures of their own the
-    panels of a row stand below each other where a page is narrow.
+    As pictures of their own the panels of a row stand below each other where a page is narrow.
     """
-    tall = list(heights) if heights is not None else [2.9] * len(rows)
+    heights = figure.heights or (2.9,) * len(figure.rows)
     parts = []
     with style():
-        for i, (row, height) in enumerate(zip(rows, tall, strict=True)):
+        for i, (row, height) in enumerate(zip(figure.rows, heights, strict=True)):
             drawn = [
-                f"<div>{panel}</div>" if isinstance(panel, str)
-                else _picture(panel, WIDTH / len(row), height, f"{key}-{i}{j}", title)
+                _placed(panel, WIDTH / len(row), height, f"{key}-{i}{j}", figure.title)
                 for j, panel in enumerate(row)
-                if panel is not None
-            ]  # fmt: skip
+            ]
             parts.append(f'<div class="panels n{len(row)}">{"".join(drawn)}</div>')
     return "\n".join(parts)
+
+
+def _placed(what: Place, width: float, height: float, key: str, title: str) -> str:
+    match what:
+        case Panel():
+            return _picture(what, width, height, key, title)
+        case Modes():
+            return f"<div>{modes_html(what)}</div>"
+        case Table():
+            return f"<div>{table_html(what)}</div>"
+        case Picture():
+            return f"<div>{what.svg}</div>"
+    return ""
 
 
 def _picture(panel: Panel, width: float, height: float, key: str, title: str) -> str:
@@ -159,8 +85,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             band.x, band.low, band.high, color=band.colour, alpha=0.18, linewidth=0.0,
             label=band.label or None,
         )  # fmt: skip
-    for corners, colour in panel.forbidden:
-        axes.fill(corners.real, corners.imag, color=colour, alpha=0.2, linewidth=0.0)
+    for area in panel.forbidden:
+        axes.fill(area.x, area.y, color=area.colour, alpha=0.2, linewidth=0.0)
     for i, curve in enumerate(panel.curves):
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",

@@ -1,0 +1,1 @@
+"""What a page shows, as plain data, and how it is painted: nothing here computes."""

@@ -1,0 +1,319 @@
+"""What a page shows, as plain data: words, tables, and figures down to every point of a curve.
+
+Made where the figures are known, kept in `report.json` (`stored`) and painted by `paint`.
+"""
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Literal
+
+import numpy as np
+
+from ccd_casadi.drawing.pictures import ModeShapes
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE
+from ccd_casadi.support.arrays import Array
+
+Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
+Fact = tuple[str, str, str]  # quantity, value, remark
+INDEX = "index.html"  # of a run's folder
+
+
+@dataclass(frozen=True)
+class Curve:
+    """y over x; `line` and `marker` as in matplotlib, either may be empty."""
+
+    x: Array
+    y: Array
+    label: str = ""
+    colour: str = BLUE
+    line: str = "-"
+    marker: str = ""
+    width: float = 1.3
+
+
+@dataclass(frozen=True)
+class Band:
+    """The area between low and high over x."""
+
+    x: Array
+    low: Array
+    high: Array
+    label: str = ""
+    colour: str = BLUE
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A marked point and its words, beside it in points (dx, dy)."""
+
+    x: float
+    y: float
+    text: str = ""
+    marker: str = "o"
+    colour: str = BLACK
+    offset: tuple[float, float] = (0.0, 7.0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A thin line across the panel at `value`, with its words at the end."""
+
+    value: float
+    text: str
+    vertical: bool = False
+    colour: str = GREY
+
+
+@dataclass(frozen=True)
+class Area:
+    """A shaded area with its corners at (x, y): where a curve may not be."""
+
+    x: Array
+    y: Array
+    colour: str = ORANGE
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes. Labels carry the unit; ranges default to the data."""
+
+    x_label: str
+    y_label: str
+    curves: tuple[Curve, ...] = ()
+    bands: tuple[Band, ...] = ()
+    marks: tuple[Mark, ...] = ()
+    levels: tuple[Level, ...] = ()
+    log_x: bool = False
+    log_y: bool = False
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    whole_x: bool = False
+    y_step: float | None = None
+    legend: Corner | None = "best"
+    title: str = ""
+    forbidden: tuple[Area, ...] = ()
+
+
+@dataclass(frozen=True)
+class Table:
+    """Column heads and rows of texts or numbers; numbers are rounded and set to the right.
+
+    A number that is not finite is None, and shows as a dash.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+
+    def __post_init__(self) -> None:
+        rows = tuple(tuple(_cell(value) for value in row) for row in self.rows)
+        object.__setattr__(self, "rows", rows)
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An <svg> element that a plant or a machine has drawn of itself."""
+
+    svg: str
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Mode shapes on a plant's surface: to be turned, with a scale, or small ones that stand."""
+
+    shapes: ModeShapes
+    turning: bool = False
+
+
+Place = Panel | Picture | Modes | Table | None  # None: an empty one
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Rows of panels, read out as `title`; heights in inches, 2.9 by default."""
+
+    rows: tuple[tuple[Place, ...], ...]
+    title: str
+    heights: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class ThetaPath:
+    """A method's way over θ, rows (θ₁, θ₂); numbered where `numbered`."""
+
+    label: str
+    theta: Array
+    numbered: bool = False
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """ω_b*(θ) in Hz on a grid of two parameters (NaN: infeasible), and what is known of it.
+
+    `bandwidth_hz` (len(first), len(second)), empty where there is no surrogate. `truths` are
+    rows (θ₁, θ₂, Hz), `designs` rows (θ₁, θ₂). `forbidden` is where some λ(θ) > 0. `region` is
+    a trust region (low₁, high₁, low₂, high₂), `optimum` the verified one.
+    """
+
+    names: tuple[str, str]
+    units: tuple[str, str]
+    first: Array
+    second: Array
+    bandwidth_hz: Array
+    truths: Array
+    designs: Array
+    truth_label: str = "true ω_b*(θ), same colours"
+    forbidden: Array | None = None
+    region: tuple[float, float, float, float] | None = None
+    paths: tuple[ThetaPath, ...] = ()
+    optimum: tuple[float, float] | None = None
+
+    @property
+    def outside(self) -> np.ndarray:
+        """The grid's points outside the trust region: no surrogate speaks of them."""
+        if self.region is None or not self.bandwidth_hz.size:
+            return np.zeros(self.bandwidth_hz.shape, dtype=bool)
+        a, b, c, d = self.region
+        first = (self.first >= a) & (self.first <= b)
+        second = (self.second >= c) & (self.second <= d)
+        return ~(first[:, None] & second[None, :])
+
+
+@dataclass(frozen=True)
+class SweepMap:
+    """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
+
+    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low`, the largest ln(figure/bound) of the bounds
+    that `others` names, lie on the grid of
+    `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
+    where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
+    """
+
+    rows: Array
+    omega_S: Array
+    omega_T: Array
+    bandwidth_hz: Array
+    peak: Array
+    low: Array
+    optimum: tuple[float, float, float]
+    source: str
+    others: str = "S_low"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure with its caption, and the numbers behind it, which a page folds away."""
+
+    drawing: Lines | Landscape | SweepMap | Modes | Picture
+    caption: str
+    tables: tuple[Table, ...]
+
+
+@dataclass(frozen=True)
+class Words:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Of a part of a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of sentences."""
+
+    items: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Links:
+    """Pages beside this one: address, title, and what is on it."""
+
+    items: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Text as it is, in a box."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Quantity, value and remark in three columns."""
+
+    rows: tuple[Fact, ...]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """One of several pictures at a time, with its words, chosen by a slider; `first` is shown."""
+
+    steps: tuple[tuple[str, Lines], ...]
+    first: int
+    label: str
+
+
+@dataclass(frozen=True)
+class VerdictLine:
+    """A line of a run's verdict: its name, `passed`, `warned`, `failed` or `unknown`, and why."""
+
+    name: str
+    state: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The lines of a verdict."""
+
+    lines: tuple[VerdictLine, ...]
+
+
+@dataclass(frozen=True)
+class Head:
+    """Title, status with its reason, a line of circumstances, the conclusion, the verdict.
+
+    `badge`: "good", "warn" or "bad".
+    """
+
+    title: str
+    badge: str
+    status: str
+    reason: str
+    meta: str
+    lead: str
+    verdict: tuple[VerdictLine, ...] = ()
+
+
+Text = Words | Heading | Bullets | Links | Source | Facts | Verdict
+Block = Text | Table | Figure | Picture | Steps
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands under it; `own_page` starts a page in print."""
+
+    heading: str
+    body: tuple[Block, ...]
+    own_page: bool = False
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole page; `index`: the one that links all of the run, empty where there is none."""
+
+    head: Head
+    sections: tuple[Section, ...]
+    index: str = INDEX

@@ -1,0 +1,50 @@
+"""`python -m ccd_casadi.report RUN_DIR`: the pages of a folder drawn again from what it holds.
+
+Nothing is designed: what the pages show is in report.json. A run that kept none gets a report of
+its design, as far as case.toml, controller.json and result.json hold it.
+"""
+
+import argparse
+from collections.abc import Sequence
+
+from ccd_casadi.support.command_line import ExitCode, run, run_parser
+from ccd_casadi.support.errors import UserError
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """Draw every page of the folder, and of those of deployments and the like below it."""
+    from ccd_casadi.cases.run_folder import read_run
+    from ccd_casadi.drawing.stored import NAME, draw, read_pages
+    from ccd_casadi.reporting.index import publish, write_index
+    from ccd_casadi.reporting.solve_page import page_of_run
+
+    folder = options.run
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+    below = (path.parent for path in sorted(folder.glob(f"*/{NAME}")))
+    drawn = []
+    for place in (folder, *(own for own in below if not (own / "result.json").exists())):
+        for name, page in read_pages(place).items():
+            draw(place / name, page)
+            drawn.append(place / name)
+    report = folder / "report.html"
+    if not (report.exists() or (folder / "compare.json").exists()):
+        publish(folder, report, page_of_run(read_run(folder)))
+        drawn.append(report)
+    write_index(folder)
+    if not options.quiet:
+        print("\n".join(f"drawn         {path}" for path in drawn))
+    return ExitCode.DONE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = run_parser(
+        "ccd_casadi.report", "The pages of a finished folder, drawn again; nothing is designed.",
+        without_effect=["--out", "--workers", "--seed"],
+    )  # fmt: skip
+    return run(command, arguments, argv, needs=["ccd_casadi.drawing.stored"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,58 @@
+"""What a command leaves on the screen of a terminal of a given width."""
+
+import fcntl
+import os
+import pty
+import struct
+import sys
+import termios
+
+import pytest
+
+import ccd_casadi
+from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import wrapped
+
+
+def on_screen(columns: int, *words: str) -> list[str]:
+    """The lines that a command leaves on a terminal: what was written over is gone."""
+    child, terminal = pty.fork()
+    if child == 0:
+        os.environ["PYTHONUTF8"] = "1"
+        fcntl.ioctl(0, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+        os.execv(sys.executable, [sys.executable, "-m", "ccd_casadi", *words])
+    written = b""
+    try:
+        while part := os.read(terminal, 65536):
+            written += part
+    except OSError:  # Linux says so where the other side is closed
+        pass
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    lines = written.decode().replace("\r\n", "\n").split("\n")
+    return [line.split("\r")[-1].replace("\x1b[2K", "") for line in lines]
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
+    """No word is broken and none lost, and no bar stays on a line of the answer."""
+    lines = on_screen(columns, "check", str(ccd_casadi.TWO_MASS))
+    assert max(map(len, lines)) <= columns
+    assert any(line.startswith("plant         two_mass: 1 input") for line in lines)
+    ends = [line for line in lines if line.startswith("checking the plant")]
+    assert len(ends) == 1
+    assert "left" not in ends[0]
+
+
+def test_a_line_goes_on_under_its_words() -> None:
+    line = "survives      warned   stable for resonances -0.76 to +7.9 %, less than +-2 %"
+    broken = wrapped(line, 50).split("\n")
+    assert all(part.startswith(" " * 23) for part in broken[1:])
+    assert " ".join(" ".join(broken).split()) == " ".join(line.split())
+
+
+def test_work_that_ends_early_ends_its_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(126, "worst hardware") as bar:
+        bar.advance(9)
+    with Progress(1, "verifying") as bar:
+        bar.advance()
+    assert "9/9" in capsys.readouterr().err.splitlines()[-1]
