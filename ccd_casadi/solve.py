@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     from ccd_casadi.analysis.loop_figures import loop_lines
-    from ccd_casadi.codesign.budget_result import budget_lines
+    from ccd_casadi.codesign.design_entries import budget_lines
     from ccd_casadi.inner_problem.sections_words import channel_words
     from ccd_casadi.reporting.verdict import terminal_lines
     from ccd_casadi.sampling.spent import cost_words

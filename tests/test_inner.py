@@ -7,8 +7,8 @@ import pytest
 from benchmark_scripts import benchmark
 from helpers import HZ, INNER, PAPER, log_uniform, problem, two_mass
 
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant, true_inner
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import (
     InnerProblem,

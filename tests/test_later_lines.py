@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
-from ccd_casadi.codesign.later_lines import told
+from ccd_casadi.codesign.result import told
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deploy import main as deploy
 from ccd_casadi.drawing.content import Page

@@ -15,7 +15,7 @@ from helpers import problem
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.post_optimal import sections_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
