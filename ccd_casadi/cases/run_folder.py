@@ -147,17 +147,7 @@ def _read_sections(
     `figures` are those of the continuous loop with the model; hold and delay are not in them.
     """
     path = folder / "controller.json"
-<<<<<<< HEAD
-    table = read_json(path).get("sections")
-    words = "is not a list of parameters of the case's structure; solve the case again"
-    try:
-        kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: sections.kappa: {words}") from None
-    problem = _with_directions(problem, table, path)
-=======
     problem = _with_directions(problem, read_json(path).get("sections"), path)
->>>>>>> main
     structure = structure_of(problem)
     kappa = np.array(sections_kappa(folder, structure))
     controller = controller_of(structure, kappa)
