@@ -158,6 +158,7 @@ def _with_sections(
         for key in ("theta", "objective", "sampling", "outer", "robust"):
             case.pop(key, None)
         case.get("loop", {}).pop("delay_us", None)
+        case["controller"].pop("starts")  # one search alone, from as many places as usual
 
 
 def written(folder: Path, case: dict[str, Any]) -> Path:

@@ -20,7 +20,7 @@ from ccd_casadi.cross_check import main
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import scale_state_space
-from ccd_casadi.support.errors import MissingPackage
+from ccd_casadi.support.errors import MissingPackage, require
 from ccd_casadi.synthesis.backends.mixed import (
     AGREE,
     Backend,
@@ -169,6 +169,15 @@ def test_missing_package_is_named_with_its_remedy() -> None:
     backend = Backend("none", "none", ("no_such_package",), "slicot")
     with pytest.raises(MissingPackage, match=r"pip install 'ccd-casadi\[slicot\]'"):
         backend.solver()
+
+
+def test_a_library_of_the_system_that_a_package_lacks_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "loads_more.py").write_text("raise OSError('libGLU.so.1: cannot open')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingPackage, match=r"loads_more: cannot be loaded \(libGLU\.so\.1"):
+        require("loads_more", "cad")
 
 
 def test_command_refuses_what_it_cannot_use(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The explorer in a real browser: dragged, refused with a bad token, its server killed."""
 
+import json
 import re
 import signal
 import subprocess
@@ -133,6 +134,28 @@ def test_it_fits_and_does_not_complain(browser, server, width, scheme):
     light = sum(map(int, re.findall(r"\d+", ground)[:3])) > 3 * 128
     assert light == (scheme == "light")
     assert not heard
+
+
+@pytest.mark.parametrize("width", [1920, 1400, 800, 390])
+def test_a_circle_is_round_without_a_browser_too(width):
+    """The page's own arithmetic, in the JavaScript that playwright brings: CI has no Chromium."""
+    api = pytest.importorskip("playwright", reason="playwright is not installed")
+    pytest.importorskip("bokeh", reason="bokeh is not installed")
+    from ccd_casadi.explorer.figures import CENTRE, HALF, ROUND
+
+    size = {"inner_width": width - 70, "inner_height": 180}
+    code = f"""
+const axis = () => ({{setv(found) {{ Object.assign(this, found) }}}})
+const figure = {{...{json.dumps(size)}, x_range: axis(), y_range: axis()}}
+;((figure, centre, half) => {{ {ROUND} }})(figure, {CENTRE}, {json.dumps(HALF)})
+console.log(JSON.stringify([figure.x_range, figure.y_range]))"""
+    node = Path(api.__file__).parent / "driver" / "node"
+    found = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
+    x, y = json.loads(found.stdout)
+    across, up = x["end"] - x["start"], y["end"] - y["start"]
+    assert across / size["inner_width"] == pytest.approx(up / size["inner_height"], rel=1e-12)
+    assert min(CENTRE - x["start"], x["end"] - CENTRE) >= HALF[0] * (1.0 - 1e-12)
+    assert min(-y["start"], y["end"]) >= HALF[1] * (1.0 - 1e-12)
 
 
 def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):

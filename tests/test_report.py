@@ -43,6 +43,7 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.report import main as report_command
 from ccd_casadi.reporting.bode import bode
+from ccd_casadi.reporting.landscape import caption_landscape
 from ccd_casadi.reporting.lifted_maximum import inner_maximum
 from ccd_casadi.reporting.solve_page import solve_page, write_report
 from ccd_casadi.sampling.sampler import Sampler
@@ -320,6 +321,28 @@ def test_a_page_is_drawn_again_from_its_folder_alone(
         assert (again / "report.html").read_text(encoding="utf-8") == first
 
 
+def test_a_run_without_one_gets_a_report_of_its_design(
+    two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    for name in ("report.html", "report.json"):
+        (folder / name).unlink(missing_ok=True)
+
+    def refused(*given: object, **named: object) -> None:
+        raise AssertionError("nothing is designed")
+
+    for place in ("synthesis.synthesis", "reporting.loops", "reporting.start"):
+        monkeypatch.setattr(f"ccd_casadi.{place}.synthesise", refused)
+    assert report_command([str(folder), "--quiet"]) == 0
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    Document(text)
+    for heading in ("At a glance", "The design", "Plant and controller", "A move", "Provenance"):
+        assert f"<h2>{heading}</h2>" in text
+    assert "how the design was found was not kept" in text
+    assert report_command([str(folder), "--quiet"]) == 0
+    assert (folder / "report.html").read_text(encoding="utf-8") == text
+
+
 def test_a_foreign_or_damaged_report_json_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -401,6 +424,16 @@ def test_landscape_takes_several_paths_and_unknown_letters() -> None:
     svg = figure_landscape(land, "two")
     Document(svg)
     assert all(word in svg for word in ("ours", "theirs", "天", "…"))
+
+
+def test_a_slope_that_the_surrogate_may_err_by_is_not_told() -> None:
+    """It was told as a fact, eight times the true one, at an optimum that the samples missed."""
+    axis = np.linspace(0.0, 1.0, 5)
+    field = axis[:, None] ** 2 + 0.0 * axis  # the steepest step is 7/16 Hz
+    land = Landscape(("a", "b"), ("", ""), axis, axis, field, np.empty((0, 3)), np.empty((0, 2)))
+    for error, told in ((0.2, True), (0.25, False)):
+        words = caption_landscape(land, 1.0, lifted=False, error_hz=error)
+        assert ("steepest" in words) is told
 
 
 def test_tables_round_and_escape() -> None:

@@ -244,7 +244,8 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
     assert page.count("<figure>") == 6
     assert "not stable on all plants" in page
     assert "-0.76 %" in page
-    assert sorted(p.name for p in out.iterdir()) == ["robustness.html", "robustness.json"]
+    left = ["report.json", "robustness.html", "robustness.json"]
+    assert sorted(p.name for p in out.iterdir()) == left
 
 
 @pytest.mark.parametrize(

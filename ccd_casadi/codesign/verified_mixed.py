@@ -84,6 +84,7 @@ class VerifiedDesign(Verified):
                 }
                 for check in self.references
             },
+            "gap": None,  # nothing bounds KS, and so no ω_b, but the weights that are searched
         }
         if self.robust is not None:
             found["robust"] = {

@@ -14,7 +14,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.drawing.pictures import Drawing, ModeShapes
+from ccd_casadi.drawing.content import Figure
+from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool
@@ -76,7 +77,7 @@ class Plant:
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
-    drawing: Callable[[Mapping[str, Sequence[float]]], Drawing] | None = None
+    drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
 
     @cached_property
     def slopes(self) -> ca.Function:

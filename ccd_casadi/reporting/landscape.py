@@ -94,8 +94,10 @@ def best_designs(problem: CoDesignProblem, truths: Truths) -> dict[tuple[float, 
     return best
 
 
-def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
-    """Range, steepest place, and how far the surrogate is from the true samples."""
+def caption_landscape(
+    land: Landscape, best_hz: float, *, lifted: bool, error_hz: float = 0.0
+) -> str:
+    """Range, and the steepest place where the surrogate's own error leaves one to be told."""
     if not land.bandwidth_hz.size:
         return (
             "The direct formulation makes no surrogate: the large dots are the θ where a synthesis "
@@ -121,7 +123,7 @@ def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
             "grid), where the last surrogate was not asked to be right; believe the dots there."
         )
     else:
-        words += _steepest(land)
+        words += _steepest(land, error_hz)
     share = np.isnan(field).mean()
     if share > 0.0:
         words += f" Grey: no feasible design ({100.0 * share:.0f} % of the grid)."
@@ -130,13 +132,13 @@ def caption_landscape(land: Landscape, best_hz: float, *, lifted: bool) -> str:
     return words
 
 
-def _steepest(land: Landscape) -> str:
-    """Where the field changes most between neighbours, and how unlike the usual that is."""
+def _steepest(land: Landscape, error_hz: float) -> str:
+    """Where the field changes most between neighbours, if by more than it may err there."""
     steps = [np.abs(np.diff(land.bandwidth_hz, axis=k)) for k in range(2)]
     steps = [step if np.isfinite(step).any() else np.zeros_like(step) for step in steps]
     k = int(np.nanmax(steps[1]) > np.nanmax(steps[0]))
     largest = float(np.nanmax(steps[k]))
-    if largest == 0.0:
+    if largest <= 2.0 * error_hz:  # a difference of two values
         return ""
     i, j = (int(v) for v in np.unravel_index(np.nanargmax(steps[k]), steps[k].shape))
     usual = max(float(np.nanmedian(step)) for step in steps)
@@ -211,15 +213,10 @@ def tables_landscape(land: Landscape) -> tuple[Table, ...]:
     tables = []
     first, second = land.names
     if land.bandwidth_hz.size:
-        rows = range(0, len(land.first), TABLE_STEP)
-        columns = range(0, len(land.second), TABLE_STEP)
-        head = (
-            f"ω_b* in Hz; {first} ↓ {second} →",
-            *(number(float(land.second[j])) for j in columns),
-        )
-        body = tuple(
-            (float(land.first[i]), *(float(land.bandwidth_hz[i, j]) for j in columns)) for i in rows
-        )
-        tables.append(Table(head, body))
+        thinned = slice(0, None, TABLE_STEP)
+        heads = (number(float(value)) for value in land.second[thinned])
+        values = land.bandwidth_hz[thinned, thinned].T
+        head = (f"ω_b* in Hz; {first} ↓ {second} →", *heads)
+        tables.append(Table.of(head, land.first[thinned], *values))
     head = (axis_label(first, land.units[0]), axis_label(second, land.units[1]), "true ω_b* (Hz)")
-    return (*tables, Table(head, tuple(tuple(map(float, row)) for row in land.truths)))
+    return (*tables, Table.of(head, *land.truths.T))

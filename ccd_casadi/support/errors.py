@@ -25,9 +25,15 @@ class MissingPackage(UserError):
 
 
 def require(package: str, extra: str) -> Any:
-    """Import a package of the extra `ccd-casadi[extra]`. Raises MissingPackage without it."""
+    """Import a package of the extra `ccd-casadi[extra]`.
+
+    Raises MissingPackage without it, or without a library of the system that it loads.
+    """
     try:
         return import_module(package)
     except ImportError:
         words = f"is not installed; install it with pip install 'ccd-casadi[{extra}]'"
+        raise MissingPackage(f"{package}: {words}") from None
+    except OSError as error:
+        words = f"cannot be loaded ({error}); install that library of the system"
         raise MissingPackage(f"{package}: {words}") from None
