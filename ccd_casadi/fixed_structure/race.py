@@ -90,7 +90,8 @@ def run_race(
 def started(problem: LoopProblem, kappa: Array) -> Point:
     """A controller at the bandwidth that searches start from; lower if it keeps its bounds there.
 
-    A climb that began above the bandwidth that a controller has would leave it for good.
+    A climb that began above the bandwidth that a controller has would leave it for good; one below
+    ω_low is none.
     """
     tau = problem.begin(kappa)
     first = point = Point(kappa, tau, assess(problem, kappa, tau))
@@ -101,6 +102,8 @@ def started(problem: LoopProblem, kappa: Array) -> Point:
         if not (peaks.to_tau[over] > 0.0).all():
             break
         tau -= float((peaks.value[over] / peaks.to_tau[over]).max())
+        if tau < np.log(problem.low):
+            break
         point = Point(kappa, tau, assess(problem, kappa, tau))
     return first
 
