@@ -9,7 +9,7 @@ from collections import Counter
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
-from ccd_casadi.support.deadline import Runner
+from ccd_casadi.support.worker_process import Runner
 from ccd_casadi.synthesis.backends.mixed import TITLES, synthesise_with, verdicts
 
 SEED = 0

@@ -27,8 +27,8 @@ import numpy as np
 from chain_plants import chain_problem
 
 import ccd_casadi as ccd
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, true_inner
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.plants.plant import hardware_cost
 
 AGREE = 1e-3  # relative

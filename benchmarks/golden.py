@@ -26,7 +26,7 @@ import ccd_casadi as ccd
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_problem import Uncertainty
-from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.rows import problem_hash
 
 FILE = ROOT / "tests/data/golden.json"
 FILES = {

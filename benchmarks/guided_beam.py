@@ -23,8 +23,9 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import synthesise_sections
 from ccd_casadi.inner_problem.problem import box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem, structure_of
+from ccd_casadi.inner_problem.sections_search import prepared, with_range
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 

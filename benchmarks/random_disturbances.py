@@ -28,9 +28,9 @@ from slycot.exceptions import SlycotError
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.backends import slicot
 from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
 from ccd_casadi.synthesis.synthesis import Design, synthesise

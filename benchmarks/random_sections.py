@@ -51,8 +51,8 @@ from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import build_plant, mechanics
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.weights import Weights
 
 HZ = 2.0 * np.pi

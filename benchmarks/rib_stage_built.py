@@ -25,9 +25,11 @@ from scipy.signal import cont2discrete
 
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
-from ccd_casadi.deployment.sampled import sampled_figures, sampled_plant, sensitivity_loop
+from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
@@ -85,7 +87,7 @@ def judged(
     """Rows of a group, and its worst plant."""
     rows, made = [], plants(theta, seed, group, anywhere)
     for plant, place in made:
-        f = sampled_figures(sensitivity_loop(sampled_plant(plant, 1.0 / RATE, DELAY), K))
+        f = sampled_figures(closed_loop(sampled(plant, 1.0 / RATE, DELAY), K).S)
         rows.append({"group": group, "stable": f.stable, "radius": f.spectral_radius,
                      "peak": f.sensitivity_peak if f.stable else None,
                      "bandwidth_hz": f.bandwidth / HZ if f.stable else None, **place})  # fmt: skip
@@ -117,7 +119,7 @@ def main() -> None:
         rows += more
         peak = max(row["peak"] or np.inf for row in more)
         if top < peak < np.inf:
-            held = sampled_plant(plant, 1.0 / RATE, DELAY)
+            held = sampled(plant, 1.0 / RATE, DELAY)
             bandwidth = HZ * min(row["bandwidth_hz"] for row in more)
             top, measured = peak, measure_set([held], K, bandwidth, options.seed)[0]
         print(f"{len(rows)} plants: {summary(rows)}", flush=True)

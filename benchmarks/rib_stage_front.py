@@ -34,7 +34,6 @@ from ccd_casadi.fixed_structure.decoupling import channel_plant, in_units_of
 from ccd_casadi.fixed_structure.design import synthesise_sections
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import ROUNDS, prepared, with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     moved,
@@ -43,6 +42,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     with_options,
 )
 from ccd_casadi.inner_problem.sections_robustness import worst_members
+from ccd_casadi.inner_problem.sections_search import ROUNDS, prepared, with_range
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.studies.sequential import first_resonance

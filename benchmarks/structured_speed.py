@@ -42,7 +42,6 @@ def problems():
     from ccd_casadi.fixed_structure.channel_design import synthesise
     from ccd_casadi.fixed_structure.design import problem_for
     from ccd_casadi.fixed_structure.sections_design import in_problem_units
-    from ccd_casadi.inner_problem.sections_bandwidth import with_range
     from ccd_casadi.inner_problem.sections_plant_set import (
         bounds_of,
         plants_of,
@@ -50,6 +49,7 @@ def problems():
         structure_of,
         with_options,
     )
+    from ccd_casadi.inner_problem.sections_search import with_range
 
     shifts = (-0.03, -0.015, 0.0, 0.015, 0.03)
     found, kappa = loop(0, Structure(), FAST, shifts)

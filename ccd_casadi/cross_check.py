@@ -134,18 +134,14 @@ def _json(
         "omega_T_hz": point[1] / HZ,
         "backends": {
             item.result.backend: {
-                "gamma_claimed": clean(item.result.gamma_opt),
-                "holds": item.holds,
-                "verdict": item.words,
-                "seconds": item.result.seconds,
-                "figures": clean(figures_dict(item.result.design.figures))
-                if item.result.design is not None
-                else None,
+                "gamma_claimed": clean(item.result.gamma_opt), "holds": item.holds,
+                "verdict": item.words, "seconds": item.result.seconds,
+                "figures": item.result.design and clean(figures_dict(item.result.design.figures)),
             }
             for item in found
         },
         "versions": versions(),
-    }
+    }  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -25,7 +25,7 @@ LEADS = {"auto": None, "on": True, "off": False}
 def command(options: argparse.Namespace) -> ExitCode:
     """Deploy, write the folder, print a summary."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.later_lines import told
+    from ccd_casadi.codesign.result import told
     from ccd_casadi.deployment.c_code import FILES as C_FILES
     from ccd_casadi.deployment.c_code import write_c
     from ccd_casadi.deployment.files import DESIGN_FILES, write_files
@@ -96,10 +96,10 @@ def command(options: argparse.Namespace) -> ExitCode:
         if moved is not None:
             say(f"{'a move':13s} {_move_words(moved)}")
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
-    from ccd_casadi.reporting.index import index_above, publish
+    from ccd_casadi.reporting.index import index_of, publish
 
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
-    page = deploy_page(finished, found, moved, index_above(folder, finished.folder))
+    page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")

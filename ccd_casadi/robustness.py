@@ -19,7 +19,7 @@ LIMIT = 30.0  # s for the structured singular value, which of many modes takes l
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
     from ccd_casadi.cases.run_folder import read_run
-    from ccd_casadi.codesign.later_lines import told
+    from ccd_casadi.codesign.result import told
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
     from ccd_casadi.robust.study import study_dict, survival_line, tried, with_structured_bound
     from ccd_casadi.support.json_files import write_json

@@ -185,7 +185,7 @@ def test_command_refuses_what_it_cannot_use(capsys: pytest.CaptureFixture[str]) 
     for arguments, words in (
         ([case], "give --theta"),
         ([case, "--theta", "m1=60,m2=60", "--omega-s-hz", "100"], "give both"),
-        ([case, "--theta", "m1=60,m2=60", "--limit", "-1"], "no number above 0"),
+        ([case, "--theta", "m1=60,m2=60", "--limit", "-1"], "not a number above 0"),
     ):
         assert main(arguments) == 2
         error = capsys.readouterr().err

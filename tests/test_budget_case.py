@@ -14,7 +14,7 @@ from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.codesign.budget_result import budget_entry, budget_lines
+from ccd_casadi.codesign.design_entries import budget_entry, budget_lines
 from ccd_casadi.drawing.paint import blocks_html
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.reporting.budget_section import budget_section

@@ -11,9 +11,9 @@ from helpers import HZ, problem
 
 from ccd_casadi.codesign.kkt import lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_program
-from ccd_casadi.inner_problem.envelope import bandwidth_gradient
+from ccd_casadi.inner_problem.controller_problem import RobustSet
+from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.synthesis.compliance import compliance_of

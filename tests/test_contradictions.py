@@ -17,8 +17,8 @@ from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
 from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling, Structure
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.worker_process import Overrun, Runner
 
 
 def fail(message: str) -> None:
@@ -41,7 +41,7 @@ LOOP = """
 import os
 import sys
 from pathlib import Path
-from ccd_casadi.support.deadline import Runner
+from ccd_casadi.support.worker_process import Runner
 
 def forever(path):
     Path(path).write_text(str(os.getpid()))

@@ -10,10 +10,9 @@ import pytest
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
-from ccd_casadi.deployment.compliance import sampled_compliance
 from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.sampled import sampled_figures
+from ccd_casadi.deployment.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop

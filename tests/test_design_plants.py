@@ -8,8 +8,8 @@ from helpers import problem
 
 from ccd_casadi.codesign.design_plants import missed_words, remedies, search_words, widen
 from ccd_casadi.codesign.direct import acceptable
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import best_choice, design_choices, true_design, true_inner
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sweep import missed_by, shortfall
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

@@ -19,7 +19,8 @@ from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign
 from ccd_casadi.fixed_structure.optimality import Envelope
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.sections_search import prepared
 from ccd_casadi.inner_problem.sections_words import channel_words
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.errors import UserError

@@ -16,10 +16,15 @@ from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_s
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
 from ccd_casadi.explorer.landscape import field_of
-from ccd_casadi.explorer.machine import machine_html
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
 from ccd_casadi.explorer.session import Session
-from ccd_casadi.explorer.words import end_words, move_words, standing_html, survival_words
+from ccd_casadi.explorer.words import (
+    end_words,
+    machine_html,
+    move_words,
+    standing_html,
+    survival_words,
+)
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.reporting.machine import lumped, lumped_svg
@@ -114,11 +119,11 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     near = np.abs(1.0 + c.loci[:, 0])
     known = np.isfinite(near)
     assert near[known] * c.view.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
-    assert abs(c.signals.step[-1] - 1.0) < 0.05
-    assert c.signals.move.feedforward
+    assert abs(c.step[-1] - 1.0) < 0.05
+    assert c.move.feedforward
     assert (
-        np.abs(c.signals.move.error[c.signals.move.time > 1.5 * c.signals.move.duration]).max()
-        < 1e-2 * np.abs(c.signals.move.error).max()
+        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
+        < 1e-2 * np.abs(c.move.error).max()
     )
 
 
@@ -197,8 +202,8 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
         assert not stable(gain / inwards)
     assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
     assert "feedforward" in move_words(c)
-    alone = replace(c.signals, move=replace(c.signals.move, feedforward=False))
-    assert "without feedforward" in move_words(replace(c, signals=alone))
+    alone = replace(c, move=replace(c.move, feedforward=False))
+    assert "without feedforward" in move_words(alone)
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):

@@ -30,7 +30,6 @@ from ccd_casadi.fixed_structure.structure import (
     response,
     response_and_slopes,
     roots,
-    second_slopes,
     state_space,
 )
 from ccd_casadi.kernels import sections
@@ -72,16 +71,15 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
     kappa = rng.normal(0.0, 0.5, len(structure.names))
     s = 1j * np.geomspace(0.05, 20.0, 9)
     _, slopes, slope = response_and_slopes(structure, kappa, s)
-    second = second_slopes(structure, kappa, s)
-    h = 1e-5
+    h, bent = 1e-5, []
     for i, step in enumerate(h * np.eye(len(kappa))):
         up, down = (response_and_slopes(structure, kappa + x, s) for x in (step, -step))
         np.testing.assert_allclose(np.log(up[0] / down[0]) / (2 * h), slopes[:, i], atol=1e-7)
-        np.testing.assert_allclose((up[1] - down[1]) / (2 * h), second[:, i], atol=1e-6)
+        bent.append((up[1] - down[1]) / (2 * h))
     ends = [response(structure, kappa, s * np.exp(x)) for x in (h, -h)]
     np.testing.assert_allclose(np.log(ends[0] / ends[1]) / (2 * h), slope, atol=1e-7)
     k, alone, ln_slope = np.empty((3, 1), complex)
-    own, bend = np.empty(len(kappa), complex), np.empty(second.shape[1:], complex)
+    own, bend = np.empty(len(kappa), complex), np.empty((len(kappa),) * 2, complex)
     loop = problem_for([plant()], structure, BOUNDS).loop(kappa, 0.0)
     K = (loop.factors, loop.values)
     for i, at in enumerate(s):  # the kernel's
@@ -91,7 +89,7 @@ def test_derivatives_of_the_controller(structure: Structure) -> None:
         np.testing.assert_allclose([k, ln_slope], [[response(structure, kappa, at)], [slope[i]]])
         np.testing.assert_allclose(own, slopes[i], atol=1e-12)
         sections.second_slopes(loop.factors, own, bend)
-        np.testing.assert_allclose(bend, second[i], atol=1e-12)
+        np.testing.assert_allclose(bend, np.array(bent)[:, i], atol=1e-6)
 
 
 @pytest.mark.parametrize("sampling", [None, FAST, SLOW])

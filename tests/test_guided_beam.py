@@ -10,14 +10,15 @@ from scipy.signal import tf2ss
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.sections_polish import polish_sections
-from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.outer_sections import polish_sections
+from ccd_casadi.codesign.post_optimal import sections_responses
 from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, prepared, sections_value
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sections_search import prepared
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.sampling.sampler import Sampler

@@ -7,7 +7,7 @@ import pytest
 from hard_plants import HARD, regularised
 
 from ccd_casadi.lti.norms import gains
-from ccd_casadi.support.deadline import Runner
+from ccd_casadi.support.worker_process import Runner
 from ccd_casadi.synthesis.backends import lmi, slicot
 from ccd_casadi.synthesis.backends.standard_plant import close
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kernel_draws import complex_matrix, random_system, seeds
 
 from ccd_casadi.kernels import frequency, small
-from ccd_casadi.kernels.refine import _vertex, narrow, next_trial, promised
+from ccd_casadi.kernels.frequency import _vertex, narrow, next_trial, promised
 
 
 @few(max_examples=40)

@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_scripts import benchmark
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Bounds, Sampling
+from ccd_casadi.fixed_structure.certificate import judged
 from ccd_casadi.gap import main
+from ccd_casadi.inner_problem.problem import best_choice, scaled_plant
 from ccd_casadi.limitations.basis import Basis
 from ccd_casadi.limitations.bound import inside, outside
 from ccd_casadi.limitations.certificate import forbids, support
@@ -22,7 +25,10 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.facts import Zero
 from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import handed_out
+from ccd_casadi.synthesis.synthesis import synthesise
 
+SECTIONS, chain_problem = benchmark("random_sections"), benchmark("chain_plants").chain_problem
 ROOT = Path(__file__).resolve().parent.parent
 BASIS = Basis((3.0, 3.0, 0.5), (0.1 + 2.0j, 0.3 + 7.0j), 20.0, 1, (5.0 + 1.0j, 5.0 - 1.0j))
 finite = st.floats(-3.0, 3.0)
@@ -141,3 +147,38 @@ def test_more_delay_never_gives_more() -> None:
         for sampling in (None, Sampling(200.0), Sampling(200.0, 10_000.0))
     ]
     assert reached[0] * 1.01 >= reached[1] >= reached[2] * 0.99
+
+
+@pytest.mark.parametrize("seed", [7, 12, 28])
+def test_no_climb_of_sections_exceeds_the_bound(seed: int) -> None:
+    """Random chains; benchmarks/limitations.py has sixty."""
+    asked, made = SECTIONS.climbed(SECTIONS.case(seed), seed)
+    uncertain = asked.uncertain
+    assert made is not None
+    limits = limits_of(
+        uncertain.plant(uncertain.nominal).plant_si(), asked.bounds, asked.sampling,
+        integrator=asked.structure.integrator,
+    )  # fmt: skip
+    assert made.bandwidth <= outside(limits) < np.inf
+
+
+@pytest.mark.parametrize("seed", [0, 8])
+def test_no_h_infinity_design_exceeds_the_bound(seed: int) -> None:
+    """What the design has of |S|, |KS| and |T| as bounds, without a shape."""
+    problem = chain_problem(seed)
+    problem, found = best_choice(problem, problem.start)
+    assert found.optimum is not None
+    figures, plant = found.optimum.figures, scaled_plant(problem, problem.start)
+    weights, omega_low = (
+        problem.weights.at(figures.omega_S, figures.omega_T),
+        figures.omega_S / 50.0,
+    )
+    made = synthesise(
+        plant, weights, omega_low=omega_low, gamma_backoff=problem.inner.gamma_backoff
+    )
+    controller = handed_out(plant, made, omega_low).controller
+    loose = Bounds(50.0, 1.0, omega_low, weighted_level=1e9, weights=weights)
+    loop = judged([plant], controller, loose, None, False)[0]
+    level = max(loop.weighted_KS, loop.weighted_T) * (1.0 + 1e-6)
+    bounds = Bounds(loop.S_peak * (1.0 + 1e-6), 1.0, omega_low, None, level, weights)
+    assert loop.crossing <= outside(limits_of(plant.plant_si(), bounds, None)) < np.inf

@@ -17,7 +17,7 @@ del os.sched_getaffinity
 JOB = """
 import math
 import ccd_casadi as ccd
-from ccd_casadi.support.deadline import Runner
+from ccd_casadi.support.worker_process import Runner
 from ccd_casadi.support.process_pool import Workers
 
 if __name__ == "__main__":

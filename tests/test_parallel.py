@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 from busy import HANGS
 
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.process_pool import Workers
-from ccd_casadi.support.worker_process import THREADS, WorkerLost
+from ccd_casadi.support.worker_process import THREADS, Overrun, Runner, WorkerLost
 
 HERE = Path(__file__).parent
 

@@ -17,8 +17,8 @@ from ccd_casadi.codesign.kinked import descend
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
 from ccd_casadi.inner_problem import true_function
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore

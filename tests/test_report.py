@@ -275,7 +275,7 @@ def test_unverified_result_says_why() -> None:
     *_, solution, text = run("three")
     assert solution.result["status"] == "not_verified"
     assert "✕ not verified" in text
-    assert "failed: prediction" in text
+    assert "Failed: prediction" in text
     assert "UNVERIFIED" in text
 
 
@@ -319,6 +319,28 @@ def test_a_page_is_drawn_again_from_its_folder_alone(
     for _ in range(2):
         assert report_command([str(again), "--quiet"]) == 0
         assert (again / "report.html").read_text(encoding="utf-8") == first
+
+
+def test_a_run_without_one_gets_a_report_of_its_design(
+    two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    for name in ("report.html", "report.json"):
+        (folder / name).unlink(missing_ok=True)
+
+    def refused(*given: object, **named: object) -> None:
+        raise AssertionError("nothing is designed")
+
+    for place in ("synthesis.synthesis", "reporting.loops", "reporting.start"):
+        monkeypatch.setattr(f"ccd_casadi.{place}.synthesise", refused)
+    assert report_command([str(folder), "--quiet"]) == 0
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    Document(text)
+    for heading in ("At a glance", "The design", "Plant and controller", "A move", "Provenance"):
+        assert f"<h2>{heading}</h2>" in text
+    assert "how the design was found was not kept" in text
+    assert report_command([str(folder), "--quiet"]) == 0
+    assert (folder / "report.html").read_text(encoding="utf-8") == text
 
 
 def test_a_foreign_or_damaged_report_json_is_told(

@@ -11,12 +11,12 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import Plant, mechanics
 from ccd_casadi.plants.scaling import PlantFamily, ScaledPlant, scale_plant
-from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.solve import main
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities, sensitivities
@@ -225,7 +225,7 @@ def test_what_no_robust_design_meets_is_infeasible(tmp_path: Path, capsys) -> No
     assert main([str(path), *options]) == 3
     err = capsys.readouterr().err
     assert len(err.splitlines()) == 1
-    for words in ("none found", "where S_max = 1.3 is asked", "is not proven", "[robust]"):
+    for words in ("none found", "where S_max = 1.3 is required", "is not proven", "[robust]"):
         assert words in err
     assert "cannot" not in err
 

@@ -19,8 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rows import REALS, identical, sample
 
-from ccd_casadi.sampling.keys import problem_hash, sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.store import SampleStore
 
 # -0.0 is left out: SQLite stores it as 0, and no key or figure tells the two apart.

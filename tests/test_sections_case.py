@@ -26,7 +26,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.plants.plant import hardware_cost, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.rows import problem_hash
 
 RUNS = Path(__file__).parent.parent / "runs"
 SECTIONS = '\n[controller]\nstructure = "sections"\n'

@@ -17,7 +17,7 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.fixed_structure import Sampling, SectionsDesign, Structure
 from ccd_casadi.inner_problem import sections_bandwidth
 from ccd_casadi.inner_problem.problem import CoDesignProblem, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, sections_value, with_range
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, with_sections
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem, Uncertainty
 from ccd_casadi.inner_problem.sections_robustness import (
@@ -25,6 +25,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     judged_widely,
     worst_members,
 )
+from ccd_casadi.inner_problem.sections_search import prepared, with_range
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import UserError

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from helpers import problem
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import read_run
-from ccd_casadi.codesign.sections_responses import sections_responses
+from ccd_casadi.codesign.post_optimal import sections_responses
 from ccd_casadi.compare import main as compare_main
 from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.given_controller import as_it_runs
@@ -24,10 +25,15 @@ from ccd_casadi.fixed_structure import Bounds, Structure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.starts import at_random, kept
 from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.gap import main as gap_main
 from ccd_casadi.inner import main as inner_main
+from ccd_casadi.inner_problem import sections_robustness
 from ccd_casadi.inner_problem.problem import scaled_plant
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.insight import main as insight_main
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.of_problem import limits_of_problem
+from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.robustness import main as robustness_main
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.solve import main as solve_main
@@ -97,6 +103,56 @@ def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
     # more plants, or hold and delay, can only cost: the climbs start from the design itself
     for easier in ("on_model_hz", "continuous_hz"):
         assert result["costs"][easier] >= result["bandwidth_hz"] * (1.0 - 1e-3)
+
+
+def test_no_controller_exceeds_what_the_run_says(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = json.loads((folder / "run" / "result.json").read_text())
+    bound = result["gap"]["outside_hz"]
+    assert bound >= result["costs"]["on_model_hz"] >= result["bandwidth_hz"]
+    assert f"no controller of any order exceeds {bound:.2f} Hz" in (
+        result["verdict"]["optimal"]["words"]
+    )
+    assert gap_main([str(folder / "run")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["gap"]["relative"] == pytest.approx(result["gap"]["relative"])
+    assert result["bandwidth_hz"] < answer["gap"]["inside_hz"] < bound
+
+
+def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_sees_it(
+    folder: Path,
+) -> None:
+    """T of the design in v = (2/T) tan(ωT/2): ∫ h T dv = 0, as for the T of every controller."""
+    run = read_run(folder / "run")
+    (limits,) = limits_of_problem(run.problem, run.theta)
+    sampling, bandwidth = run.problem.controller.sampling, HZ * run.result["bandwidth_hz"]
+    v = np.geomspace(1e-3, 1e9, 200_000)
+    omega = limits.omega(v)
+    plant = sampled(run.plant.plant_si(), sampling.period, sampling.delay)
+    L = plant.swept(omega)[:, 0, 0] * tustin(run.controller, sampling.period).swept(omega)[:, 0, 0]
+    T, inside = L / (1.0 + L), omega < 0.99 * np.pi * sampling.rate_hz
+    m_S, m_T = limits.radii(v, v, bandwidth)
+    share = np.maximum(np.abs(1.0 - T) / m_S, np.abs(T) / m_T)[inside].max()
+    assert 0.5 < share < 1.0 + 1e-3
+    at = limits.variable(bandwidth)
+    basis = Basis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
+    h = basis.values(v)
+    seen = np.trapezoid((h * T[:, None]).real, v, axis=0)
+    assert np.abs(seen).max() < 1e-3 * np.trapezoid(np.abs(h * T[:, None]), v, axis=0).max()
+
+
+def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = read_run(folder / "run")
+    monkeypatch.setattr(sections_robustness, "FRESH", 40)
+    for more, survived in ((1.0, 40), (1.05, 0)):
+        bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
+        made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
+        drawn = sections_robustness.fresh_yield(run.problem, run.theta, made)
+        assert drawn is not None
+        assert (drawn.survived, drawn.draws) == (survived, 40)
 
 
 def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

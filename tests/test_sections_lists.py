@@ -12,8 +12,8 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.run import co_design
 from ccd_casadi.codesign.sections_lists import ListedSections
-from ccd_casadi.codesign.solution import Solution
-from ccd_casadi.inner_problem import sections_bandwidth
+from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.inner_problem import sections_search
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Uncertainty
@@ -39,7 +39,7 @@ def test_one_search_seeds_the_next_and_all_is_counted(
     w2: float, beside: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     races = []
-    for module in (sections_races, sections_bandwidth):
+    for module in (sections_races, sections_search):
         honest = module.race
 
         def counted(*arguments: object, honest: object = honest, **more: object) -> object:

@@ -29,7 +29,7 @@ from ccd_casadi.drawing.turntable import (
     data,
     still,
 )
-from ccd_casadi.reporting.mode_shapes import mode_shape_figure, table_modes
+from ccd_casadi.reporting.machine import mode_shape_figure, table_modes
 
 Array = np.ndarray
 A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)
@@ -262,7 +262,7 @@ def test_dimension_figure_has_a_caption_with_numbers_and_a_table() -> None:
     assert "From start to end the mass goes from 1.0189 to 0.59001 kg (−42.1 %)." in words
     assert "Changed: t_c (−49.3 %), t_i (−46.9 %), H (−29.1 %), x_i (+11.1 %)." in words
     assert "heights drawn 3 times as large" in words
-    rows = {row[0]: row[2:] for row in drawing(Geometry(), {"a": A, "b": B}).rows}
+    rows = {row[0]: row[2:] for row in drawing(Geometry(), {"a": A, "b": B}).tables[0].rows}
     assert rows["t_c"] == ("mm", 8.0, pytest.approx(4.0588))
     assert rows["b_1"] == ("mm", pytest.approx(75.5), pytest.approx(69.9037))
     assert rows["mass"] == ("kg", pytest.approx(1.01891, rel=1e-4), pytest.approx(0.59, rel=1e-3))
@@ -274,7 +274,7 @@ def test_one_stage_three_stages_hostile_names_and_point_masses() -> None:
     masses = Geometry(point_masses=(PointMass(0.0, 0.15, 0.1),))
     assert "Dashed" not in drawing(Geometry(), {"start": A}).caption
     assert "Dashed circles: masses" in drawing(masses, {"start": A}).caption
-    html = drawing(masses, {HOSTILE: A, "x" * 90: B, "c": A}).svg
+    html = drawing(masses, {HOSTILE: A, "x" * 90: B, "c": A}).drawing.svg
     (root,) = svgs(html)
     assert "<script" not in html
     assert len(list(root.iter("circle"))) == 3
@@ -282,5 +282,5 @@ def test_one_stage_three_stages_hostile_names_and_point_masses() -> None:
     assert f"{HOSTILE}, 1.119 kg" in words
     assert f"{'x' * 39}…, 0.69 kg" in words
     tall = float(root.get("viewBox", "").split()[3])
-    single = float(svgs(drawing(masses, {"a": A}).svg)[0].get("viewBox", "").split()[3])
+    single = float(svgs(drawing(masses, {"a": A}).drawing.svg)[0].get("viewBox", "").split()[3])
     assert tall == pytest.approx(2 * single, rel=1e-5)

@@ -16,7 +16,7 @@ from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, 
 from ccd_casadi.codesign.verdict import State, survives
 from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.robust_set import RobustSet
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.norms import hinf_norm

@@ -28,8 +28,8 @@ from ccd_casadi.codesign.run import solve
 from ccd_casadi.codesign.survival import REACH, Survival, loops_of, survival_of
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.drawing.paint import verdict_html
+from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.plants.modal import Perturbation, modal_plant

@@ -116,6 +116,19 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
     return tuple(sorted(found))
 
 
+def step_response(
+    loop: Loop, direction: Array, seconds: float, points: int
+) -> tuple[Array, Array]:
+    """Times (k,) in s and y (k, p) after a unit step of the reference in `direction` (p,).
+
+    Exact at the instants: those of a sampled loop, or `points` of a continuous one.
+    """
+    steps = loop.over_a_step(seconds / (points - 1))
+    count = points if loop.sampling is None else int(np.ceil(seconds / steps.period)) + 1
+    y = constant_drive(steps, steps.B_r @ direction, count)
+    return np.asarray(np.arange(count) * steps.period), y.T
+
+
 def force_step(loop: Loop, times: Array) -> tuple[Array, Array]:
     """Times in s near the given ones, and y of the first output in m after 1 N, exact at them.
 

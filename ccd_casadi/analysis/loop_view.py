@@ -150,6 +150,14 @@ def _hz(roots: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in np.abs(light(roots)) / HZ)
 
 
+def frequency_and_damping(poles: np.ndarray) -> tuple[Array, Array]:
+    """|p| and -Re p/|p|, a conjugate pair once, in rising order."""
+    upper = poles[poles.imag >= 0.0]
+    upper = upper[np.argsort(np.abs(upper))]
+    size = np.abs(upper)
+    return size, -upper.real / np.maximum(size, np.finfo(float).tiny)
+
+
 def phase_deg(response: np.ndarray) -> Array:
     """Without jumps along the first axis, from within ±180° on."""
     phase = np.degrees(np.unwrap(np.angle(response), axis=0))

@@ -8,10 +8,9 @@ from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
 from ccd_casadi.cases.sections import Case, RobustSection
-from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
+from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.sections_plant_set import with_options
 from ccd_casadi.inner_problem.sweep import InnerProblem
 from ccd_casadi.plants.modal import Suspension
@@ -93,7 +92,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     except Exception as error:
         if function is None:
             raise
-        words = f"{function} raised {described(error)}; mend it"
+        words = f"{function} raised {described(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
 

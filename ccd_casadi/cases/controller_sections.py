@@ -1,9 +1,11 @@
-"""[controller] and [loop] of a case file: what the controller is, and how it runs."""
+"""[controller] and [loop] of a case file: what the controller is, and how it runs; and [sampling],
+[outer], [baseline] and [limits]: how a run goes about it."""
 
 import math
 from dataclasses import dataclass
 
 from ccd_casadi.cases.checks import (
+    FRACTION,
     POSITIVE,
     choice,
     count,
@@ -11,6 +13,7 @@ from ccd_casadi.cases.checks import (
     flag,
     key,
     number,
+    steps,
     table,
     text,
 )
@@ -62,7 +65,7 @@ class ChannelSection:
     bandwidth_ratio: float = key(
         number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
         1.0,
-        says="this channel's bandwidth is at least so many times ω_b, which is the slowest one's",
+        says="this channel's bandwidth is at least this many times ω_b, which is the slowest one's",
     )
 
 
@@ -120,4 +123,78 @@ class LoopSection:
         0.0,
         says="from reading the sensor to the new force",
         unit="µs",
+    )
+
+
+@dataclass(frozen=True)
+class SamplingSection:
+    """[sampling]: the offline design over θ; points per axis for grid, in all for the others.
+
+    `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
+    """
+
+    design: str = key(choice("grid", "sobol", "lhs"), "grid", says="how θ is spread for samples")
+    points: int = key(
+        count(2), 5, says="of θ: on each axis of a grid, in all for the other designs"
+    )
+    lifted_points: int = key(
+        count(0), 0, says="designs of (θ, ω_S, ω_T) for the lifted formulation; 0 chooses"
+    )
+
+
+@dataclass(frozen=True)
+class OuterSection:
+    """[outer]: IPOPT starts, agreement of prediction and truth, rounds of refinement, surrogate.
+
+    `surrogate`: the kernel of the Gaussian processes; "auto" takes, output by output, the one
+    that predicts left-out samples best. `box_points`: true inner problems spread over the box of θ
+    that a solve ends with a look at, those that it has solved already among them; 0: none.
+    """
+
+    starts: int = key(count(1), 16, says="of IPOPT on the surrogates")
+    direct_starts: int = key(count(1), 4, says="of IPOPT on the true problem")
+    tolerance: float = key(
+        FRACTION, 1e-3, says="to which prediction and truth have to agree, relative"
+    )
+    max_refinements: int = key(count(0), 12, says="rounds of adding true samples at the optimum")
+    surrogate: str = key(
+        choice("matern52", "rbf", "auto"),
+        "matern52",
+        says='kernel of the Gaussian processes; "auto": what predicts left-out samples best',
+    )
+    box_points: int = key(
+        count(0), 32, says="θ spread over the box that every solve ends with a look at; 0: none"
+    )
+
+
+@dataclass(frozen=True)
+class BaselineSection:
+    """[baseline]: the sequential design's first resonance, and the descents' steps and starts.
+
+    `steps` are the first steps tried, as shares of the box; `starts` start points: the case's own
+    and a Latin hypercube.
+    """
+
+    first_resonance_hz: float = key(
+        POSITIVE,
+        250.0,
+        says="of the sequential design: its first resonance is at least this",
+        unit="Hz",
+    )
+    steps: tuple[float, ...] = key(
+        steps, (0.02, 0.05, 0.1), says="first steps that the descents try, as shares of the box"
+    )
+    starts: int = key(count(1), 3, says="of the descents: the case's own and a Latin hypercube")
+    max_iterations: int = key(count(1), 100, says="of a descent")
+
+
+@dataclass(frozen=True)
+class LimitsSection:
+    """[limits]: how long a user's plant function may take at each call, in s."""
+
+    plant_seconds: float = key(
+        POSITIVE,
+        60.0,
+        says="how long a plant function of one's own may take at each call",
+        unit="s",
     )

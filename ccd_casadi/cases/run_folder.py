@@ -20,10 +20,10 @@ from ccd_casadi.fixed_structure import ChannelStructure, Structure
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
-from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
+from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -99,7 +99,7 @@ def read_run(folder: str | Path) -> FinishedRun:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+        raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
     result = read_json(folder / "result.json")
     if result.get("status") == "infeasible":
         words = "the run found no feasible design; there is nothing to work on"
@@ -147,16 +147,9 @@ def _read_sections(
     `figures` are those of the continuous loop with the model; hold and delay are not in them.
     """
     path = folder / "controller.json"
-    table = read_json(path).get("sections")
-    words = "is no list of parameters of the case's structure; solve the case again"
-    try:
-        kappa = np.array(table["kappa"], dtype=np.float64)  # type: ignore[index]
-    except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: sections.kappa: {words}") from None
-    problem = _with_directions(problem, table, path)
+    problem = _with_directions(problem, read_json(path).get("sections"), path)
     structure = structure_of(problem)
-    if kappa.shape != (len(structure.names),) or not (np.abs(kappa) < 200.0).all():
-        raise UserError(f"{path}: sections.kappa: {words}")
+    kappa = np.array(sections_kappa(folder, structure))
     controller = controller_of(structure, kappa)
     judged = judged_corners(problem, theta, controller)
     if not judged.passed:
@@ -203,11 +196,14 @@ def with_function(
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
     """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
     path = folder / "controller.json"
-    found = read_json(path).get("sections")
-    kappa = found.get("kappa") if isinstance(found, Mapping) else None
-    if not isinstance(kappa, list) or len(kappa) != len(structure.names):
-        words = f"sections.kappa: has no {len(structure.names)} parameters, which the case has"
-        raise UserError(f"{path}: {words}; name a run of this case")
+    words = f"is no list of the {len(structure.names)} parameters of the case's structure"
+    try:
+        kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
+        good = kappa.shape == (len(structure.names),) and bool((np.abs(kappa) < 200.0).all())
+    except (KeyError, TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
+        raise UserError(f"{path}: sections.kappa: {words}; name a run of this case")
     return tuple(map(float, kappa))
 
 
@@ -268,7 +264,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 def _number(path: Path, table: Mapping[str, Any], key: str) -> float:
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: {key}: is no number; solve the case again")
+        raise UserError(f"{path}: {key}: is not a number; solve the case again")
     if value <= 0.0:
         raise UserError(f"{path}: {key}: is not positive; solve the case again")
     return float(value)
@@ -311,7 +307,7 @@ def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:
     try:
         matrix = np.array(table[key], dtype=float)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: {key}: is no matrix; solve the case again") from None
+        raise UserError(f"{path}: {key}: is not a matrix; solve the case again") from None
     if matrix.ndim != 2 or matrix.size == 0 or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {key}: is no finite matrix; solve the case again")
+        raise UserError(f"{path}: {key}: is not a finite matrix; solve the case again")
     return matrix

@@ -25,10 +25,11 @@ from ccd_casadi.cases.checks import (
     tables,
     text,
 )
-from ccd_casadi.cases.controller_sections import ControllerSection, LoopSection
-from ccd_casadi.cases.run_sections import (
+from ccd_casadi.cases.controller_sections import (
     BaselineSection,
+    ControllerSection,
     LimitsSection,
+    LoopSection,
     OuterSection,
     SamplingSection,
 )

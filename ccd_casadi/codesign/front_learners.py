@@ -95,7 +95,7 @@ class LiftedLearner(Learner):
         return lifted_program(self.sampler.problem, made, margin=MARGIN)
 
     def point(self, sample: BandwidthSample) -> Array:
-        return np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
+        return sample.joint
 
 
 class NestedLearner(Learner):

@@ -12,8 +12,8 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.measured_case import MeasuredCase
-from ccd_casadi.codesign.budget_result import budget_entry
 from ccd_casadi.codesign.design_entries import (
+    budget_entry,
     compliance_dict,
     controller_dict,
     figures_dict,

@@ -133,10 +133,11 @@ def solve_nested(
         elif iterate.step >= 0.9 * radius:  # trusted, and stopped by the region alone
             radius = min(1.0, 2.0 * radius)
     best = _best(problem, samples)
-    x = np.array([*best.theta, np.log(best.omega_S), np.log(best.omega_T)])
     message = "" if agreed else "prediction and truth did not agree within the budget"
     surrogates = () if surrogate is None else (surrogate,)
-    return FormulationResult(x, None, tuple(iterates), surrogates, solution, agreed, message)
+    return FormulationResult(
+        best.joint, None, tuple(iterates), surrogates, solution, agreed, message
+    )
 
 
 def fit_bandwidth(

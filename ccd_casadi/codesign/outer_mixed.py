@@ -58,11 +58,6 @@ COVERAGE = 0.8  # of left-out samples within their 95 % bands, for surrogates to
 NEAR_SHELF = 0.2  # ln: a local maximum of S this close to -3 dB may make ω_b jump
 
 
-def joint_point(sample: BandwidthSample) -> Array:
-    """(θ, ln ω_S, ln ω_T) of a sample of ω_b*(θ)."""
-    return np.array([*sample.theta, np.log(sample.omega_S), np.log(sample.omega_T)])
-
-
 @dataclass(frozen=True)
 class MixedEnd(End):
     """With the synthesis there and its derivatives."""
@@ -85,7 +80,7 @@ class MixedOuter(Outer):
     def point_at(self, theta: Array) -> Array:
         inner = self.sampler.bandwidths(theta, "verifying")[0]
         if inner.feasible:
-            return joint_point(inner)
+            return inner.joint
         lower, upper = self.bounds
         return np.array([*theta, *(0.5 * (lower + upper))[-2:]])
 
@@ -113,7 +108,7 @@ class MixedOuter(Outer):
             words = self.sampler.nearest.shortfall
             return FormulationResult(None, None, outcome.iterates, (), None, False, words)
         best = max(feasible, key=lambda sample: sample.bandwidth)
-        return replace(outcome, x=joint_point(best), agreed=False)
+        return replace(outcome, x=best.joint, agreed=False)
 
     def ended(self, x: Array) -> MixedEnd:
         """Polished; where the inner problem has a better design at its θ, on from that one."""
@@ -134,7 +129,7 @@ class MixedOuter(Outer):
             gap = inner.bandwidth / made.figures.bandwidth - 1.0 if inner.feasible else 0.0
             if gap <= INNER_GAP:
                 break
-            x = joint_point(inner)
+            x = inner.joint
         assert made is not None
         J = true_objective(problem, x, made) if acceptable(problem, x, made) else np.inf
         kkt = kkt_certificate(problem, x, made)
@@ -176,7 +171,7 @@ class MixedOuter(Outer):
         self, sample: BandwidthSample, known: Sequence[Place], settled: float | None = None
     ) -> Place | None:
         problem, truth = self.problem, self.sampler.truth
-        begin = joint_point(sample)
+        begin = sample.joint
         basins = [(place.x, place.objective) for place in known if place.stationary]
         settled = SETTLED if settled is None else settled
         end = descend(problem, truth, begin, ended=basins, settled=settled)

@@ -3,8 +3,11 @@
 A formulation works on v(θ) of the problem's anchors and plant set, with envelope gradients. At its
 end a multi-start search and a search for worse plants ask whether these were good enough at that
 θ; if not, what they find joins, and the outer problem is solved again.
+
+The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,23 +17,21 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.codesign.costs import Costs, costs_of
-from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer import End
+from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.outer_theta import ThetaOuter
-from ccd_casadi.codesign.post_optimal import PostOptimal
+from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.sections_polish import polish_sections
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
-from ccd_casadi.codesign.sections_responses import sections_responses
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import TrueBandwidth
-from ccd_casadi.codesign.theta_kkt import theta_kkt
+from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, joined
+from ccd_casadi.inner_problem.problem import box, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
 from ccd_casadi.inner_problem.sections_robustness import (
@@ -39,6 +40,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     proof_of,
     worst_members,
 )
+from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
@@ -47,6 +49,9 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 
 BETTER = 1e-3  # relative: what the search at the end has to gain to be worth another round
+STATIONARY = 1e-5  # scaled residual below which a polish has nothing to do
+LEVEL = 1e-9  # of J: what the pieces of a kink promise less than that is not known
+FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω_b*
 
 
 @dataclass(frozen=True)
@@ -90,12 +95,6 @@ class SectionsOuter(ThetaOuter):
             return self.prepared(seed)
         problem = with_function(path, sampler.problem, read_json(path))
         return SectionsOuter(sampler.of(problem)).prepared(seed)
-
-    def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
-        """None: every θ has had its own multi-start search. Why, in words."""
-        nearest = self.sampler.nearest
-        words = self.words if nearest is None else nearest.shortfall
-        return replace(outcome, message=words or outcome.message)
 
     def ended(self, x: Array) -> SectionsEnd:
         with self.sampler.spent.on("polish"):
@@ -164,3 +163,54 @@ class SectionsOuter(ThetaOuter):
     def responses(self, x: Array) -> PostOptimal:
         sample = self.sampler.bandwidths(x, "the run's own design")[0]
         return sections_responses(self.problem, sample, value_at(self.sampler, sample.theta))
+
+
+def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
+    """From a design nearly optimal to the best θ that is found near it on the true problem, and
+    the sampler of the problem that has it: with more anchors, where the given ones lose it.
+
+    By pieces (`pieces`), which know kinks; by IPOPT where J has one gradient and that is not yet
+    zero to what it is known to.
+    """
+    problem = sampler.problem
+    lower, upper = box(problem)
+    near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
+    near = np.where(upper - near <= 1e-3 * (upper - lower), upper, near)
+    truth = TrueBandwidth(sampler, "polishing")
+    candidates = [truth.at(point) for point in np.unique([near, theta], axis=0)]
+    best = min(candidates, key=lambda s: objective_of(problem, s))
+    if theta_kkt(problem, best).stationarity > STATIONARY:
+        truth, best = by_pieces(truth, best)
+    sampler, problem = truth.sampler, truth.sampler.problem
+    if theta_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(sampler, best):
+        return sampler, best
+    program = nested_program(problem, truth)
+    program = replace(program, exact_hessian=False)
+    with suppress(OuterFailure):  # what it has asked for on its way counts
+        solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
+    return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))
+
+
+def _on_a_kink(sampler: Sampler, best: BandwidthSample) -> bool:
+    """Whether a sample is optimal to first order by the gradients of several sides of it."""
+    envelope = value_at(sampler, best.theta).envelope
+    found = theta_kkt(sampler.problem, best, envelope=envelope)
+    return found.kink is not None and found.stationarity <= SMOOTH
+
+
+def by_pieces(
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+) -> tuple[TrueBandwidth, BandwidthSample]:
+    """From a sample, and what was asked for near it, to where the pieces of J promise no more.
+
+    Where ω_b* jumps beside the best θ the climbs from the anchors have lost its controller: that
+    one becomes an anchor, and the search goes on.
+    """
+    for _ in range(FOLLOWED):
+        best, jumped = pieces_from(truth, best, settled)
+        if not jumped:
+            break
+        problem = joined(truth.sampler.problem, np.array(best.kappa), ())
+        truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
+        best = truth.at(np.array(best.theta))
+    return truth, best

@@ -27,10 +27,11 @@ from ccd_casadi.support.errors import UserError
 
 
 class ThetaOuter(Outer, ABC):
-    """See the module."""
+    """See the module; `words` say why its kind has nothing to begin with, where it has not."""
 
     look_is_cheap = False
     learns_from_others = False
+    words = ""
 
     def formulated(
         self, formulation: Formulation, seed: int, given: Surrogates | None = None
@@ -50,7 +51,7 @@ class ThetaOuter(Outer, ABC):
     def rescued(self, outcome: FormulationResult, seed: int) -> FormulationResult:
         """None: what falls short at the nearest θ, in words."""
         nearest = self.sampler.nearest
-        words = outcome.message if nearest is None else nearest.shortfall
+        words = self.words if nearest is None else nearest.shortfall
         return replace(outcome, message=words or outcome.message)
 
     def ended(self, x: Array) -> End:

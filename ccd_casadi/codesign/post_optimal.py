@@ -16,16 +16,21 @@ constraints with positive multipliers stay the ones that bind.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-import casadi as ca
 import numpy as np
 from scipy.linalg import null_space
 
 from ccd_casadi.codesign.kkt import kkt_certificate, lagrangian_hessian, lagrangian_parts
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import OTHER_PEAK, other_peaks
+from ccd_casadi.codesign.theta_kkt import theta_kkt
+from ccd_casadi.fixed_structure.bounds import kind_and_channel
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
+from ccd_casadi.inner_problem.sections_plant_set import bounds_of, sections_of_problem
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.optim.kkt import ACTIVE, KktCertificate
+from ccd_casadi.plants.plant import hardware_cost, hardware_slopes
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -110,7 +115,8 @@ def post_optimal(problem: CoDesignProblem, x: Array, quiet: bool = True) -> Post
         determined &= bool(np.isfinite(H).all() and np.linalg.eigvalsh(reduced).min() > 0.0)
     lower, upper = lifted_bounds(problem)
     slope_b = np.hstack([design.to_theta[0], design.to_break_frequencies[0]]) * (upper - lower)
-    slope_f = _hardware_slope(problem, x) * (upper - lower)
+    to_theta = hardware_slopes(plant_of(problem), x[:-2])[0]
+    slope_f = np.append(to_theta, [0.0, 0.0]) * (upper - lower)  # ω_S and ω_T cost nothing
     system = np.block([[H, A.T], [A, np.zeros((len(A), len(A)))]])
     responses = []
     for parameter in _parameters(problem, x, design.values[0], slope_f, slope_b):
@@ -146,7 +152,7 @@ def _parameters(
 ) -> Iterator[_Parameter]:
     """w1, w2, the inner problem's bounds, the level of each λ, and the bounds of θ, ω_S, ω_T."""
     none = np.zeros(x.size)
-    cost = float(plant_of(problem).hardware(x[: len(problem.names)])[0])
+    cost = hardware_cost(plant_of(problem), x[:-2])
     yield _Parameter("w1", problem.w1, slope_f, cost=cost)
     yield _Parameter("w2", problem.w2, slope_b, cost=float(bandwidth))
     for name, (_, bound) in problem.inner.bounds.items():
@@ -171,10 +177,76 @@ def _bound_rows(problem: CoDesignProblem) -> dict[str, Array]:
     }
 
 
-def _hardware_slope(problem: CoDesignProblem, x: Array) -> Array:
-    """∇f over x; ω_S and ω_T have no part in it."""
-    count = len(problem.names)
-    theta = ca.SX.sym("theta", count)
-    f, _ = plant_of(problem).hardware(theta)
-    slope = ca.Function("slope", [theta], [ca.jacobian(f, theta)])
-    return np.append(np.array(slope(x[:count])).ravel(), [0.0, 0.0])
+def sections_responses(
+    problem: CoDesignProblem, sample: BandwidthSample, found: SectionsValue
+) -> PostOptimal:
+    """Derivatives of the optimum to w1, w2, the bounds on the loop, λ <= 0 and the bounds of θ.
+
+        dJ*/dp = ∂L/∂p,   with the bounds on the loop dω_b*/dp = ω_b μ/p
+
+    How θ and ω_b move is given where the bounds on θ and λ alone determine θ (a vertex); elsewhere
+    it takes second derivatives of ω_b*, which are not known. At a kink of ω_b* the multipliers μ
+    are those of θ and controller together.
+    """
+    theta, names = np.array(sample.theta), problem.names
+    plant, width = plant_of(problem), np.subtract(problem.upper, problem.lower)
+    kkt = theta_kkt(problem, sample, envelope=found.envelope)
+    loop = found.design.multipliers if kkt.kink is None else kkt.kink.multipliers
+    size = float(np.abs(kkt.objective_gradient).max())
+    strong = [name for name in kkt.active if kkt.multipliers.get(name, 0.0) > WEAK * size]
+    bound = [name for name in strong if name not in plant.constraint_names]
+    vertex = len(bound) == len(names) == len(strong)
+    slope_f = hardware_slopes(plant, theta)[0]
+    still = (0.0,) * len(names)
+    unknown = (float("nan"),) * len(names)
+
+    def response(
+        name: str, value: float, J: float, bandwidth: float, i: int | None = None
+    ) -> Response:
+        """`i`: the θ that moves with the parameter, one to one."""
+        if not vertex:
+            nan = float("nan")
+            return Response(name, value, J, nan, nan, unknown, ())
+        moved = still if i is None else tuple(map(float, np.eye(len(names))[i]))
+        cost = 0.0 if i is None else float(slope_f[i])
+        return Response(name, value, J, bandwidth, cost, moved, ())
+
+    answers = [
+        response("w1", problem.w1, hardware_cost(plant, theta), 0.0),
+        response("w2", problem.w2, sample.bandwidth, 0.0),
+    ]
+    for name, value, mu in _loop_bounds(problem, loop):
+        rate = sample.bandwidth * mu / value
+        answers.append(response(name, value, problem.w2 * rate, rate))
+    for name in plant.constraint_names:
+        answers.append(response(f"{name} <= 0", 0.0, -kkt.multipliers.get(name, 0.0), 0.0))
+    for i, name in enumerate(names):
+        ends = (("lower", problem.lower[i], 1.0), ("upper", problem.upper[i], -1.0))
+        for end, value, sign in ends:
+            label = f"{name} {end}"
+            mu = kkt.multipliers.get(label, 0.0)
+            rate, which = (sample.gradient[i], i) if label in strong else (0.0, None)
+            answers.append(response(label, value, sign * mu / width[i], rate, which))
+    weak = tuple(name for name in kkt.active if name not in strong)
+    return PostOptimal(tuple(answers), kkt, weak, vertex)
+
+
+def _loop_bounds(
+    problem: CoDesignProblem, mu: Mapping[str, float]
+) -> list[tuple[str, float, float]]:
+    """Bounds on the loop that the case gives: name, value, and d ln ω_b/d ln of it."""
+    sections = sections_of_problem(problem)
+    effort = sum(value for name, value in mu.items() if kind_and_channel(name)[0] == "KS")
+    rows = [
+        ("S_max", problem.inner.S_max, mu.get("S_MAX", 0.0)),
+        ("S_low", problem.inner.S_low, mu.get("S_LOW", 0.0)),
+        ("shape", sections.shape, mu.get("SHAPE", 0.0)),
+        ("weighted_level", sections.weighted_level, effort + mu.get("T", 0.0)),
+        ("compliance_max", sections.compliance_max, mu.get("GS", 0.0)),
+    ]
+    for own in bounds_of(problem).channels:
+        rows += [
+            (f"S_max of channel {own.name}", own.S_max, mu.get(f"S_MAX of {own.name}", 0.0)),
+            (f"M_K of channel {own.name}", own.M_K, mu.get(f"KS of {own.name}", 0.0)),
+        ]
+    return [(name, float(value), m) for name, value, m in rows if value is not None]

@@ -1,11 +1,17 @@
-"""result.json of a co-design, alike for every kind of controller."""
+"""result.json of a co-design, alike for every kind of controller.
+
+Lines of the verdict that later commands find are written back into it. A line keeps what the solve
+itself said of it (`at_solve`), so that a command may be given again.
+"""
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
-from ccd_casadi.codesign.budget_result import budget_entry
+from ccd_casadi.cases.run_folder import FinishedRun, read_json
+from ccd_casadi.codesign.design_entries import budget_entry
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
@@ -24,7 +30,7 @@ from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.optim.kkt import KktCertificate
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.json_files import clean
+from ccd_casadi.support.json_files import clean, write_json
 from ccd_casadi.support.versions import versions
 from surrogates import Quality
 
@@ -208,3 +214,29 @@ def _box_look(look: BoxLook | None) -> dict[str, Any]:
         return {}
     found = {key: value for key, value in vars(look).items() if key != "x"}
     return found | {"moved": look.moved}
+
+
+def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """A line as the solve wrote it; empty where a run is older than verdicts."""
+    verdict = result.get("verdict")
+    line = verdict.get(name) if isinstance(verdict, Mapping) else None
+    if not isinstance(line, Mapping):
+        return {}
+    before = line.get("at_solve")
+    return before if isinstance(before, Mapping) else line
+
+
+def told(run: FinishedRun, out: Path, name: str, line: Line) -> FinishedRun:
+    """The run with a line of its verdict, written into its folder if `out` lies in that.
+
+    Elsewhere nothing is written: a study that is kept apart leaves the run as it is. `status` stays
+    that of the solve.
+    """
+    folder, before = run.folder.resolve(), at_solve(run.result, name)
+    if not before or not out.resolve().is_relative_to(folder):
+        return run
+    result = dict(read_json(folder / "result.json"))
+    found = {"state": line.state.value, "words": line.words, **line.figures, "at_solve": before}
+    result["verdict"] = {**result["verdict"], name: found}
+    write_json(folder / "result.json", result)
+    return replace(run, result=result)

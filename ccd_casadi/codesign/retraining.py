@@ -29,7 +29,7 @@ from ccd_casadi.codesign.stored import Surrogates, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.versions import keep_version
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
 from ccd_casadi.sampling.spent import spent_entry
 from ccd_casadi.support.arrays import Array

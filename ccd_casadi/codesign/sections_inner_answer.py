@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.codesign.budget_result import budget_entry
+from ccd_casadi.codesign.design_entries import budget_entry
 from ccd_casadi.codesign.inner_answer import InnerAnswer, InnerOptions, head_of
 from ccd_casadi.codesign.sections_entries import (
     active_of,
@@ -16,10 +16,10 @@ from ccd_casadi.codesign.sections_entries import (
 from ccd_casadi.inner_problem.figure import RMS_ERROR
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, too_slow, with_range
-from ccd_casadi.inner_problem.sections_error import least_error_at
+from ccd_casadi.inner_problem.sections_bandwidth import too_slow
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.sections_search import least_error_at, prepared, with_range
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 

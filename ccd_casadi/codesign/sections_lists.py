@@ -21,14 +21,12 @@ from ccd_casadi.codesign.outer_problem import (
     solve_program,
     unmet_constraint,
 )
-from ccd_casadi.codesign.outer_sections import SectionsOuter
-from ccd_casadi.codesign.sections_polish import by_pieces
+from ccd_casadi.codesign.outer_sections import SectionsOuter, by_pieces
 from ccd_casadi.codesign.theta_direct import TrueBandwidth
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import with_range
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     plants_of,
@@ -38,6 +36,7 @@ from ccd_casadi.inner_problem.sections_plant_set import (
     with_sections,
 )
 from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample

@@ -11,22 +11,20 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.inner_problem.sections_bandwidth import (
-    SectionsValue,
-    prepared,
-    race,
-    sections_value,
-    valued,
-    with_range,
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value, valued
+from ccd_casadi.inner_problem.sections_plant_set import (
+    plants_of,
+    sections_of_problem,
+    uncertain_plant,
 )
-from ccd_casadi.inner_problem.sections_error import least_from
-from ccd_casadi.inner_problem.sections_plant_set import plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.inner_problem.sections_search import least_from, prepared, race, with_range
+from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.process_pool import Pool, Workers
 from ccd_casadi.support.terminal import say
 
 
@@ -62,8 +60,13 @@ def seeded_and_prepared(
         tell = teller("search at the start", quiet)
         anchored, made = prepared(problem, tell, workers)
         anchored, made = least_from(anchored, problem.start, made, tell)
-        own = sections_of_problem(anchored)
+        own, start = sections_of_problem(anchored), problem.start
         words = "" if made.certified else made.words
+        alone = len(own.members) == len(uncertain_plant(problem, start).corners())
+        if made.certified and alone and problem.figure is BANDWIDTH:
+            # No plant was found worse: this is the search that an end at the start would ask for.
+            value = valued(anchored, start, plants_of(anchored, start), made, 1)
+            Sampler(anchored, store, Workers(1)).kept("race", start, SectionsValue, lambda: value)
         return Seeds(own.anchors, own.members, own.error_anchors, words)
 
     key = sample_key(owner, problem.start, 0.0, 0.0)

@@ -8,8 +8,7 @@ import numpy as np
 from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.versions import load_version
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.sampling.keys import problem_hash
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash
 from ccd_casadi.sampling.samples import QuantitySample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.arrays import Array

@@ -9,7 +9,7 @@ A design is verified when no line failed; a warning is for the reader to weigh.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import metres
+from ccd_casadi.support.units import counted, metres
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -74,31 +74,6 @@ class CloserModel:
     name: str
     stable: bool
     peak: float
-
-
-def certified(
-    *,
-    certificate: bool,
-    constraints: bool,
-    norm: float,
-    norm_bound: float,
-    peak: float,
-    bounds: Collection[str] = ("S_max", "S_low"),
-    compliance: float = math.nan,
-) -> Line:
-    """The certificate of the true closed loop, and `bounds` and λ <= 0 as given."""
-    figures = {"norm": norm, "norm_bound": norm_bound, "sensitivity_peak": peak}
-    if "compliance_max" in bounds:
-        figures["compliance_max"] = compliance
-    if not certificate:
-        return Line(State.FAILED, "the closed loop is not certified", figures)
-    if not constraints:
-        words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
-        return Line(State.FAILED, words, figures)
-    words = f"closed loop stable, norm {norm:.6g} <= {norm_bound:.6g}, constraints met"
-    if "compliance_max" in bounds:
-        words += f" (compliance {1e6 * compliance:.4g} um/N at most)"
-    return Line(State.PASSED, words, figures)
 
 
 def optimal(
@@ -168,7 +143,7 @@ def look_words(
 ) -> tuple[str, dict[str, Any]]:
     """What IPOPT's starts, the global check over the box and bounds say, in words and figures."""
     figures: dict[str, Any] = {"starts": starts, "distinct_optima": optima}
-    known = f"best of {_count(starts, 'start')}" if starts else ""
+    known = f"best of {counted(starts, 'start')}" if starts else ""
     if optima > 1:
         known += f", {optima} distinct optima"
     if look is None or not look.points:
@@ -350,7 +325,3 @@ def _range(low: float, high: float) -> str:
     beyond = [">" if abs(end) >= 0.999 * REACH else "" for end in (low, high)]
     shown = [float(round(100.0 * end, 3)) for end in (low, high)]  # less is none
     return f"{beyond[0]}{shown[0]:+.2g} to {beyond[1]}{shown[1]:+.2g} %"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -15,7 +15,7 @@ import numpy as np
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.robust_check import OtherDamping
 from ccd_casadi.codesign.survival import Survival
-from ccd_casadi.codesign.verdict import SADDLE, Line
+from ccd_casadi.codesign.verdict import SADDLE, Line, look_words
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.optim.kkt import KktCertificate
@@ -105,11 +105,18 @@ class Verified(ABC):
         """Why J may have no gradient at θ; nothing where it always has one."""
         return ""
 
-    @abstractmethod
     def searched(
         self, outcome: FormulationResult, look: BoxLook | None
     ) -> tuple[str, Mapping[str, Any]]:
         """Where something better was looked for and not found, in words and figures."""
+        solved = outcome.outer
+        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
+        return look_words(starts, optima, look, self.bound_words)
+
+    @property
+    def bound_words(self) -> str:
+        """What no controller exceeds at θ."""
+        return "gap not known"
 
 
 @dataclass(frozen=True)

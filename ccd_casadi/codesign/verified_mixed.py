@@ -1,6 +1,5 @@
 """A verified design with a mixed-sensitivity controller: its figures, checks and lines."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar
@@ -11,9 +10,8 @@ from ccd_casadi.codesign.design_entries import (
     figures_dict,
     loop_of_design,
 )
-from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import CloserModel, Line, certified, look_words, survives
+from ccd_casadi.codesign.verdict import CloserModel, Line, State, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -86,6 +84,7 @@ class VerifiedDesign(Verified):
                 }
                 for check in self.references
             },
+            "gap": None,  # nothing bounds KS, and so no ω_b, but the weights that are searched
         }
         if self.robust is not None:
             found["robust"] = {
@@ -110,16 +109,20 @@ class VerifiedDesign(Verified):
         return controller_dict(self.controller)
 
     def certified_line(self) -> Line:
-        figures = self.design.figures
-        return certified(
-            certificate=figures.certified,
-            constraints=self.feasible,
-            norm=figures.certificate.norm,
-            norm_bound=figures.certificate.norm_bound,
-            peak=figures.sensitivity_peak,
-            bounds=self.problem.inner.bounds,
-            compliance=figures.compliance,
-        )
+        design, bounds = self.design.figures, self.problem.inner.bounds
+        norm, norm_bound = design.certificate.norm, design.certificate.norm_bound
+        figures = {"norm": norm, "norm_bound": norm_bound}
+        figures["sensitivity_peak"] = design.sensitivity_peak
+        words = f"closed loop stable, norm {norm:.6g} <= {norm_bound:.6g}, constraints met"
+        if "compliance_max" in bounds:
+            figures["compliance_max"] = design.compliance
+            words += f" (compliance {1e6 * design.compliance:.4g} um/N at most)"
+        if not design.certified:
+            words = "the closed loop is not certified"
+        elif not self.feasible:
+            words = f"certified, but {', '.join(bounds)} or a constraint on theta is not met"
+        good = design.certified and self.feasible
+        return Line(State.PASSED if good else State.FAILED, words, figures)
 
     def survives_line(self) -> Line:
         closer = (
@@ -137,10 +140,3 @@ class VerifiedDesign(Verified):
 
     def gap_words(self) -> str:
         return f"other weights at the same theta give {100 * self.inner_gap:.2g} % more bandwidth"
-
-    def searched(
-        self, outcome: FormulationResult, look: BoxLook | None
-    ) -> tuple[str, Mapping[str, Any]]:
-        solved = outcome.outer
-        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        return look_words(starts, optima, look)

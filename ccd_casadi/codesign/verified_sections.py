@@ -16,7 +16,7 @@ from ccd_casadi.codesign.sections_entries import (
     proof_dict,
     sections_controller,
 )
-from ccd_casadi.codesign.verdict import Line, State, look_words, survives
+from ccd_casadi.codesign.verdict import Line, State, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.fixed_structure import Certificate, SectionsDesign
 from ccd_casadi.fixed_structure.box_proof import Proof
@@ -204,13 +204,14 @@ class VerifiedSections(Verified):
         words = "no gradient over theta, since the search over the controller ended"
         return f"{words} {off:.1e} from its optimum"
 
+    @property
+    def bound_words(self) -> str:
+        return super().bound_words if self.gap is None else self.gap.words(self.bandwidth)
+
     def searched(
         self, outcome: FormulationResult, look: BoxLook | None
     ) -> tuple[str, Mapping[str, Any]]:
-        solved = outcome.outer
-        starts, optima = (0, 0) if solved is None else (solved.starts, len(solved.optima))
-        bound = {} if self.gap is None else {"gap": self.gap.words(self.bandwidth)}
-        known, figures = look_words(starts, optima, look, **bound)
+        known, figures = super().searched(outcome, look)
         found, of = [optimum.bandwidth / HZ for optimum in self.raced.design.local_optima], ""
         if self.raced.feasible and self.problem.figure is not BANDWIDTH:
             of = f", from there at {self.problem.figure.shown(self.raced.value)}"

@@ -21,29 +21,9 @@ COMPILE = (
     "-o controller_test controller.c controller_test.c"
 )
 FILES = ("controller.h", "controller.c", "controller_test.c")
-TEMPLATES = tuple(f"deployment/templates/{name}" for name in FILES)
 SAMPLES = 64  # of the test vectors
 ERROR = 1e-6  # m; size of the errors in the test vectors
 TOLERANCE = 1e-12  # of the largest force
-
-_CLIP = """\
-        cut[i] = sum;
-        if (sum > {limit})
-            sum = {limit};
-        if (sum < -{limit})
-            sum = -{limit};
-        cut[i] = sum - cut[i];
-"""
-
-_BACK = """\
-/* Back-calculation: states x forces. */
-static const double L[] = {L};
-"""
-
-_LEAD_BACK = """\
-            for (j = 0; j < CONTROLLER_FORCES; j++)
-                sum += L[i * CONTROLLER_FORCES + j] * cut[j];
-"""
 
 
 def write_c(
@@ -71,8 +51,8 @@ def c_files(
     n, p, m = len(K.A), K.B.shape[1], len(K.C)
     errors, forwards, first, forces = vectors(realisation)
     plain = "".join(c if c.isalnum() or c in " ._-" else "_" for c in title)
-    header = filled(
-        TEMPLATES[0],
+    header = _part(
+        FILES[0],
         title=plain, period=f"{K.period:.17g}", rate=f"{1.0 / K.period:.10g}",
         delay=f"{delay:.10g}",
         limits="v[k]" if limit is None else f"v[k] within +-{limit:.17g} N",
@@ -80,20 +60,20 @@ def c_files(
         ahead=f"{delay + 0.5 * K.period:.6g}", verified="verified" if verified else "NOT verified",
         n=n, p=p, m=m, room=max(n, 1),
     )  # fmt: skip
-    clip = "" if limit is None else _CLIP.format(limit=f"{limit:.17g}")
-    source = filled(
-        TEMPLATES[1],
+    clip = "" if limit is None else _part("clip.c", limit=f"{limit:.17g}")
+    source = _part(
+        FILES[1],
         blocks="{" + ", ".join(str(size) for size in realisation.blocks or (0,)) + "}",
         A=_numbers(realisation.block_entries), B=_numbers(K.B), C=_numbers(K.C),
         D=_numbers(K.D), room=max(n, 1), clip=clip,
-        L="" if L is None else _BACK.format(L=_numbers(L)),
+        L="" if L is None else _part("back.c", L=_numbers(L)),
         X=_numbers(takeover(K)),
         F=_numbers(np.zeros((ORDER + 1, m, p)) if forward is None else forward),
         cut_declared="    double cut[CONTROLLER_FORCES];\n" if clip else "",
-        cut_used="" if L is None else _LEAD_BACK,
+        cut_used="" if L is None else _part("lead_back.c"),
     )  # fmt: skip
-    test = filled(
-        TEMPLATES[2],
+    test = _part(
+        FILES[2],
         compile=COMPILE, tolerance=f"{TOLERANCE:g}", samples=SAMPLES,
         errors=_numbers(errors), forwards=_numbers(forwards), first=_numbers(first),
         forces=_numbers(forces),
@@ -117,6 +97,10 @@ def vectors(realisation: Realisation) -> tuple[Array, Array, Array, Array]:
         for row in takeover(K).tolist()
     ]
     return errors, forwards, first, difference_equation(realisation, errors, forwards, start)
+
+
+def _part(name: str, **values: object) -> str:
+    return filled(f"deployment/templates/{name}", **values)
 
 
 def _numbers(values: Array) -> str:

@@ -6,9 +6,9 @@ from typing import Any
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
-from ccd_casadi.deployment.reduction import Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
-from ccd_casadi.deployment.sections import Root, Section, sections_of
+from ccd_casadi.deployment.sampled import SampledFigures
+from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.units import HZ
@@ -43,20 +43,15 @@ def write_files(
 
 def controller_dict(found: Deployment) -> dict[str, Any]:
     """The deployed difference equation; matrices row-major, SI."""
-    K = found.realisation.system
+    K, back = found.realisation.system, found.realisation.back_calculation
     return {
-        "A": K.A.tolist(),
-        "B": K.B.tolist(),
-        "C": K.C.tolist(),
-        "D": K.D.tolist(),
+        **{name: getattr(K, name).tolist() for name in "ABCD"},
         "blocks": list(found.realisation.blocks),
         "period": K.period,
         "rate_hz": found.rate_hz,
         "delay": found.delay,
         "saturation": found.realisation.saturation,
-        "back_calculation": None
-        if found.realisation.back_calculation is None
-        else found.realisation.back_calculation.tolist(),
+        "back_calculation": None if back is None else back.tolist(),
         "input": "e = r - y",
         "output": "u",
         "equation": "v[k] = C x[k] + D e[k], u[k] = v[k] within +-saturation, "
@@ -67,79 +62,62 @@ def controller_dict(found: Deployment) -> dict[str, Any]:
 
 def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str, Any]:
     """deploy.json: every figure of the way; frequencies in Hz."""
-    sampled, measured = found.sampled, found.measured
+    m, inner, limits = found.measured, run.problem.inner, found.limits
+    unverified = f"the run is not verified: {found.unverified}" if found.unverified else ""
+    simulated = None if m is None else {
+        "sensitivity_peak": m.sensitivity_peak,
+        "sensitivity_peak_hz": m.sensitivity_peak_frequency / HZ,
+        "bandwidth_hz": m.bandwidth / HZ, "periods": m.periods, "leftover": m.leftover,
+    }  # fmt: skip
+    robust = None if not found.members else {
+        "plants": 1 + len(found.members), "simulated": 1 + len(found.measured_members),
+        "stable": found.stable, "worst": _member(found.worst),
+        "members": [_member(item) for item in found.members],
+    }  # fmt: skip
     return {
         "status": "verified" if found.passed else "not_verified",
-        "reason": "; ".join(
-            [
-                *([f"the run is not verified: {found.unverified}"] if found.unverified else []),
-                *found.shortfalls[:1],
-            ]
-        ),
+        "reason": "; ".join(filter(None, (unverified, *found.shortfalls[:1]))),
         "rate_hz": found.rate_hz,
         "needed_rate_hz": found.needed_hz,
         "delay": found.delay,
         "method": found.conversion.label,
         "order": found.order,
         "criterion": {
-            "S_max": run.problem.inner.S_max,
-            "reduced_peak": found.limits.peak,
-            "reduced_low": found.limits.low,
-            "reduced_norm": found.limits.norm,
-            "reduced_bandwidth_hz": found.limits.bandwidth / HZ,
-            "compliance_max": found.compliance_max,
-            "sampled_peak": found.target.peak,
+            "S_max": inner.S_max, "reduced_peak": limits.peak, "reduced_low": limits.low,
+            "reduced_norm": limits.norm, "reduced_bandwidth_hz": limits.bandwidth / HZ,
+            "compliance_max": found.compliance_max, "sampled_peak": found.target.peak,
             "sampled_bandwidth_tolerance": found.target.tolerance,
         },
         "full": _figures(run.figures),
         "reduced": _figures(found.reduced_figures),
-        "sampled": {
-            "stable": sampled.stable,
-            "spectral_radius": sampled.spectral_radius,
-            "sensitivity_peak": sampled.sensitivity_peak,
-            "sensitivity_peak_hz": sampled.sensitivity_peak_frequency / HZ,
-            "bandwidth_hz": sampled.bandwidth / HZ,
-        },
-        "simulated": None
-        if measured is None
-        else {
-            "sensitivity_peak": measured.sensitivity_peak,
-            "sensitivity_peak_hz": measured.sensitivity_peak_frequency / HZ,
-            "bandwidth_hz": measured.bandwidth / HZ,
-            "periods": measured.periods,
-            "leftover": measured.leftover,
-        },
+        "sampled": _sampled(found.sampled) | {"bandwidth_hz": found.sampled.bandwidth / HZ},
+        "simulated": simulated,
         "compliance_peak": None if found.compliance is None else found.compliance[1],
         "static_stiffness": None if found.statics is None else found.statics.stiffness,
         "static_compliance": None if found.statics is None else found.statics.compliance,
-        "robust": None
-        if not found.members
-        else {
-            "plants": 1 + len(found.members),
-            "simulated": 1 + len(found.measured_members),
-            "stable": found.stable,
-            "worst": _member(found.worst),
-            "members": [_member(item) for item in found.members],
-        },
+        "robust": robust,
         "methods": {trial.conversion.label: trial.needed_hz for trial in found.trials},
         "channels": [_channel(item, run) for item in found.orders],
         "theta": dict(zip(run.problem.names, run.theta, strict=True)),
         "versions": versions(),
         "seed": seed,
-    }
+    }  # fmt: skip
 
 
-def _member(item: MemberLoop) -> dict[str, Any]:
-    f = item.figures
-    place: dict[str, Any] = {"shift": item.at.shift, "damping": item.at.damping}
-    if isinstance(item.at, SetPlace):
-        place |= {"modes": list(item.at.modes), "gain": item.at.gain, "option": item.at.option}
-    return place | {
+def _sampled(f: SampledFigures) -> dict[str, Any]:
+    return {
         "stable": f.stable,
         "spectral_radius": f.spectral_radius,
         "sensitivity_peak": f.sensitivity_peak,
         "sensitivity_peak_hz": f.sensitivity_peak_frequency / HZ,
     }
+
+
+def _member(item: MemberLoop) -> dict[str, Any]:
+    place: dict[str, Any] = {"shift": item.at.shift, "damping": item.at.damping}
+    if isinstance(item.at, SetPlace):
+        place |= {"modes": list(item.at.modes), "gain": item.at.gain, "option": item.at.option}
+    return place | _sampled(item.figures)
 
 
 def _figures(figures: DesignFigures) -> dict[str, Any]:
@@ -164,16 +142,13 @@ def _channel(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
         "order": item.chosen.order,
         "method": item.chosen.method.value,
         "smallest_order_at_S_max": item.strict.order,
-        "orders": [_row(row) for row in item.rows],
+        "orders": [
+            {"order": row.order, "method": row.method.value, "reason": row.figures.outcome.value}
+            | _figures(row.figures)
+            for row in item.rows
+        ],
         "sections": _sections(item, run) if scalar else None,
     }
-
-
-def _row(row: Reduced) -> dict[str, Any]:
-    reason = row.figures.outcome.value
-    return {"order": row.order, "method": row.method.value, "reason": reason} | _figures(
-        row.figures
-    )
 
 
 def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
@@ -183,17 +158,12 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> dict[str, Any]:
     return {
         "gain": found.gain,
         "gain_at_bandwidth": found.gain_at_bandwidth,
-        "sections": [_section(section) for section in found.sections],
+        "sections": [
+            {"kind": s.kind, "zero": _root(s.zero), "pole": _root(s.pole), "depth_db": s.depth_db}
+            for s in found.sections
+        ],
     }
 
 
-def _section(section: Section) -> dict[str, Any]:
-    def root(value: Root | None) -> dict[str, float | None] | None:
-        return None if value is None else {"hz": value.hz, "damping": value.damping}
-
-    return {
-        "kind": section.kind,
-        "zero": root(section.zero),
-        "pole": root(section.pole),
-        "depth_db": section.depth_db,
-    }
+def _root(root: Root | None) -> dict[str, Any] | None:
+    return None if root is None else dict(vars(root))

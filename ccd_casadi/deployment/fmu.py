@@ -16,11 +16,11 @@ import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from xml.etree import ElementTree as ET
+from xml.sax.saxutils import escape
 
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.support.errors import UserError
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.package_text import filled, package_text
 
 FILE = "controller.fmu"
 NAME = "controller"  # modelIdentifier
@@ -82,41 +82,21 @@ def compiled(sources: Mapping[str, str]) -> bytes | None:
 
 def _description(errors: int, forces: int, period: float, guid: str, title: str) -> bytes:
     """modelDescription.xml of FMI 2.0; value references count e, then f, then u."""
-    root = ET.Element("fmiModelDescription", {
-        "fmiVersion": "2.0", "modelName": NAME, "guid": guid, "generationTool": "ccd-casadi",
-        "description": f"Controller of {title}, sampled every {period:.17g} s",
-        "variableNamingConvention": "flat", "numberOfEventIndicators": "0",
-    })  # fmt: skip
-    kind = ET.SubElement(root, "CoSimulation", {
-        "modelIdentifier": NAME, "canHandleVariableCommunicationStepSize": "true",
-        "canNotUseMemoryManagementFunctions": "true",
-    })  # fmt: skip
-    files = ET.SubElement(kind, "SourceFiles")
-    for name in ("controller.c", "fmu.c"):
-        ET.SubElement(files, "File", {"name": name})
-    units = ET.SubElement(root, "UnitDefinitions")
-    for name, base in (("m", {"m": "1"}), ("N", {"kg": "1", "m": "1", "s": "-2"})):
-        ET.SubElement(ET.SubElement(units, "Unit", {"name": name}), "BaseUnit", base)
-    ET.SubElement(root, "DefaultExperiment", {"startTime": "0", "stepSize": f"{period:.17g}"})
-    variables = ET.SubElement(root, "ModelVariables")
     groups = (
-        ("e", errors, "m", "input", "r - y"),
-        ("f", forces, "N", "input", "feedforward, added before the limit"),
-        ("u", forces, "N", "output", "force"),
+        ("e", errors, "m", 'causality="input" description="r - y"'),
+        ("f", forces, "N", 'causality="input" description="feedforward, added before the limit"'),
+        ("u", forces, "N",
+         'causality="output" description="force" variability="discrete" initial="exact"'),
+    )  # fmt: skip
+    named = [(f"{letter}{i + 1}", *rest) for letter, n, *rest in groups for i in range(n)]
+    variables = "".join(
+        f'\n    <ScalarVariable name="{name}" valueReference="{reference}" {about}>'
+        f'\n      <Real unit="{unit}" start="0.0" />\n    </ScalarVariable>'
+        for reference, (name, unit, about) in enumerate(named)
     )
-    reference, outputs = 0, []
-    for letter, count, unit, causality, words in groups:
-        for i in range(count):
-            about = {"name": f"{letter}{i + 1}", "valueReference": str(reference),
-                     "causality": causality, "description": words}  # fmt: skip
-            if causality == "output":
-                about |= {"variability": "discrete", "initial": "exact"}
-                outputs.append(reference + 1)
-            variable = ET.SubElement(variables, "ScalarVariable", about)
-            ET.SubElement(variable, "Real", {"unit": unit, "start": "0.0"})
-            reference += 1
-    structure = ET.SubElement(ET.SubElement(root, "ModelStructure"), "Outputs")
-    for index in outputs:
-        ET.SubElement(structure, "Unknown", {"index": str(index)})
-    ET.indent(root)
-    return ET.tostring(root, encoding="UTF-8", xml_declaration=True)
+    first = errors + forces + 1
+    outputs = "".join(f'\n      <Unknown index="{first + i}" />' for i in range(forces))
+    text = filled("deployment/templates/modelDescription.xml", model=NAME, guid=guid,
+                  title=escape(title, {'"': "&quot;"}), period=f"{period:.17g}",
+                  variables=variables, outputs=outputs)  # fmt: skip
+    return text.encode()

@@ -5,13 +5,12 @@ from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.anti_windup import limited
-from ccd_casadi.deployment.compliance import sampled_compliance
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
-from ccd_casadi.deployment.sampled import sampled_figures
+from ccd_casadi.deployment.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled

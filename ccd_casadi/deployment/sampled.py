@@ -14,10 +14,14 @@ from scipy.optimize import brentq
 
 from ccd_casadi.kernels.sensitivity import HALF_POWER, axis_frequencies
 from ccd_casadi.lti.closed_loop import largest
+from ccd_casadi.lti.grid import around, frequency_grid
 from ccd_casadi.lti.hold import in_w
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.signals import highest
 from ccd_casadi.support.arrays import Array
+
+PER_DECADE, DECADES = 60, 6  # of a grid of compliance, below the Nyquist frequency
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,18 @@ def together(parts: Sequence[SampledFigures]) -> SampledFigures:
     return SampledFigures(
         True, radius, top.sensitivity_peak, top.sensitivity_peak_frequency, bandwidth
     )
+
+
+def sampled_compliance(plant: StateSpace, S: StateSpace) -> float:
+    """max over ω up to π/T of σ_max(S(e^{jωT}) G(jω)), m/N; the plant in SI without hold and delay.
+
+    A sinusoidal force f beside the held one acts without a break: the outputs at the instants are
+    S G f. What faster forces leave (aliased) is not in it. S is stable.
+    """
+    end = np.pi / S.period
+    near = around(np.concatenate([S.rates, plant.poles]))
+    grid = frequency_grid(end * 10.0**-DECADES, end, DECADES * PER_DECADE, near)
+    return highest(lambda at: largest(S.response(at) @ plant.response(at))[None], grid)[0][0]
 
 
 class _Levels:

@@ -3,6 +3,7 @@
 Made where the figures are known, kept in `report.json` (`stored`) and painted by `paint`.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Literal
@@ -108,6 +109,11 @@ class Table:
         rows = tuple(tuple(_cell(value) for value in row) for row in self.rows)
         object.__setattr__(self, "rows", rows)
 
+    @staticmethod
+    def of(head: Sequence[str], *columns: Iterable[Any]) -> "Table":
+        """From columns of equal length."""
+        return Table(tuple(head), tuple(zip(*columns, strict=True)))
+
 
 def _cell(value: Any) -> Any:
     if isinstance(value, np.generic):
@@ -205,11 +211,14 @@ class SweepMap:
     others: str = "S_low"
 
 
+Drawing = Lines | Landscape | SweepMap | Modes | Picture
+
+
 @dataclass(frozen=True)
 class Figure:
     """A figure with its caption, and the numbers behind it, which a page folds away."""
 
-    drawing: Lines | Landscape | SweepMap | Modes | Picture
+    drawing: Drawing
     caption: str
     tables: tuple[Table, ...]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from ccd_casadi.drawing.content import Table
 from ccd_casadi.drawing.svg import THEME
-from ccd_casadi.support.package_text import package_text
+from ccd_casadi.support.package_text import filled, package_text
 from ccd_casadi.support.units import number
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"  # no request, no script but ours
@@ -82,10 +82,5 @@ def document(title: str, head: str, body: str) -> str:
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
     policy = f"{POLICY}; script-src {allowed}" if own else POLICY
     scripted = "".join(f"<script>{text}</script>\n" for text in scripts)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{css}</style>\n</head>\n<body>\n"
-        f"{head}\n<main>\n{body}\n</main>\n{scripted}</body>\n</html>\n"
-    )
+    return filled("drawing/assets/page.html", policy=policy, title=escape(title), css=css,
+                  head=head, body=body, scripts=scripted)  # fmt: skip

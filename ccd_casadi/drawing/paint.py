@@ -5,27 +5,7 @@ By hand, not by templates: each text is escaped in the one function that makes i
 
 from collections.abc import Sequence
 
-from ccd_casadi.drawing.content import (
-    Block,
-    Bullets,
-    Facts,
-    Figure,
-    Head,
-    Heading,
-    Landscape,
-    Lines,
-    Links,
-    Modes,
-    Page,
-    Picture,
-    Source,
-    Steps,
-    SweepMap,
-    Table,
-    Verdict,
-    VerdictLine,
-    Words,
-)
+from ccd_casadi.drawing import content as c
 from ccd_casadi.drawing.lines import figure_lines
 from ccd_casadi.drawing.maps import figure_landscape, figure_sweep
 from ccd_casadi.drawing.page import document, escape, table_html, typeset
@@ -36,7 +16,7 @@ BADGES = {"passed": "good", "warned": "warn", "failed": "bad", "unknown": "open"
 STANDINGS = {"good": "✓", "warn": "!", "bad": "✕"}
 
 
-def painted(page: Page) -> str:
+def painted(page: c.Page) -> str:
     """The whole document."""
     body, contents = [], []
     for i, section in enumerate(page.sections, 1):
@@ -53,61 +33,61 @@ def painted(page: Page) -> str:
     return document(page.head.title, head, "\n".join(body))
 
 
-def blocks_html(blocks: Sequence[Block], key: str) -> str:
+def blocks_html(blocks: Sequence[c.Block], key: str) -> str:
     """What stands under a heading; `key` is unique in the page."""
     return "\n".join(block_html(block, f"{key}{i}") for i, block in enumerate(blocks))
 
 
-def block_html(block: Block, key: str) -> str:
+def block_html(block: c.Block, key: str) -> str:
     """One of it."""
     match block:
-        case Words(text):
+        case c.Words(text):
             return f"<p>{escape(typeset(text))}</p>"
-        case Heading(text):
+        case c.Heading(text):
             return f"<h3>{escape(text)}</h3>"
-        case Source(text):
+        case c.Source(text):
             return f"<pre>{escape(text)}</pre>"
-        case Bullets(items):
+        case c.Bullets(items):
             return f"<ul>{''.join(f'<li>{escape(words)}</li>' for words in items)}</ul>"
-        case Links(pages):
+        case c.Links(pages):
             linked = (f'<li><a href="{escape(to)}">{escape(title)}</a>: {escape(words)}</li>'
                       for to, title, words in pages)  # fmt: skip
             return f"<ul>{''.join(linked)}</ul>"
-        case Facts(rows):
+        case c.Facts(rows):
             body = "\n".join(
-                f'<tr><th scope="row">{escape(a)}</th><td>{escape(typeset(b))}</td>'
-                f"<td>{escape(typeset(c))}</td></tr>"
-                for a, b, c in rows
+                f'<tr><th scope="row">{escape(what)}</th><td>{escape(typeset(value))}</td>'
+                f"<td>{escape(typeset(remark))}</td></tr>"
+                for what, value, remark in rows
             )
             return f'<table class="wide"><tbody>{body}</tbody></table>'
-        case Table():
+        case c.Table():
             return table_html(block)
-        case Picture(svg):
+        case c.Picture(svg):
             return svg
-        case Figure():
+        case c.Figure():
             return _figure(block, key)
-        case Steps():
+        case c.Steps():
             return _steps(block, key)
-        case Verdict(lines):
+        case c.Verdict(lines):
             return verdict_html(lines)
 
 
-def drawing_html(drawing: Lines | Landscape | SweepMap | Modes | Picture, key: str) -> str:
+def drawing_html(drawing: c.Drawing, key: str) -> str:
     """A figure by itself."""
     match drawing:
-        case Lines():
+        case c.Lines():
             return figure_lines(drawing, key)
-        case Landscape():
+        case c.Landscape():
             return figure_landscape(drawing, key)
-        case SweepMap():
+        case c.SweepMap():
             return figure_sweep(drawing, key)
-        case Modes():
+        case c.Modes():
             return modes_html(drawing)
-        case Picture(svg):
+        case c.Picture(svg):
             return svg
 
 
-def _figure(figure: Figure, key: str) -> str:
+def _figure(figure: c.Figure, key: str) -> str:
     tables = "\n".join(table_html(item) for item in figure.tables)
     return (
         f'<figure>\n<div class="drawing">{drawing_html(figure.drawing, key)}</div>\n'
@@ -117,7 +97,7 @@ def _figure(figure: Figure, key: str) -> str:
     )
 
 
-def _steps(found: Steps, key: str) -> str:
+def _steps(found: c.Steps, key: str) -> str:
     """Without the script, and on paper, the picture that is shown stands alone."""
     shown = "".join(
         f'\n<div class="step"{"" if i == found.first else " hidden"}><p>{escape(words)}</p>'
@@ -128,7 +108,7 @@ def _steps(found: Steps, key: str) -> str:
     return f'<div class="steps"><label hidden>{escape(found.label)} {slider}</label>{shown}\n</div>'
 
 
-def head_html(head: Head) -> str:
+def head_html(head: c.Head) -> str:
     """Of a page, or of a cell of a notebook."""
     badge = f'<span class="badge {head.badge}">{STANDINGS[head.badge]} {escape(head.status)}</span>'
     return (
@@ -139,7 +119,7 @@ def head_html(head: Head) -> str:
     )
 
 
-def verdict_html(lines: Sequence[VerdictLine]) -> str:
+def verdict_html(lines: Sequence[c.VerdictLine]) -> str:
     """The lines as a table; nothing where there are none."""
     rows = "\n".join(
         f'<tr><th scope="row">{escape(line.name)}</th><td><span class="badge {BADGES[line.state]}">'

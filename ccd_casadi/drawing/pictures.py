@@ -1,4 +1,4 @@
-"""What a plant may show of itself: its surface with the shapes of its modes, and a drawing."""
+"""What a plant may show of itself: its surface with the shapes of its modes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -48,13 +48,3 @@ class ModeShapes:
     faces: np.ndarray
     modes: tuple[ModeShape, ...]
     view: str = ""
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """Several θ of a plant side by side: an <svg> element, its caption, and their lengths."""
-
-    svg: str
-    caption: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[object, ...], ...]

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccd_casadi.support.package_text import package_path
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -38,45 +40,13 @@ COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
 LONGEST_LABEL = 40
 
-_STYLE: Any = {
-    "svg.fonttype": "none",
-    "text.parse_math": False,  # a "$" in a user's unit is a dollar
-    "font.family": ["DejaVu Sans"],  # for the layout; the page sets its own, none is wider
-    "font.size": 10.0,
-    "axes.labelsize": 10.0,
-    "axes.titlesize": 10.0,
-    "xtick.labelsize": 9.0,
-    "ytick.labelsize": 9.0,
-    "legend.fontsize": 9.0,
-    "axes.linewidth": 0.7,
-    "axes.edgecolor": "#444444",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 5.0,
-    "hatch.linewidth": 0.5,
-    "legend.frameon": True,
-    "legend.framealpha": 0.9,
-    "legend.edgecolor": "#e6e6e6",
-    "legend.fancybox": False,
-    "axes.titley": 1.0,  # where it is by itself, but not measured to be placed
-    "figure.facecolor": "none",
-    "savefig.facecolor": "none",
-}
-
-
 @contextmanager
 def style() -> Iterator[None]:
     """Our style while a figure is built and written, and the caller's again after it."""
     import matplotlib
 
-    with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
+    sheet = package_path("drawing/assets/figures.mplstyle")
+    with matplotlib.rc_context(fname=sheet), warnings.catch_warnings():
         # A letter that DejaVu lacks is only measured with it; the browser draws it.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield

@@ -4,8 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
-from ccd_casadi.analysis.signals import Signals, signals_of
+from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
+from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
+from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
@@ -23,6 +26,11 @@ from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
 
 POINTS = 180  # of the frequency grid, besides those around resonances
+STEP_POINTS = 240
+STEP_PERIODS = 5.0  # of the bandwidth
+WATCHED = 2.0  # durations of the move that are shown
+NONE = np.zeros(0)
+AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
 
 
 @dataclass(frozen=True)
@@ -30,7 +38,9 @@ class Curves:
     """Of one design: its loop on the plant looked at, over frequency and over time.
 
     `loci` (k, p): eigenvalues of L = GK. `margins`: the least of the loops broken one at a time at
-    the plant's inputs. Poles of K and of G are in Hz, complex.
+    the plant's inputs. Poles of the loop (of a sampled one ln(z)/T), of K and of G: complex, Hz.
+    `step`: y of the first output (s) after a step of its reference. An unstable loop has no step
+    and no move (`AT_REST`).
     """
 
     view: LoopView
@@ -38,12 +48,10 @@ class Curves:
     margins: ClassicalMargins
     controller_poles: np.ndarray
     plant_poles: np.ndarray
-    signals: Signals
-
-    @property
-    def poles(self) -> np.ndarray:
-        """Of the closed loop in Hz, complex."""
-        return self.signals.poles / HZ
+    poles: np.ndarray
+    step_time: Array
+    step: Array
+    move: Move
 
     @property
     def unstable(self) -> bool:
@@ -76,15 +84,33 @@ def curves_of(look: Look) -> Curves | None:
     bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)
     view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=False,
                      special=(look.figures.sensitivity_peak_frequency / HZ,))  # fmt: skip
-    free = modal_plant(look.elements.system, Suspension(0.0, 0.0))
+    time, step, move = NONE, NONE, AT_REST
+    if loop.stable:
+        first = np.eye(len(loop.plant.C))[0]
+        time, y = step_response(loop, first, STEP_PERIODS / bandwidth, STEP_POINTS)
+        step, move = y[:, 0], _move(look, loop, bandwidth)
     return Curves(
         view=view,
         loci=loci_of(view.open[0], np.inf),
         margins=least_margins(loop.responses, HZ * view.hz),
         controller_poles=K.poles / HZ,
         plant_poles=loop.plant.poles / HZ,
-        signals=signals_of(loop, free, bandwidth),
+        poles=loop.poles / HZ,
+        step_time=time,
+        step=step,
+        move=move,
     )
+
+
+def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
+    """The default one of robustness, its rigid bodies free where that loop is stable."""
+    modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
+    free = replace(loop, plant=free_plant(modal))
+    ((made,),) = moves(
+        [loop], [free], [mass_feedforward(modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
+        bandwidth_hz=bandwidth_hz, doublings=1,
+    )  # fmt: skip
+    return made.until(WATCHED * made.duration)
 
 
 def sampled_of(look: Look) -> AsSampled | None:

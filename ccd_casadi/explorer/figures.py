@@ -22,31 +22,22 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from ccd_casadi.analysis.loop_view import phase_deg
+from ccd_casadi.analysis.loop_view import frequency_and_damping, phase_deg
 from ccd_casadi.drawing.svg import AMBER, BLUE, BROWN, GREEN, GREY, ORANGE, PURPLE, SKY
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.reporting.nyquist import FAR
+from ccd_casadi.support.package_text import package_text
 
 HEIGHT = 230
 TOP = 1e12  # above every gain: a shaded region ends there
 SLOWEST = 0.1  # of the least frequency shown: where slower poles are drawn
 GAINS = (("S", "σ_max(S)"), ("KS", "σ_max(KS) (N/m)"), ("T", "σ_max(T)"))
+BODE = ("size", "phase")
 PIN_COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
 DASHES = {Standing.KEPT: [], Standing.MISSED: [], Standing.NEAR: [2, 3], Standing.REFUSED: [6]}
 PADDING = 0.1  # of the data, that an axis reaches beyond them
-# After a reset an axis follows the designs again, which it does not once it was zoomed or moved.
-FOLLOW = """for (const range of [cb_obj.origin.x_range, cb_obj.origin.y_range])
-  range.have_updated_interactively = false"""
-# At any width of the page both axes have one scale, so that a circle is round: ±`half` fits in.
-ROUND = """const {inner_width: wide, inner_height: tall, x_range, y_range} = figure
-if (!(wide > 0 && tall > 0)) return
-const scale = Math.max(2 * half[0] / wide, 2 * half[1] / tall)
-for (const [range, middle, size] of [[x_range, centre, wide], [y_range, 0, tall]]) {
-  const start = middle - scale * size / 2, end = middle + scale * size / 2
-  range.setv({start, end, reset_start: start, reset_end: end}, {sync: false})
-}"""
 CENTRE, HALF = -0.8, (2.4, 2.0)  # of the Nyquist plot, and what it shows at least to both sides
 
 
@@ -77,7 +68,7 @@ class Figures:
         self.move = ColumnDataSource({"ms": [], "um": []})
         self.pinned = {
             name: ColumnDataSource({"xs": [], "ys": [], "colour": [], "name": []})
-            for name in ("S", "KS", "T", "nyquist", "size", "phase", "step", "move")
+            for name in ("S", "KS", "T", "nyquist", *BODE, "step", "move")
         }
         self.lines: list[Any] = []  # those of the present design, whose look says its standing
         self.cursor = Span(dimension="height", line_color=GREY, line_dash="dotted")
@@ -108,7 +99,7 @@ class Figures:
             min_border_left=58, tools="pan,box_zoom,wheel_zoom,reset", toolbar_location="above",
             **options,
         )  # fmt: skip
-        made.js_on_event(Reset, CustomJS(code=FOLLOW))
+        made.js_on_event(Reset, CustomJS(code=package_text("explorer/assets/follow.js")))
         made.toolbar.logo = None
         made.toolbar.autohide = True
         for axis in made.axis:
@@ -170,7 +161,8 @@ class Figures:
                 tool.match_aspect = True
             if isinstance(tool, WheelZoomTool):
                 tool.zoom_on_axis = False
-        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)}, code=ROUND)
+        fit = CustomJS(args={"figure": made, "centre": CENTRE, "half": list(HALF)},
+                       code=package_text("explorer/assets/round.js"))  # fmt: skip
         for size in ("inner_width", "inner_height"):
             made.js_on_change(size, fit)
         # ellipses: true in both axes, whatever these do, where a circle would take that across
@@ -261,41 +253,34 @@ class Figures:
             sources = (self.gains, self.loci, self.loop, self.step, self.move, *self.poles.values())
             return found + [_data(source, **{key: [] for key in source.data}) for source in sources]
         columns = {"hz": c.view.hz, "top": np.full(len(c.view.hz), TOP)}
-        for i, (name, _) in enumerate(GAINS):
-            nothing = np.full(len(c.view.hz), np.nan)
-            bound = c.view.bounds[i] if certified else nothing
-            columns |= {name: c.view.gains[i], f"b{name}": bound}
-        size, phase = _bode_of(c)
-        xs, ys = _lines(c.loci)
-        hz = [c.view.hz] * len(size)
+        bounds = c.view.bounds if certified else np.full_like(c.view.bounds, np.nan)
+        for (name, _), gain, bound in zip(GAINS, c.view.gains, bounds, strict=True):
+            columns |= {name: gain, f"b{name}": bound}
+        lines = _lines(c)
+        (hz, size), (_, phase) = (tuple(zip(*lines[name], strict=True)) for name in BODE)
+        xs, ys = zip(*lines["nyquist"], strict=True)
+        (ms, y), (end, um) = (lines[name][0] for name in ("step", "move"))
         found += [
-            _data(self.gains, **columns), _data(self.loci, xs=xs, ys=ys),
-            _data(self.loop, hz=hz, size=size, phase=phase),
+            _data(self.gains, **columns), _data(self.loci, xs=list(xs), ys=list(ys)),
+            _data(self.loop, hz=list(hz), size=list(size), phase=list(phase)),
+            _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
+            (self.end, {"location": 1e3 * c.move.duration}),
         ]  # fmt: skip
         at_poles = []
         for name, roots in (("loop", c.poles), ("K", c.controller_poles), ("G", c.plant_poles)):
-            upper = roots[roots.imag >= 0.0]
-            size = np.maximum(np.abs(upper), 1e-300)
-            at = np.maximum(size, SLOWEST * c.view.hz[0])  # an integrator's has no place there
+            at, damping = frequency_and_damping(roots)
+            at = np.maximum(at, SLOWEST * c.view.hz[0])  # an integrator's has no place there
             at_poles.append(at)
-            found.append(_data(self.poles[name], hz=at, damping=-upper.real / size))
-        ms, y = 1e3 * c.signals.step_time, c.signals.step
-        end, um = 1e3 * c.signals.move.time, 1e6 * c.signals.move.error
-        found += [
-            _data(self.step, ms=ms, y=y), _data(self.move, ms=end, um=um),
-            (self.end, {"location": 1e3 * c.signals.move.duration}),
-        ]  # fmt: skip
-        known = [c, *(pin.curves for pin in pinned if pin.curves is not None)]
-        spans = [(made.y_range, [c.view.gains[i]], True) for i, made in enumerate(self.of_gain)]
-        spans += [
-            (self.pole_map.x_range, at_poles, True),
-            (self.loop_size.y_range, size, True),
+            found.append(_data(self.poles[name], hz=at, damping=damping))
+        spans: list[tuple[Range1d, Sequence[Any], bool]] = [
+            *((made.y_range, [c.view.gains[i]], True) for i, made in enumerate(self.of_gain)),
+            (self.pole_map.x_range, at_poles, True), (self.loop_size.y_range, size, True),
             (self.loop_phase.y_range, phase, False),
-            (self.step_figure.x_range, [1e3 * each.signals.step_time for each in known], False),
-            (self.step_figure.y_range, [each.signals.step for each in known], False),
-            (self.move_figure.x_range, [1e3 * each.signals.move.time for each in known], False),
-            (self.move_figure.y_range, [1e6 * each.signals.move.error for each in known], False),
-        ]
+        ]  # fmt: skip
+        known = [lines, *(_lines(pin.curves) for pin in pinned if pin.curves is not None)]
+        for name, made in (("step", self.step_figure), ("move", self.move_figure)):
+            x, y = zip(*(each[name][0] for each in known), strict=True)
+            spans += [(made.x_range, x, False), (made.y_range, y, False)]
         return found + [_spanned(*span) for span in spans]
 
     def frame(self, drawn: Drawn) -> list[Change]:
@@ -308,18 +293,11 @@ class Figures:
         """Draw the pinned designs beside the present one."""
         rows: dict[str, list[tuple[Any, Any, str, str]]] = {name: [] for name in self.pinned}
         for i, (name, drawn) in enumerate(pins):
-            c, colour = drawn.curves, PIN_COLOURS[i % len(PIN_COLOURS)]
-            if c is None:
+            if drawn.curves is None:
                 continue
-            for k, (gain, _) in enumerate(GAINS):
-                rows[gain].append((c.view.hz, c.view.gains[k], colour, name))
-            for x, y in zip(*_lines(c.loci), strict=True):
-                rows["nyquist"].append((x, y, colour, name))
-            for name_, lines in zip(("size", "phase"), _bode_of(c), strict=True):
-                rows[name_] += [(c.view.hz, line, colour, name) for line in lines]
-            s = c.signals
-            rows["step"].append((1e3 * s.step_time, s.step, colour, name))
-            rows["move"].append((1e3 * s.move.time, 1e6 * s.move.error, colour, name))
+            colour = PIN_COLOURS[i % len(PIN_COLOURS)]
+            for place, lines in _lines(drawn.curves).items():
+                rows[place] += [(x, y, colour, name) for x, y in lines]
         for name, source in self.pinned.items():
             keys = ("xs", "ys", "colour", "name")
             source.data = {key: [row[i] for row in rows[name]] for i, key in enumerate(keys)}
@@ -347,14 +325,18 @@ def _spanned(axis: Range1d, values: Sequence[np.ndarray], log: bool) -> Change:
     return _ends(axis, low - margin, high + margin)
 
 
-def _bode_of(c: Curves) -> tuple[list[Any], list[Any]]:
-    """Sizes of the eigenvalues of L, and their phases in degrees."""
-    return list(np.abs(c.loci).T), list(phase_deg(c.loci).T)
-
-
-def _lines(loci: np.ndarray) -> tuple[list[Any], list[Any]]:
-    loci = np.where(np.abs(loci) <= FAR, loci, np.nan)
-    return [line.real for line in loci.T], [line.imag for line in loci.T]
+def _lines(c: Curves) -> dict[str, list[tuple[Any, Any]]]:
+    """x and y of every line of a design, by the name of its figure."""
+    hz = c.view.hz
+    near = np.where(np.abs(c.loci) <= FAR, c.loci, np.nan)
+    found = {name: [(hz, gain)] for (name, _), gain in zip(GAINS, c.view.gains, strict=True)}
+    return found | {
+        "nyquist": [(line.real, line.imag) for line in near.T],
+        "size": [(hz, line) for line in np.abs(c.loci).T],
+        "phase": [(hz, line) for line in phase_deg(c.loci).T],
+        "step": [(1e3 * c.step_time, c.step)],
+        "move": [(1e3 * c.move.time, 1e6 * c.move.error)],
+    }
 
 
 def _hover(line: Any, tips: list[tuple[str, str]]) -> HoverTool:

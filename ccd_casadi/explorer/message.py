@@ -10,22 +10,10 @@ from bokeh.events import DocumentReady
 from bokeh.model import DataModel, Model
 from bokeh.models import CustomJS
 
+from ccd_casadi.support.package_text import package_text
+
 Change = tuple[Model, dict[str, Any]]  # a model, and new values of its properties
 
-# In the browser alone: sent back they would be heard here as changes. What somebody zoomed stays.
-APPLY = """if (message.content == null) return
-const [words, changes, numbers] = message.content
-for (const [id, html] of Object.entries(words)) document.getElementById(id).innerHTML = html
-const unpacked = value => value?.count == null
-  ? Array.isArray(value) ? value.map(unpacked) : value
-  : new Float64Array(numbers.buffer, numbers.byteOffset + 8 * value.from, value.count)
-for (const [id, values] of changes) {
-  const model = message.document.get_model_by_id(id)
-  if (model == null || model.have_updated_interactively) continue
-  const data = values.data && Object.fromEntries(
-    Object.entries(values.data).map(([name, column]) => [name, unpacked(column)]))
-  model.setv(data ? {...values, data} : values, {sync: false, check_eq: data == null})
-}"""
 
 
 class Message(DataModel):
@@ -39,7 +27,7 @@ class Message(DataModel):
 
     def applied_in(self, document: Document) -> None:
         """Have the browser apply what comes, and what came before the page was there."""
-        apply = CustomJS(args={"message": self}, code=APPLY)
+        apply = CustomJS(args={"message": self}, code=package_text("explorer/assets/apply.js"))
         self.js_on_change("content", apply)
         document.js_on_event(DocumentReady, apply)
 

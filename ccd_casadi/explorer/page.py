@@ -18,14 +18,13 @@ from ccd_casadi.explorer.designs import How, Look
 from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.explorer.landscape import field_of, run_surrogate
-from ccd_casadi.explorer.machine import machine_html
 from ccd_casadi.explorer.map_figure import MapFigure
 from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.modes import frequency_error, in_modal_form
 from ccd_casadi.explorer.pins import Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
-from ccd_casadi.explorer.words import end_words, move_words, standing_html
+from ccd_casadi.explorer.words import end_words, machine_html, move_words, standing_html
 from ccd_casadi.support.errors import UserError
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once

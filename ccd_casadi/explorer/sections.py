@@ -15,12 +15,11 @@ from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import Certificate as SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_system
-from ccd_casadi.inner_problem.sections_bandwidth import prepared, with_range
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
+from ccd_casadi.inner_problem.sections_search import prepared, with_range
 from ccd_casadi.plants.modal import modal_plant
-from ccd_casadi.sampling.keys import problem_hash, sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.units import sections_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.synthesis import Certificate, DesignFigures, Outcome

@@ -12,13 +12,13 @@ from ccd_casadi.cases.sections import Case
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.explorer.designs import Elements, How, Look, elements_at, present, searched
 from ccd_casadi.explorer.knobs import Knobs, Problems, case_at, knobs_of
-from ccd_casadi.explorer.machine import surface_modes_html
 from ccd_casadi.explorer.modes import KnownModes, in_modal_form
 from ccd_casadi.explorer.sections import Designed, anchored, empty_look, judged_look
+from ccd_casadi.explorer.words import surface_modes_html
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.machine import lumped
-from ccd_casadi.sampling.keys import problem_hash, sample_key
+from ccd_casadi.sampling.rows import problem_hash, sample_key
 from ccd_casadi.sampling.samples import sample_of
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of

@@ -1,13 +1,18 @@
-"""What the explorer says of a design, as text and as HTML."""
+"""What the explorer says of a design, as text and as HTML, and its machine."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.drawing.content import Modes
 from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.paint import block_html, drawing_html
+from ccd_casadi.drawing.turntable import modes_html
 from ccd_casadi.explorer.curves import AsSampled, Curves
 from ccd_casadi.explorer.designs import Look, Standing
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.support.units import HZ, number
 
 
@@ -67,7 +72,7 @@ def move_words(curves: Curves | None) -> str:
     """What the figure of the move shows."""
     if curves is None or curves.unstable:
         return ""
-    return f"the default one of robustness, {curves.signals.move.words}; dashed: its end"
+    return f"the default one of robustness, {curves.move.words}; dashed: its end"
 
 
 def sampled_words(sampled: AsSampled, S_max: float) -> str:
@@ -112,3 +117,19 @@ def pin_columns(
 
 def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def machine_html(look: Look, start: Sequence[float], reference: float) -> str:
+    """Its drawing beside that of the start, masses and springs, or its modes."""
+    plant = plant_of(look.problem)
+    if plant.drawing is not None:
+        drawn = plant.drawing({"this design": look.theta, "the start": start})
+        picture = drawing_html(drawn.drawing, "machine")
+        return f'<div style="background:#fff;color:#1a1a1a">{picture}</div>'
+    return block_html(lumped_machine(look.elements.system, look.modal, reference), "machine")
+
+
+def surface_modes_html(problem: CoDesignProblem, theta: Sequence[float]) -> str:
+    """The first flexible modes on the plant's surface; empty for a plant that has none."""
+    plant = plant_of(problem)
+    return "" if plant.shapes is None else modes_html(Modes(plant.shapes(theta, SHOWN_MODES)))

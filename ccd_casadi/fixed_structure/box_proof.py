@@ -17,10 +17,9 @@ from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.design import problem_for
 from ccd_casadi.fixed_structure.enclosure import Boxes, Chart, LoopFamily
 from ccd_casadi.fixed_structure.loop import closed_loops, stable
-from ccd_casadi.fixed_structure.modal_sum import modal_sum
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.structure import Structure
-from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
+from ccd_casadi.fixed_structure.uncertainty import UncertainPlant, modal_sum
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.support.arrays import Array
 

@@ -5,9 +5,8 @@ Of plants with several inputs and outputs the whole loop is judged, by largest s
 From the SI matrices of K and of every plant: the closed loop is rebuilt, its eigenvalues decide
 stability; S, KS, T and GS are evaluated (`certificate_responses`) on grids through every pole and
 zero of plant, controller and closed loop (`certificate_curves`), those of many plants at once. For
-S the largest gain is confirmed by a Hamiltonian matrix (`certificate_norms`). A sampled loop is
-judged in z, its hold and delay exact, K by Tustin's rule; what happens between samples is not in
-it.
+S the largest gain is confirmed by a Hamiltonian matrix (`norms`). A sampled loop is judged in z,
+its hold and delay exact, K by Tustin's rule; what happens between samples is not in it.
 """
 
 from collections.abc import Sequence

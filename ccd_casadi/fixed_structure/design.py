@@ -6,7 +6,7 @@ design.
 
 from collections.abc import Callable, Sequence
 from time import perf_counter
-from typing import overload
+from typing import cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import ascend
 from ccd_casadi.fixed_structure.loop import plant_set
 from ccd_casadi.fixed_structure.loop_problem import LoopProblem, Problem
-from ccd_casadi.fixed_structure.race import Runner, distinct, finished, local_optima, run_race
+from ccd_casadi.fixed_structure.race import SAME, Runner, distinct, finished, local_optima, run_race
 from ccd_casadi.fixed_structure.sections_design import (
     MARGIN,
     SectionsDesign,
@@ -35,33 +35,13 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 
 CROSSOVERS = (0.03, 1.0)  # of starts, over ω₀: M_K is about mass times the square of ω_b hoped for
-REDRAWS = 2  # searches from the best ends, one section of each drawn anew
+REDRAWS = 2  # searches at most from the best ends, one section of each drawn anew
 REDRAWN = 3  # ends
 POOL = 12  # random starts tried for stability for each one that is kept
 RESTORING = 400.0  # penalty when an end is to be brought within its bounds
 
 
 Progress = Callable[[str], None]
-
-
-@overload
-def problem_for(
-    plants: Sequence[ScaledPlant],
-    structure: Structure,
-    bounds: Bounds,
-    sampling: Sampling | None = None,
-    frequencies: tuple[float, float] | None = None,
-) -> Problem: ...
-
-
-@overload
-def problem_for(
-    plants: Sequence[ScaledPlant],
-    structure: Structure | ChannelStructure,
-    bounds: Bounds,
-    sampling: Sampling | None = None,
-    frequencies: tuple[float, float] | None = None,
-) -> LoopProblem: ...
 
 
 def problem_for(
@@ -112,7 +92,7 @@ def synthesise_sections(
     cannot be in a set.
     """
     begun = perf_counter()
-    problem = problem_for(plants, structure, bounds, sampling, frequencies)
+    problem = cast(Problem, problem_for(plants, structure, bounds, sampling, frequencies))
     rng = np.random.default_rng(seed)
     pool = _initial(problem, initial, rng)
     if not only_initial:
@@ -122,8 +102,11 @@ def synthesise_sections(
         return failed(problem, SectionsOutcome.NO_STABLE_START, "", seed, begun)
     runners = run_race(problem, pool, tell, workers)
     for _ in range(0 if only_initial else REDRAWS):
+        best = runners[0].merit
         fresh = _redrawn(problem, runners, max(starts // 2, 1), rng)
         runners = run_race(problem, fresh, tell, workers, runners)
+        if runners[0].merit < best + SAME:
+            break
     return concluded(problem, plants, sampling, runners, len(pool), 0, seed, begun, tell)
 
 

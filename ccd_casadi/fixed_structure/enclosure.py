@@ -21,8 +21,9 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.affine import Affine, exponential, inverse, phi, variable
 from ccd_casadi.fixed_structure.bounds import Bounds, ShapeEnd
-from ccd_casadi.fixed_structure.modal_sum import ModalSum
 from ccd_casadi.fixed_structure.structure import Structure
+from ccd_casadi.fixed_structure.uncertainty import ModalSum
+from ccd_casadi.kernels.sections import INTEGRATOR, REAL
 from ccd_casadi.lti.hold import INSTANT
 from ccd_casadi.support.arrays import Array
 
@@ -185,21 +186,16 @@ class LoopFamily:
 
     def _controller(self, x: Affine, y: Affine) -> tuple[Affine, Affine]:
         """U and P of K = U/(y^i P)."""
-        S, values, at = self.structure, np.exp(self.kappa), 1
+        S, values = self.structure, np.exp(self.kappa)
         above: list[Affine] = []
         below: list[Affine] = []
-        if S.integrator:
-            above, at = [y + x * values[1]], 2
-        for _ in range(S.lead):
-            for side in (above, below):
-                side.append(x + y * (1.0 / values[at]))
-                at += 1
-        for side in [above, below] * S.biquads + [below] * (S.roll_off // 2):
+        for kind, sign, at in S.factors[1:].tolist():
             u = y * (1.0 / values[at])
-            side.append(x * x + x * u * (2.0 * values[at + 1]) + u * u)
-            at += 2
-        if S.roll_off % 2:
-            below.append(x + y * (1.0 / values[at]))
+            if kind == INTEGRATOR:
+                part = y + x * values[at]
+            else:
+                part = x + u if kind == REAL else x * x + x * u * (2.0 * values[at + 1]) + u * u
+            (above if sign > 0 else below).append(part)
         one = Affine(np.ones(len(x.centre)), np.zeros_like(x.slope), np.zeros(len(x.centre)))
         U, P = one * values[0], one
         for part in above + [x] * S.roll_off:

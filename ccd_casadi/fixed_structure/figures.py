@@ -37,13 +37,11 @@ def assess(
     kappa: Array,
     tau: float,
     *,
-    within: float | None = None,
     depth: float | None = None,
     each: bool = False,
 ) -> Assessment:
     """Stability by the eigenvalues of every loop, then the constraints with c > `depth`.
 
-    `within`: how far below 0 a value on the base grid may be to be among `near`.
     `each`: the constraints of unstable loops are given too, where some are stable.
     """
     plants = problem.plants
@@ -52,7 +50,7 @@ def assess(
     if not good.any() if each else not good.all():
         return Assessment(False, poles, None, None)
     several = len(plants.out) > 1
-    within = (WITHIN_OF_SEVERAL if several else WITHIN) if within is None else within
+    within = WITHIN_OF_SEVERAL if several else WITHIN
     depth = (RELEVANT_OF_SEVERAL if several else RELEVANT) if depth is None else depth
     v, regular = frequency_grid(problem, problem.roots(kappa), poles)
     P, curves, loop = len(v), np.array(problem.curves, np.int64), problem.loop(kappa, tau)
@@ -128,11 +126,10 @@ def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) 
         return out
     loop = problem.loop(kappa, tau)
     out[:, :n, :n] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
-    (_, slope, *_), up, down = (
-        evaluate_rows(problem, kappa, tau, rows.curve, rows.plant, rows.v * np.exp(step))
-        for step in (0.0, STEP, -STEP)
-    )
-    c_xx, c_xk = ((up[i] - down[i]) / (2.0 * STEP) for i in (1, 2))
+    v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
+    found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
+    (slope, *slopes), (_, *to_kappa) = (np.split(part, 3) for part in found[1:3])
+    c_xx, c_xk = ((up - down) / (2.0 * STEP) for up, down in (slopes, to_kappa))
     end = rows.curve == Curve.CROSSING
     fixed = end | (rows.curve == Curve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))

@@ -22,9 +22,10 @@ from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.budget.derivatives import Change, rms_error_slope, variance_slopes
 from ccd_casadi.fixed_structure.bounds import Bounds
 from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.channel_structure import controller_of
 from ccd_casadi.fixed_structure.design import Progress, problem_for
 from ccd_casadi.fixed_structure.local_search import LoopModel, Point, descend
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Problem
+from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.fixed_structure.optimality import Envelope, Optimality, envelope_of, optimality
 from ccd_casadi.fixed_structure.sections_design import (
     SectionsDesign,
@@ -173,7 +174,7 @@ def least_error(
 
 
 def _judged(
-    problem: Problem,
+    problem: LoopProblem,
     plants: Sequence[ScaledPlant],
     sampling: Sampling | None,
     end: Iterate[Assessment],
@@ -184,7 +185,7 @@ def _judged(
     structure, P = problem.structure, problem.plants
     inside, tau = end.x[:-1], float(end.x[-1])
     kappa = structure.in_units(inside, P.omega_0, P.force)
-    controller = state_space(structure, kappa)
+    controller = controller_of(structure, kappa)
     judged = certify(plants, controller, problem.bounds, sampling, integrator=structure.integrator)
     found = optimality(problem, Point(inside, tau, end.data), -end.gradient, floor)
     least = float(np.exp(floor)) * P.omega_0

@@ -212,7 +212,6 @@ def _(
     kappa: Array,
     tau: float,
     *,
-    within: float | None = None,
     depth: float | None = None,
     each: bool = False,
 ) -> Assessment:

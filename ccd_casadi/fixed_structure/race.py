@@ -22,6 +22,7 @@ HALVINGS = 3  # rounds after which the better half goes on
 LAST = 6  # that are never halved away
 BEHIND = 0.1  # in ln ω_b: no further behind the best one once halving is over
 OVERTAKING = 4.0  # times the gain of its last round: what a search behind may still catch up
+WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
 LOWERED = 6  # steps at most to the bandwidth of a controller
@@ -183,7 +184,7 @@ def _going_on(field: Sequence[Runner], turn: int) -> list[Runner]:
     for place, i in enumerate(running):
         runner = field[i]
         behind = lead - runner.merit
-        lost = place >= most or behind > OVERTAKING * runner.gained
+        lost = place >= most or behind + WORTH > OVERTAKING * runner.gained
         lost = lost or (turn >= HALVINGS - 1 and behind > BEHIND)
         missing = PENALTY * runner.point.assessment.violation
         hopeless = turn >= HALVINGS - 1 and missing > OVERTAKING * runner.gained

@@ -8,6 +8,7 @@ frequency and damping ratio: all positive, so K is stable (but the integrator) a
 by construction. κ has the units of what it is multiplied with: everything here is blind to them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -133,82 +134,27 @@ def response_and_slopes(
     return value, slopes, slope
 
 
-def second_slopes(structure: Structure, kappa: Array, s: np.ndarray) -> np.ndarray:
-    """∂²ln K/∂κ², (..., n, n); zero between parameters of different factors."""
-    n = len(structure.names)
-    out = np.zeros((*s.shape, n, n), complex)
-    for factor, sign, index, parts in _factors(structure, np.exp(kappa), s):
-        # ω and ζ enter a polynomial by ζ/ω and 1/ω²: its second derivatives are its parts again.
-        first = [part / factor for part in parts]
-        if len(parts) == 1:
-            inverse = structure.integrator and index == 1
-            second = {(0, 0): first[0] if inverse else -first[0]}
-        else:
-            middle = first[1]
-            second = {(0, 0): -2.0 * first[0] - middle, (0, 1): -middle, (1, 1): middle}
-        for (i, j), value in second.items():
-            entry = sign * (value - first[i] * first[j])
-            out[..., index + i, index + j] = out[..., index + j, index + i] = entry
-    return out
-
-
-def _factors(structure: Structure, values: Array, s: np.ndarray) -> list:
+def _factors(
+    structure: Structure, values: Array, s: np.ndarray
+) -> Iterator[tuple[np.ndarray, int, int, tuple[np.ndarray, ...]]]:
     """(polynomial, +1 above or -1 below, index of its first parameter, its derivatives)."""
-    found, at = [], 1
-
-    def single() -> tuple:
-        x = s / values[at]
-        return 1.0 + x, (-x,)
-
-    def pair() -> tuple:
-        x, zeta = s / values[at], values[at + 1]
-        middle = 2.0 * zeta * x
-        return 1.0 + middle + x * x, (-middle - 2.0 * x * x, middle)
-
-    if structure.integrator:
-        x = values[at] / s
-        found.append((1.0 + x, 1, at, (x,)))
-        at += 1
-    for _ in range(structure.lead):
-        for sign in (1, -1):
-            factor, parts = single()
-            found.append((factor, sign, at, parts))
-            at += 1
-    for _ in range(structure.biquads):
-        for sign in (1, -1):
-            factor, parts = pair()
-            found.append((factor, sign, at, parts))
-            at += 2
-    for _ in range(structure.roll_off // 2):
-        factor, parts = pair()
-        found.append((factor, -1, at, parts))
-        at += 2
-    if structure.roll_off % 2:
-        factor, parts = single()
-        found.append((factor, -1, at, parts))
-    return found
+    for kind, sign, at in structure.factors[1:].tolist():
+        x = values[at] / s if kind == INTEGRATOR else s / values[at]
+        if kind == PAIR:
+            middle = 2.0 * values[at + 1] * x
+            yield 1.0 + middle + x * x, sign, at, (-middle - 2.0 * x * x, middle)
+        else:
+            yield 1.0 + x, sign, at, (x if kind == INTEGRATOR else -x,)
 
 
 def roots(structure: Structure, kappa: Array) -> tuple[np.ndarray, np.ndarray]:
     """The zeros and the poles of K, the integrator's pole included."""
-    values, at = np.exp(kappa), 1
+    values = np.exp(kappa)
     zeros: list[complex] = []
-    poles: list[complex] = []
-    if structure.integrator:
-        zeros, poles, at = [-values[1]], [0.0], 2
-    for _ in range(structure.lead):
-        zeros.append(-values[at])
-        poles.append(-values[at + 1])
-        at += 2
-    for _ in range(structure.biquads):
-        zeros += _pair(values[at], values[at + 1])
-        poles += _pair(values[at + 2], values[at + 3])
-        at += 4
-    for _ in range(structure.roll_off // 2):
-        poles += _pair(values[at], values[at + 1])
-        at += 2
-    if structure.roll_off % 2:
-        poles.append(-values[at])
+    poles: list[complex] = [0.0] * structure.integrator
+    for kind, sign, at in structure.factors[1:].tolist():
+        found = _pair(values[at], values[at + 1]) if kind == PAIR else [-values[at]]
+        (zeros if sign > 0 else poles).extend(found)
     return np.array(zeros, complex), np.array(poles, complex)
 
 

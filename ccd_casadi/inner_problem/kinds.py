@@ -4,6 +4,12 @@
 
 A kind knows no hardware cost and no weights of J. What works on problems of any kind is written
 against `InnerKind`.
+
+That of ω_b*(θ) by mixed sensitivity has its gradient by the envelope theorem,
+
+    dω_b*/dθ = ∂ω_b/∂θ - Σ μ_i ∂g_i/∂θ,   ∂ω_b/∂x = Σ μ_i ∂g_i/∂x at the inner optimum,
+
+x = (ln ω_S, ln ω_T), g the active constraints, ends of the ranges included.
 """
 
 from abc import ABC, abstractmethod
@@ -14,17 +20,20 @@ import numpy as np
 from ccd_casadi.analysis.loop_view import Bounded
 from ccd_casadi.fixed_structure import Bounds, ShapeEnd
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.envelope import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import bounds_of, plants_of, sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import LOOSE
+from ccd_casadi.optim.kkt import non_negative
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.weights import Weights
+
+RESIDUAL = 1e-3  # relative; above it the point is no stationary one and has no envelope gradient
 
 
 class InnerKind(ABC):
@@ -193,3 +202,29 @@ KINDS: dict[type[ControllerProblem], type[InnerKind]] = {
     MixedSensitivityProblem: MixedSensitivity,
     SectionsProblem: FixedStructure,
 }
+
+
+def bandwidth_gradient(
+    optimum: Sensitivities, active: tuple[str, ...], bounded: tuple[str, ...]
+) -> Array:
+    """dω_b*/dθ (n_θ,) in rad/s per unit of θ; NaN where the optimality conditions do not hold.
+
+    `bounded` names the rows 1 to -2 of the optimum's values, as `InnerProblem.bounds` does.
+    """
+    x = optimum.to_break_frequencies
+    columns, slopes = [], []
+    zero = np.zeros(optimum.to_theta.shape[1])
+    for name in active:
+        if name in bounded:
+            i = 1 + bounded.index(name)
+            columns.append(x[i])
+            slopes.append(optimum.to_theta[i])
+        else:
+            variable, end = name.split()
+            sign = 1.0 if end == "upper" else -1.0
+            columns.append(sign * np.eye(2)[0 if variable == "omega_S" else 1])
+            slopes.append(zero)
+    mu, residual = non_negative(np.reshape(columns, (-1, 2)), x[0])
+    if residual > RESIDUAL:
+        return np.full_like(zero, np.nan)
+    return optimum.to_theta[0] - mu @ np.reshape(slopes, (-1, len(zero)))

@@ -11,10 +11,13 @@ import numpy as np
 
 from ccd_casadi.budget import ErrorBudget
 from ccd_casadi.fixed_structure import Sampling
-from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
+from ccd_casadi.inner_problem.controller_problem import (
+    ControllerProblem,
+    MixedSensitivityProblem,
+    RobustSet,
+)
 from ccd_casadi.inner_problem.figure import Figure
 from ccd_casadi.inner_problem.plant_source import PlantSource, plant_from
-from ccd_casadi.inner_problem.robust_set import RobustSet
 from ccd_casadi.inner_problem.search import search_inner
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult, evaluate, sweep_inner
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant, require_damping
@@ -212,6 +215,15 @@ def true_design(
         raise ValueError("a synthesis needs one design plant: take one of design_choices(problem)")
     return evaluate(
         scaled_plant(problem, theta), problem.weights, problem.inner, (omega_S, omega_T)
+    )
+
+
+def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
+    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
+    inner = problem.inner
+    return (
+        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
+        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
     )
 
 

@@ -20,19 +20,15 @@ from ccd_casadi.fixed_structure.least_error import least_error
 from ccd_casadi.fixed_structure.optimality import RESIDUAL, Envelope
 from ccd_casadi.fixed_structure.sections_design import SectionsOutcome
 from ccd_casadi.inner_problem.figure import BANDWIDTH, RMS_ERROR
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_plant_set import (
     bounds_of,
     plants_of,
     sections_of_problem,
     structure_of,
-    uncertain_plant,
     warm_starts,
-    with_channels,
     with_sections,
 )
-from ccd_casadi.inner_problem.sections_problem import Member
-from ccd_casadi.inner_problem.sections_robustness import worst_members
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
@@ -76,6 +72,23 @@ class SectionsValue:
         return self.design.certified
 
 
+def searched(
+    problem: CoDesignProblem,
+    plants: Sequence[ScaledPlant],
+    initial: Sequence[Array],
+    starts: int | None = None,
+    progress: Progress | None = None,
+    workers: Pool | None = None,
+) -> SectionsDesign:
+    """The largest bandwidth on plants, from controllers κ in SI and `starts` others beside them."""
+    sections = sections_of_problem(problem)
+    return synthesise(
+        plants, structure_of(problem), bounds_of(problem), sampling=sections.sampling,
+        starts=starts or 0, seed=sections.seed, initial=initial, only_initial=starts is None,
+        frequencies=sections.frequencies, progress=progress, workers=workers,
+    )  # fmt: skip
+
+
 def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> SectionsValue:
     """The best certified design from the problem's anchors at θ, and the envelope gradient."""
     sections = sections_of_problem(problem)
@@ -84,22 +97,13 @@ def sections_value(problem: CoDesignProblem, theta: Sequence[float]) -> Sections
     made: SectionsDesign | None = None
     spent = 0
     if initial:
-        made = synthesise(
-            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
-            initial=initial, only_initial=True, frequencies=sections.frequencies,
-        )  # fmt: skip
+        made = searched(problem, plants, initial)
         spent += 1
     if made is None or (sections.starts and not made.certified):
-        made = synthesise(
-            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
-            starts=min(FEW, sections.starts), initial=initial, frequencies=sections.frequencies,
-        )  # fmt: skip
+        made = searched(problem, plants, initial, min(FEW, sections.starts))
         spent += 1
     while made.certified and made.kkt_residual > RESIDUAL and spent < FURTHER:
-        again = synthesise(
-            plants, structure_of(problem), bounds, sampling=sections.sampling, seed=sections.seed,
-            initial=[made.kappa], only_initial=True, frequencies=sections.frequencies,
-        )  # fmt: skip
+        again = searched(problem, plants, [made.kappa])
         spent += 1
         if not again.certified or again.bandwidth < (1.0 - LOST) * made.bandwidth:
             break
@@ -141,7 +145,7 @@ def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
     if made.bandwidth >= least:
         return made
     words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
-    words += f", inner.bandwidth_least_hz asks for {least / HZ:.4g} Hz"
+    words += f", inner.bandwidth_least_hz requires {least / HZ:.4g} Hz"
     short = {"bandwidth_least_hz": least / made.bandwidth}
     return replace(made, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
 
@@ -162,101 +166,3 @@ def _least_error(
         initial=warm_starts(started, structure_of(problem), plants, bounds),
     )  # fmt: skip
     return found.design, found.error, found.envelope
-
-
-def race(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    progress: Progress | None = None,
-    workers: Pool | None = None,
-    only_anchors: bool = False,
-) -> SectionsDesign:
-    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone."""
-    sections = sections_of_problem(problem)
-    return synthesise(
-        plants_of(problem, theta), structure_of(problem), bounds_of(problem),
-        sampling=sections.sampling, starts=sections.starts, seed=sections.seed,
-        initial=[np.array(kappa) for kappa in sections.anchors], only_initial=only_anchors,
-        frequencies=sections.frequencies, progress=progress, workers=workers,
-    )  # fmt: skip
-
-
-def with_range(problem: CoDesignProblem) -> CoDesignProblem:
-    """The problem with its channels and the range of K's frequencies, by the plant at its start,
-    alike at every θ.
-
-    A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
-    """
-    problem = with_channels(problem)
-    sections = sections_of_problem(problem)
-    if sections.frequencies is not None:
-        return problem
-    plant = scaled_plant(problem, problem.start)
-    poles = np.abs(np.linalg.eigvals(plant.A))
-    fastest = FASTEST * max(1.0, float(poles.max())) * plant.omega_0
-    slowest = SLOWEST * plant.omega_0
-    if sections.sampling is not None:
-        fastest = min(fastest, 2.0 / sections.sampling.period)
-        slowest = min(slowest, 0.01 * fastest)
-    return with_sections(problem, frequencies=(slowest, fastest))
-
-
-def prepared(
-    problem: CoDesignProblem,
-    progress: Progress | None = None,
-    workers: Pool | None = None,
-    only_anchors: bool = False,
-) -> tuple[CoDesignProblem, SectionsDesign]:
-    """The problem with anchors and members: searched at its start θ, worst plants added.
-
-    With `only_anchors` the anchors that it has alone are where searches start. The design is the
-    search's last; where it is not certified the problem has no anchors, and each θ is searched on
-    its own. All of it is of the largest bandwidth, whatever the problem minimises.
-    """
-    asked = sections_of_problem(problem).minimise
-    asked_for = with_range(with_sections(problem, minimise="bandwidth"))
-    found, made = _prepared(asked_for, progress, workers, only_anchors)
-    return with_sections(found, minimise=asked), made
-
-
-def _prepared(
-    problem: CoDesignProblem, progress: Progress | None, workers: Pool | None, only_anchors: bool
-) -> tuple[CoDesignProblem, SectionsDesign]:
-    uncertain = uncertain_plant(problem, problem.start)
-    members = tuple((o, tuple(map(float, p))) for o, p in uncertain.corners())
-    problem = with_sections(problem, members=members)
-    made = race(problem, problem.start, progress, workers, only_anchors)
-    if not made.certified:
-        return problem, made
-    anchors = _anchors(made)
-    for turn in range(ROUNDS):
-        found = worst_members(problem, problem.start, made, turn, progress)[1]
-        if not found:
-            break
-        problem = with_sections(problem, members=(*sections_of_problem(problem).members, *found))
-        problem = with_sections(problem, anchors=anchors)
-        made = sections_value(problem, problem.start).design
-        if not made.certified:
-            return problem, made
-        anchors = _anchors(made)
-    return with_sections(problem, anchors=anchors), made
-
-
-def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
-    """The certified design's κ first, then those of the other local optima near it."""
-    own = tuple(map(float, made.kappa))
-    others = [
-        optimum.kappa
-        for optimum in made.local_optima
-        if (1.0 - DISTINCT) * made.bandwidth <= optimum.bandwidth < (1.0 - 1e-3) * made.bandwidth
-    ]
-    return (own, *others)[:MOST_ANCHORS]
-
-
-def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
-    """The problem with one more anchor, first, of what it minimises, and more members."""
-    sections = sections_of_problem(problem)
-    sections = sections.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
-    return replace(
-        problem, controller=replace(sections, members=(*sections.members, *members))
-    )

@@ -124,15 +124,9 @@ def with_options(
 
 def plants_of(problem: CoDesignProblem, theta: Sequence[float]) -> list[ScaledPlant]:
     """The plant set at θ: its members, or the corners of the box where none are known yet."""
-    uncertain = uncertain_plant(problem, theta)
-    return uncertain.plants(_points(problem, uncertain))
-
-
-def _points(problem: CoDesignProblem, uncertain: UncertainPlant) -> list[tuple[int, Array]]:
-    members = sections_of_problem(problem).members
-    if not members:
-        return uncertain.corners()
-    return [(option, np.array(point)) for option, point in members]
+    uncertain, members = uncertain_plant(problem, theta), sections_of_problem(problem).members
+    known = [(option, np.array(point)) for option, point in members]
+    return uncertain.plants(known or uncertain.corners())
 
 
 def with_sections(problem: CoDesignProblem, **changes: object) -> CoDesignProblem:

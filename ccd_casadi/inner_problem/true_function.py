@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design
+from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.synthesis.derivatives import Sensitivities
@@ -52,12 +52,8 @@ class TrueQuantities(VectorCallback):
         x = np.asarray(x, float).ravel()
         key = x.tobytes()
         if key not in self.designs:
-            omega = np.exp(x[-2:])
-            inner = self.problem.inner
-            # exp(log(bound)) may miss the bound by a rounding error
-            omega_S = float(np.clip(omega[0], *inner.omega_S))
-            omega_T = float(np.clip(omega[1], *inner.omega_T))
-            make = partial(true_design, self.problem, tuple(x[:-2]), omega_S, omega_T)
+            at = frequencies(self.problem, x)
+            make = partial(true_design, self.problem, tuple(x[:-2]), *at)
             self.designs[key] = make() if self.kept is None else self.kept(x, make)
         return self.designs[key]
 

@@ -4,7 +4,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.sampling.keys import problem_hash
+from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.errors import require
 from ccd_casadi.support.units import HZ

@@ -15,6 +15,7 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.casadi_callback import VectorCallback
 from ccd_casadi.support.errors import require
 
 om: Any = require("openmdao.api", "openmdao")
@@ -22,55 +23,48 @@ FREQUENCIES = ("ln_omega_S", "ln_omega_T")
 
 
 class _Component(om.ExplicitComponent):
-    """Inputs x by name, f(θ) and λ(θ); what is controlled is for those that inherit."""
+    """A CasADi function of named inputs as named outputs, its Jacobian as their partials."""
 
     def initialize(self) -> None:
         self.options.declare("problem", types=CoDesignProblem, desc="as `problem_of` makes it")
 
-    def setup(self) -> None:
+    def declared(self, x: ca.MX, controlled: Mapping[str, ca.MX], units: Mapping[str, str]) -> None:
+        """Inputs θ, and ln ω_S and ln ω_T where x has them; outputs `controlled`, f and λ."""
         problem: CoDesignProblem = self.options["problem"]
-        for name, value, unit in zip(problem.names, problem.start, problem.units, strict=True):
+        middle = np.log([problem.inner.omega_S, problem.inner.omega_T]).mean(axis=1)
+        start = (*problem.start, *middle)[: x.numel()]
+        self._inputs = (*problem.names, *FREQUENCIES)[: x.numel()]
+        for name, value, unit in zip(self._inputs, start, (*problem.units, "", ""), strict=False):
             self.add_input(name, val=value, units=om_unit(unit))
         plant = plant_of(problem)
-        theta = ca.MX.sym("theta", len(problem.names))
-        f, lam = plant.hardware(theta)
-        slopes = [ca.jacobian(f, theta), ca.jacobian(lam, theta)]
-        self._hardware = ca.Function("hardware_and_slopes", [theta], [f, lam, *slopes])
-        self.add_output("hardware_cost", desc="f(θ)")
-        if plant.constraint_names:
-            names = ", ".join(plant.constraint_names)
-            self.add_output("constraints", shape=len(plant.constraint_names), desc=f"<= 0: {names}")
-
-    def setup_partials(self) -> None:
+        f, lam = plant.hardware(x[: len(problem.names)])
+        made = {**controlled, "hardware_cost": f}
+        made |= {"constraints": lam} if plant.constraint_names else {}
+        for name, value in made.items():
+            self.add_output(name, val=1.0, shape=value.numel(), units=units.get(name))
         self.declare_partials("*", "*")
-        if self._variables() != self._theta():  # f and λ know nothing of the weights
-            for output in set(self._plain()) & {"hardware_cost", "constraints"}:
-                self.declare_partials(output, list(FREQUENCIES), dependent=False)
+        values = ca.vertcat(*made.values())
+        self._values = ca.Function("values", [x], [values])
+        self._slopes = ca.Function("slopes", [x], [ca.jacobian(values, x)])
+        ends = np.cumsum([value.numel() for value in made.values()])
+        self._rows = dict(zip(made, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
 
-    def _theta(self) -> tuple[str, ...]:
-        return tuple(self.options["problem"].names)
+    def compute(self, inputs: Any, outputs: Any) -> None:
+        x = self._x(inputs)
+        values = np.array(self._values(x)).ravel()
+        if not np.isfinite(values).all():
+            raise om.AnalysisError(self.reason(x))
+        for name, rows in self._rows.items():
+            outputs[name] = values[rows]
 
-    def _variables(self) -> tuple[str, ...]:
-        return self._theta()
-
-    def _plain(self) -> list[str]:
-        return [name.rpartition(".")[2] for name in self._var_rel_names["output"]]
+    def compute_partials(self, inputs: Any, partials: Any) -> None:
+        slopes = np.array(self._slopes(self._x(inputs)))
+        for name, rows in self._rows.items():
+            for column, variable in enumerate(self._inputs):
+                partials[name, variable] = slopes[rows, column][:, None]
 
     def _x(self, inputs: Mapping[str, Any]) -> Array:
-        return np.array([float(inputs[name].item()) for name in self._variables()])
-
-    def _write(self, outputs: Any, theta: Array) -> None:
-        f, lam = self._hardware(theta)[:2]
-        outputs["hardware_cost"] = float(f)
-        if "constraints" in self._plain():
-            outputs["constraints"] = np.array(lam).ravel()
-
-    def _write_slopes(self, partials: Any, theta: Array) -> None:
-        df, dlam = (np.array(part) for part in self._hardware(theta)[2:])
-        for i, name in enumerate(self._theta()):
-            partials["hardware_cost", name] = df[0, i]
-            if "constraints" in self._plain():
-                partials["constraints", name] = dlam[:, [i]]
+        return np.array([float(inputs[name].item()) for name in self._inputs])
 
 
 class CertifiedLoop(_Component):
@@ -79,56 +73,22 @@ class CertifiedLoop(_Component):
     Inputs are θ under its names (SI), `ln_omega_S` and `ln_omega_T` (of rad/s). Outputs:
     `bandwidth` (rad/s), `sensitivity_peak`, `sensitivity_low`, `compliance` (m/N, where the problem
     bounds it), `gamma_opt`, `hardware_cost` and `constraints` (λ <= 0, where there are any). The
-    partials are the total derivatives of `TrueQuantities`. `bounds` and `limits` hold what is to be
-    kept, `pose` tells it to a model.
+    partials are the total derivatives of `TrueQuantities`. `pose` tells a model what is to be kept.
     """
 
     def setup(self) -> None:
         problem: CoDesignProblem = self.options["problem"]
         self._truth = TrueQuantities(problem)
-        super().setup()
-        for name, (low, high) in zip(FREQUENCIES, self._ranges(problem), strict=True):
-            self.add_input(name, val=0.5 * (low + high), desc="ln of rad/s")
-        self.add_output("bandwidth", units="rad/s", desc="ω_b")
-        for name, _ in problem.inner.bounds.values():
-            self.add_output(name, val=1.0, units="m/N" if name == "compliance" else None)
-        self.add_output("gamma_opt", val=1.0)
+        x = ca.MX.sym("x", len(problem.names) + 2)
+        bandwidth, *logarithms, gamma = ca.vertsplit(self._truth(x))
+        bounded = [name for name, _ in problem.inner.bounds.values()]
+        figures = {name: ca.exp(y) for name, y in zip(bounded, logarithms, strict=True)}
+        found = {"bandwidth": bandwidth, **figures, "gamma_opt": gamma}
+        self.declared(x, found, {"bandwidth": "rad/s", "compliance": "m/N"})
 
-    def compute(self, inputs: Any, outputs: Any) -> None:
-        x = self._x(inputs)
-        design = self._truth.at(x)
-        if not design.figures.certified:
-            raise om.AnalysisError(f"not certified: {design.figures.outcome.value}")
-        self._write(outputs, x[:-2])
-        for name, value in zip(self._controlled(), self._scaled(x), strict=True):
-            outputs[name] = value
-
-    def compute_partials(self, inputs: Any, partials: Any) -> None:
-        x = self._x(inputs)
-        self._write_slopes(partials, x[:-2])
-        # of ω_b and γ_opt themselves, of the others in ln
-        factors = self._scaled(x)
-        factors[[0, -1]] = 1.0
-        slopes = factors[:, None] * self._truth.jacobian_at(x)
-        for name, row in zip(self._controlled(), slopes, strict=True):
-            for variable, slope in zip(self._variables(), row, strict=True):
-                partials[name, variable] = slope
-
-    def _variables(self) -> tuple[str, ...]:
-        return (*self._theta(), *FREQUENCIES)
-
-    def _controlled(self) -> tuple[str, ...]:
-        bounded = (name for name, _ in self.options["problem"].inner.bounds.values())
-        return ("bandwidth", *bounded, "gamma_opt")
-
-    def _scaled(self, x: Array) -> Array:
-        values = self._truth.values(x).copy()
-        values[1:-1] = np.exp(values[1:-1])
-        return values
-
-    @staticmethod
-    def _ranges(problem: CoDesignProblem) -> Array:
-        return np.log([problem.inner.omega_S, problem.inner.omega_T])
+    def reason(self, x: Array) -> str:
+        """Why there is no design at x."""
+        return f"not certified: {self._truth.at(x).figures.outcome.value}"
 
 
 class LargestBandwidth(_Component):
@@ -144,31 +104,25 @@ class LargestBandwidth(_Component):
 
     def setup(self) -> None:
         problem: CoDesignProblem = self.options["problem"]
-        super().setup()
-        self._found: dict[bytes, tuple[float, Array]] = {}
-        self._value = problem.figure.key
-        kind_of(problem).require_function()
-        self.add_output(self._value, units=problem.figure.si_unit)
+        kind, figure, known = kind_of(problem), problem.figure, dict[bytes, tuple[float, Array]]()
+        kind.require_function()
 
-    def compute(self, inputs: Any, outputs: Any) -> None:
-        theta = self._x(inputs)
-        value, _ = self._at(theta)
-        if not np.isfinite(value):
-            raise om.AnalysisError("no certified design meets the bounds at this theta")
-        self._write(outputs, theta)
-        outputs[self._value] = value
+        def at(theta: Array) -> tuple[float, Array]:
+            key = theta.tobytes()
+            if key not in known:
+                known[key] = kind.value(theta.tolist())
+            return known[key]
 
-    def compute_partials(self, inputs: Any, partials: Any) -> None:
-        theta = self._x(inputs)
-        self._write_slopes(partials, theta)
-        for name, slope in zip(self._theta(), self._at(theta)[1], strict=True):
-            partials[self._value, name] = slope
+        self._truth = VectorCallback(
+            "largest", len(problem.names), 1,
+            lambda x: np.array([at(x)[0]]), lambda x: at(x)[1][None],
+        )  # fmt: skip
+        theta = ca.MX.sym("theta", len(problem.names))
+        self.declared(theta, {figure.key: self._truth(theta)}, {figure.key: figure.si_unit})
 
-    def _at(self, theta: Array) -> tuple[float, Array]:
-        key = theta.tobytes()
-        if key not in self._found:
-            self._found[key] = kind_of(self.options["problem"]).value(theta.tolist())
-        return self._found[key]
+    def reason(self, x: Array) -> str:
+        """Why there is no design at θ."""
+        return "no certified design meets the bounds at this theta"
 
 
 def pose(model: Any, problem: CoDesignProblem, *, weights: bool = True) -> None:

@@ -5,7 +5,13 @@ from math import exp, isnan, log, nan
 import numpy as np
 
 from ccd_casadi.kernels.blocks import ascending, place
-from ccd_casadi.kernels.certificate import level_test, stack_norm
+from ccd_casadi.kernels.certificate import (
+    four_block_level_test,
+    four_block_loop,
+    four_block_norm,
+    level_test,
+    stack_norm,
+)
 from ccd_casadi.kernels.closed_loop import (
     loop_matrices,
     pole_rounding,
@@ -13,11 +19,6 @@ from ccd_casadi.kernels.closed_loop import (
     weighted_loop,
 )
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.disturbance_certificate import (
-    four_block_level_test,
-    four_block_loop,
-    four_block_norm,
-)
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.generalized_plant import generalized_plant

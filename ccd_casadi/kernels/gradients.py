@@ -16,7 +16,7 @@ Lyapunov equation A_c L + L A_cᵀ + X̄ = 0 with A_c = A + B1 V + B2 F gives th
 matrix at once, however many parameters there are. γ_opt, where X is infinite, has the same equation
 in the basis [U1; U2] of the stable subspace: only f = λ_min(X⁻¹) and its null vector q appear, T11
 Λ + Λ T11ᵀ + qqᵀ = 0. With δ > 0 the filter's solution stands in B1 and has an adjoint Lyapunov
-equation of its own (`disturbance_pullback`).
+equation of its own (`pullback`).
 
 Plain NumPy: a point is differentiated once, and compiled this took a third of the set-up.
 """

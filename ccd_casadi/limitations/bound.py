@@ -15,16 +15,16 @@ from ccd_casadi.limitations.conic import greatest_multiplier, least_scaling
 from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
-REALS = (*[2.0] * 60, 10.0, 30.0, 100.0)  # of the basis, over ω_b
+REAL, REALS = 2.0, (10.0, 30.0, 100.0)  # of the basis, over ω_b: one many times, and others
+MANY, FEW = (60, 120), (16, 40)  # how many times, and frequencies of a grid in a decade
 CORNERS = {-1: 100.0, 1: 5.0}  # of its roll-off, for h and for T
-GRID, FINE = 120, 1500  # frequencies in a decade: of a programme, of what is made of it
+FINE = 1500  # frequencies in a decade: of what is made of a programme
 OVER = 0.002  # by how much the scaling is above one where the certificate is tried
 TRIES = 5
 BAND = (0.2, 40.0)  # of ω_b: where roots of the plant have functions and a grid of their own
 MOST_PAIRS, SAME = 16, 1e-3  # how many of them, and how near two are that count as one
 BEGIN = 0.65  # of what one frequency alone forbids
-NEAR = 0.6  # of the ω_b that a basis is made for: where another one is made
-STEPS = (0.6, 1.6)  # of the scaling that one step goes for: 0 and ∞ are programmes not solved
+SECANTS, LARGEST = 10, 1.0  # programmes, and how far one step goes in ln ω_b
 CLOSE = 1e-3  # of the scaling: to what aims are met, and by how much T may pass a bound
 
 
@@ -40,18 +40,15 @@ def outside(limits: Limits, known: float = np.inf) -> float:
     begin = min([BEGIN * most, known, *zeros])
     if not np.isfinite(begin):
         return np.inf
-    for _ in range(2):  # the basis is made for where the search begins
-        search = _Search(limits, begin, -1)
-        omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
-        if NEAR < omega_b / begin < 1.0 / NEAR:
-            break
-        begin = omega_b
-    for _ in range(TRIES):
+    begin = _where(_Search(limits, begin, -1, FEW).multiplier, begin, most, 1.0 + OVER)[0]
+    search = _Search(limits, begin, -1)
+    omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
+    for number in range(TRIES):
         if omega_b >= most:
             break
-        if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, GRID)):
+        if forbids(limits, search.basis, weight, omega_b, _grid(limits, omega_b, MANY[1])):
             return min(omega_b, known)
-        omega_b *= 1.0 + 2.0 * OVER
+        omega_b = min(omega_b * (1.0 + OVER * 2.0 ** (number + 1)), most)
         weight = search.multiplier(omega_b)[1]
     return min(most, known)
 
@@ -117,11 +114,14 @@ def _grid(limits: Limits, omega_b: float, per_decade: int) -> Array:
 class _Search:
     """ω_b with a basis that stays; `turned` -1: of multipliers h, 1: of T."""
 
-    def __init__(self, limits: Limits, omega_b: float, turned: int) -> None:
+    def __init__(
+        self, limits: Limits, omega_b: float, turned: int, size: tuple[int, int] = MANY
+    ) -> None:
+        count, self.grid = size
         self.limits, self.unit = limits, limits.variable(omega_b)
         excess = len(limits.row[0].poles) - len(limits.row[0].zeros)
         self.basis = Basis(
-            reals=tuple(self.unit * a for a in REALS),
+            reals=tuple(self.unit * a for a in (*[REAL] * count, *REALS)),
             pairs=tuple(_roots(limits, omega_b)),
             corner=CORNERS[turned] * self.unit,
             order=1 if turned < 0 else max(excess - 1, 0),
@@ -132,7 +132,7 @@ class _Search:
 
     def multiplier(self, omega_b: float) -> tuple[float, Array]:
         """The scaling that some h shows, on a grid, and the coefficients of h."""
-        v = _grid(self.limits, omega_b, GRID)
+        v = _grid(self.limits, omega_b, self.grid)
         width = np.gradient(v)
         width[0] += v[0]
         values = self.basis.values(v) * np.sqrt(self.unit)
@@ -141,7 +141,7 @@ class _Search:
 
     def controller(self, omega_b: float) -> tuple[float, Array]:
         """The scaling that some T needs, on a finer grid, and its coefficients."""
-        v = _grid(self.limits, omega_b, GRID)
+        v = _grid(self.limits, omega_b, self.grid)
         g, weight = least_scaling(self.basis.values(v), *self.limits.radii(v, v, omega_b))
         v = _grid(self.limits, omega_b, FINE)
         m_S, m_T = self.limits.radii(v, v, omega_b)
@@ -153,16 +153,19 @@ class _Search:
 def _where(
     scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
 ) -> tuple[float, Array]:
-    """The ω_b at which the scaling is as aimed at; secants in ln."""
-    x, slope = np.log(begin), 0.6
-    known: list[tuple[float, float]] = []
-    for _ in range(8):
+    """The ω_b at which the scaling is as aimed at; secants in ln, between what is known."""
+    x, low, high, slope = float(np.log(begin)), -np.inf, float(np.log(most)), 0.8
+    before: tuple[float, float] | None = None
+    for _ in range(SECANTS):
         g, weight = scaling(float(np.exp(x)))
-        error = float(np.log(np.clip(g / aim, *STEPS)))
+        error = float(np.log(np.clip(g / aim, 0.1, 10.0)))  # ∞: a programme not solved
         if abs(error) < CLOSE:
             break
-        if known and x != known[-1][0]:
-            slope = float(np.clip((error - known[-1][1]) / (x - known[-1][0]), 0.2, 5.0))
-        known.append((x, error))
-        x = float(min(x - error / slope, np.log(most)))
+        low, high = (max(low, x), high) if error < 0.0 else (low, min(high, x))
+        if before is not None and x != before[0]:
+            slope = float(np.clip((error - before[1]) / (x - before[0]), 0.3, 5.0))
+        before = x, error
+        x += float(np.clip(-error / slope, -LARGEST, LARGEST))
+        if not low < x < high:
+            x = 0.5 * (low + high) if low > -np.inf else high
     return float(np.exp(x)), weight

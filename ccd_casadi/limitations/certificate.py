@@ -15,7 +15,7 @@ Intervals are halved where that is most above the integrand. Rounding, of 1e-12 
 integrals, is covered by a margin of 1e-6 of them.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,8 +24,14 @@ from ccd_casadi.limitations.limits import Limits
 from ccd_casadi.support.arrays import Array
 
 SPLIT = 0.9  # of what is lost to the intervals' widths: by the intervals that are halved
-MOST = 300_000  # intervals
+MOST = 120_000  # intervals
 MARGIN = 1e-6  # of ∫ m_T|h|: what rounding may not reach
+# An interval of v, h at its ends and its middle, ∫ σ dv from above, what of that the middle denies,
+# and ∫ m_T|h| dv.
+INTERVAL = [
+    *((name, float) for name in ("low", "middle", "high", "upper", "loss", "size")),
+    *((name, complex) for name in ("h_low", "h_middle", "h_high")),
+]
 TAIL = 1e13  # where the last interval ends, over the largest root of h
 
 
@@ -46,30 +52,6 @@ def support(h: np.ndarray, m_S: Array, m_T: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Intervals:
-    """Intervals of v with h at their ends and middles; of σ and m_T|h| upper and point values."""
-
-    low: Array
-    high: Array
-    h_low: np.ndarray
-    h_high: np.ndarray
-    h_middle: np.ndarray
-    upper: Array  # of ∫ σ dv
-    loss: Array  # upper less the value by the middle
-    size: Array
-
-    def only(self, where: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(getattr(self, item.name)[where] for item in fields(self))
-
-    def with_halves(self, split: np.ndarray, halves: "_Intervals") -> "_Intervals":
-        rest = np.ones(len(self.low), bool)
-        rest[split] = False
-        every = np.ones(len(halves.low), bool)
-        pairs = zip(self.only(rest), halves.only(every), strict=True)
-        return _Intervals(*(np.concatenate(pair) for pair in pairs))
-
-
-@dataclass(frozen=True)
 class _Multiplier:
     limits: Limits
     basis: Basis
@@ -85,16 +67,20 @@ class _Multiplier:
 
     def intervals(
         self, low: Array, high: Array, h_low: np.ndarray, h_high: np.ndarray
-    ) -> _Intervals:
+    ) -> np.ndarray:
+        """A row of `INTERVAL` for each."""
         w, middle = high - low, 0.5 * (low + high)
         h = self.at(middle)
         m_S, m_T = self._radii(low, high)
         line = 0.5 * (support(h_low, m_S, m_T) + support(h_high, m_S, m_T))
         curved = self.basis.most_curved(low, high, self.weight) * w**2 / 8.0
-        upper, size = w * (line + m_T * curved), w * m_T * np.abs(h)
+        found = np.empty(len(low), INTERVAL)
+        found["low"], found["high"], found["middle"] = low, high, middle
+        found["h_low"], found["h_high"], found["h_middle"] = h_low, h_high, h
+        found["upper"], found["size"] = w * (line + m_T * curved), w * m_T * np.abs(h)
         value = w * support(h, *self._radii(middle, middle))
-        loss = upper - np.maximum(value, -size)
-        return _Intervals(low, high, h_low, h_high, h, upper, loss, size)
+        found["loss"] = found["upper"] - np.maximum(value, -found["size"])
+        return found
 
 
 def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: Array) -> bool:
@@ -112,20 +98,19 @@ def forbids(limits: Limits, basis: Basis, weight: Array, omega_b: float, start: 
     beyond = (1.0 + limits.bounds.S_max) * basis.tail(top, weight)
     found = multiplier.intervals(ends[:-1], ends[1:], h[:-1], h[1:])
     while True:
-        total, excess = float(found.upper.sum()) + beyond, float(found.loss.sum())
-        if total < -MARGIN * float(found.size.sum()):
+        total, excess = float(found["upper"].sum()) + beyond, float(found["loss"].sum())
+        if total < -MARGIN * float(found["size"].sum()):
             return True
         if not np.isfinite(total) or total - excess > 0.0:
             return False
-        order = np.argsort(-found.loss)
-        share = np.cumsum(found.loss[order])
-        split = order[: int(np.searchsorted(share, SPLIT * excess)) + 1]
-        if len(found.low) + len(split) > MOST:
+        found = found[np.argsort(-found["loss"])]
+        count = int(np.searchsorted(np.cumsum(found["loss"]), SPLIT * excess)) + 1
+        if len(found) + count > MOST:
             return False
-        low, high, h_low, h_high, middle_h, *_ = found.only(split)
-        middle = 0.5 * (low + high)
-        halves = multiplier.intervals(
-            np.concatenate([low, middle]), np.concatenate([middle, high]),
-            np.concatenate([h_low, middle_h]), np.concatenate([middle_h, h_high]),
+        split, rest = found[:count], found[count:]
+        halves = (
+            multiplier.intervals(*(split[name] for name in names))
+            for names in (("low", "middle", "h_low", "h_middle"),
+                          ("middle", "high", "h_middle", "h_high"))
         )  # fmt: skip
-        found = found.with_halves(split, halves)
+        found = np.concatenate([rest, *halves])

@@ -7,7 +7,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.drawing.pictures import Drawing, ModeShapes
+from ccd_casadi.drawing.content import Figure
+from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
@@ -77,7 +78,7 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
         assert shapes is not None
         return shapes(own.at(theta), count)
 
-    def drawn(thetas: Mapping[str, Sequence[float]]) -> Drawing:
+    def drawn(thetas: Mapping[str, Sequence[float]]) -> Figure:
         assert drawing is not None
         return drawing({name: own.at(theta) for name, theta in thetas.items()})
 

@@ -14,7 +14,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.drawing.pictures import Drawing, ModeShapes
+from ccd_casadi.drawing.content import Figure
+from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool
@@ -76,7 +77,7 @@ class Plant:
     domain: tuple[Array, Array] | None = None
     doubt: Callable[[Sequence[float]], str] = lambda theta: ""
     shapes: Callable[[Sequence[float], int], ModeShapes] | None = None
-    drawing: Callable[[Mapping[str, Sequence[float]]], Drawing] | None = None
+    drawing: Callable[[Mapping[str, Sequence[float]]], Figure] | None = None
 
     @cached_property
     def slopes(self) -> ca.Function:
@@ -102,7 +103,7 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     except TypeError as error:
         raise PlantError(f"the plant model does not take its options: {error}") from error
     except KeyError as error:
-        raise PlantError(f"the plant model asks for a theta that the case lacks: {error}") from None
+        raise PlantError(f"the plant model needs a theta that the case lacks: {error}") from None
     check_keys(result)
     M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
     n = M.shape[0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccd_casadi.analysis.signals import step_response
+from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.c_code import COMPILE
 from ccd_casadi.deployment.on_hardware import OnHardware
@@ -30,14 +30,13 @@ from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.reporting.deploy_move import move_blocks
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
+from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.sections_page import sections_table
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number
-from ccd_casadi.synthesis.closed_loop import responses
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -98,27 +97,28 @@ def _percent(value: float, reference: float) -> str:
     return f"{round(100.0 * (value / reference - 1.0), 2) + 0.0:+.2f} %"
 
 
+def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
+    """The loops beside each other: name, colour, line."""
+    G, K = run.plant.plant_si(), found.realisation.system
+    return (
+        (Loop(G, run.controller), "full", BLUE, "-"),
+        (Loop(G, found.reduced), "reduced", GREEN, "--"),
+        (Loop(G, K, Sampling(1.0 / K.period, 1e6 * found.delay)), "sampled", ORANGE, "-"),
+    )
+
+
 def _loop(run: FinishedRun, found: Deployment) -> Figure:
     nyquist = 0.5 * found.rate_hz
     low, high = run.problem.inner.omega_low / HZ, 0.98 * nyquist
-    around = run.plant.grid * run.plant.omega_0 / HZ
-    hz = frequency_grid(low, high, POINTS, around)
-    gains, controllers = [], []
-    for K in (run.controller, found.reduced):
-        _, k, S = responses(run.plant, K, HZ * hz)
-        gains.append(largest(S))
-        controllers.append(largest(k))
-    k = found.realisation.system.response(HZ * hz)
-    G = found.plant.response(HZ * hz)
-    gains.append(largest(sensitivity(G @ k)))
-    controllers.append(largest(k))
-    colours = (BLUE, GREEN, ORANGE)
-    labels = ("full, continuous", "reduced, continuous", f"sampled at {number(found.rate_hz)} Hz")
-    lines = ("-", "--", "-")
-    curves = [
-        Curve(hz, gain, label, colour, line)
-        for gain, label, colour, line in zip(gains, labels, colours, lines, strict=True)
-    ]
+    hz = frequency_grid(low, high, POINTS, run.plant.grid * run.plant.omega_0 / HZ)
+    curves, drawn = [], []
+    for loop, name, colour, line in _loops(run, found):
+        G, K = loop.responses(HZ * hz)
+        how = "continuous" if loop.sampling is None else f"at {number(found.rate_hz)} Hz"
+        label = f"{name}{',' if loop.sampling is None else ''} {how}"
+        curves.append(Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
+        drawn.append(Curve(hz, largest(K), "", colour, line))
+    gains, controllers = ([curve.y for curve in each] for each in (curves, drawn))
     if found.measured is not None:
         first = int(np.searchsorted(found.measured.omega / HZ, low))
         at = [first + i for i in spread(found.measured.omega[first:])]
@@ -130,10 +130,6 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
     top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,))
-    drawn = [
-        Curve(hz, gain, "", colour, line)
-        for gain, colour, line in zip(controllers, colours, lines, strict=True)
-    ]
     bottom = over_hz("σ_max(K) (N/m)", drawn, (low, nyquist))
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
     table = over_frequency(
@@ -188,16 +184,8 @@ def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
 def _step(run: FinishedRun, found: Deployment) -> Figure:
     direction = found.orders[0].channel.outputs[:, 0]
     seconds = PERIODS * HZ / run.figures.bandwidth
-    G, delay = run.plant.plant_si(), found.delay
-    sampled = found.realisation.system
-    at = Sampling(1.0 / sampled.period, 1e6 * delay)
-    loops = (
-        (Loop(G, run.controller), "full", BLUE, "-"),
-        (Loop(G, found.reduced), "reduced", GREEN, "--"),
-        (Loop(G, sampled, at), "sampled", ORANGE, "-"),
-    )
     curves = []
-    for loop, label, colour, line in loops:
+    for loop, label, colour, line in _loops(run, found):
         t, outputs = step_response(loop, direction, seconds, POINTS)
         y = outputs @ direction
         curves.append(Curve(1e3 * t, y, label, colour, line))

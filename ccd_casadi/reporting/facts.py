@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Table
+from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ, number, shown_unit
 
-Fact = tuple[str, str, str]
 _FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
 
 
@@ -54,6 +53,12 @@ def cost_axis(problem: CoDesignProblem) -> str:
     return f"hardware cost f ({problem.cost_unit})" if problem.cost_unit else "hardware cost f"
 
 
+def theta_axes(problem: CoDesignProblem) -> list[tuple[str, str, float]]:
+    """Name, unit for the eye and the factor to it of every parameter."""
+    ends = zip(problem.names, problem.units, problem.upper, strict=True)
+    return [(name, *shown_unit(unit, upper)) for name, unit, upper in ends]
+
+
 def theta_words(result: Mapping[str, Any]) -> str:
     """`m1 = 55 kg, m2 = 55 kg`."""
     units = result.get("units", {})
@@ -67,11 +72,10 @@ def theta_words(result: Mapping[str, Any]) -> str:
 def theta_table(problem: CoDesignProblem, result: Mapping[str, Any]) -> Table:
     """Every parameter with its bounds, and where it lies between them."""
     rows = []
-    for i, name in enumerate(problem.names):
+    for i, (name, unit, factor) in enumerate(theta_axes(problem)):
         value, low, high = result["theta"][name], problem.lower[i], problem.upper[i]
         share = (value - low) / (high - low)
         place = "at lower" if share <= 1e-6 else "at upper" if share >= 1 - 1e-6 else "inside"
-        unit, factor = shown_unit(problem.units[i], high)
         numbers = (factor * float(v) for v in (value, low, high, problem.start[i]))
         rows.append((name, unit or "–", *numbers, place))
     lists = result.get("listed", {}).get("values", {})
@@ -171,33 +175,29 @@ def _robust(r: Mapping[str, Any]) -> list[Fact]:
         return []
     words = number(found["worst_sensitivity_peak"], 6) if found["stable"] else "unstable"
     where = f"{100.0 * found['worst_shift']:+.2f} %, damping × {found['worst_damping']:g}"
-    return [
-        (
-            "Peak of S on the perturbed plants",
-            words,
-            f"largest of {found['plants']} plants, at a resonance shift of {where}; "
-            f"on the nominal plant {number(found['nominal_sensitivity_peak'], 5)}",
-        )
-    ]
+    remark = (
+        f"largest of {found['plants']} plants, at a resonance shift of {where}; "
+        f"on the nominal plant {number(found['nominal_sensitivity_peak'], 5)}"
+    )
+    return [("Peak of S on the perturbed plants", words, remark)]
 
 
 def _without_suspension(r: Mapping[str, Any]) -> list[Fact]:
     free = r.get("without_suspension")
     if not free:
         return []
-    if free["bandwidth_hz"] is None:
-        words = "unstable" if not free["stable"] else "no bandwidth"
-        return [("Without the soft suspension", words, "same controller, rigid-body modes free")]
-    change = 100.0 * (free["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
-    stable = "stable" if free["stable"] else "UNSTABLE"
-    return [
-        (
-            "Without the soft suspension",
-            f"{number(free['bandwidth_hz'], 5)} Hz ({change:+.2f} %)",
-            f"same controller, rigid-body modes free: {stable}, peak of S "
-            f"{number(free['sensitivity_peak'], 5)}",
-        )
-    ]
+    words = "unstable" if not free["stable"] else "no bandwidth"
+    remark = "same controller, rigid-body modes free"
+    if free["bandwidth_hz"] is not None:
+        words = _changed(free, r)
+        stable = "stable" if free["stable"] else "UNSTABLE"
+        remark += f": {stable}, peak of S {number(free['sensitivity_peak'], 5)}"
+    return [("Without the soft suspension", words, remark)]
+
+
+def _changed(found: Mapping[str, Any], r: Mapping[str, Any]) -> str:
+    change = 100.0 * (found["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
+    return f"{number(found['bandwidth_hz'], 5)} Hz ({change:+.2f} %)"
 
 
 def _references(r: Mapping[str, Any]) -> list[Fact]:
@@ -207,12 +207,8 @@ def _references(r: Mapping[str, Any]) -> list[Fact]:
         value = "NOT robust to it"
         remark = f"same controller, same bound on the norm: {found['reason']}"
         if found["bandwidth_hz"] is not None:
-            change = 100.0 * (found["bandwidth_hz"] / r["bandwidth_hz"] - 1.0)
-            value = f"{number(found['bandwidth_hz'], 5)} Hz ({change:+.2f} %)"
-            remark += (
-                f"; peak of S {number(found['sensitivity_peak'], 5)}, norm "
-                f"{number(found['gamma'], 6)}"
-            )
+            value, peak = _changed(found, r), number(found["sensitivity_peak"], 5)
+            remark += f"; peak of S {peak}, norm {number(found['gamma'], 6)}"
         facts.append((f"On the plant with {name}", value, remark))
     return facts
 
@@ -249,41 +245,33 @@ def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
 
 
 def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> str:
-    inner = problem.inner
-    if name == "S_max":
-        words = f"The peak of S is at S_max = {inner.S_max:g}"
-        gain = _gain(multiplier, 0.01, "raising S_max by 1 %")
-    elif name == "S_low":
-        words = f"|S| at ω_low is at S_low = {inner.S_low:g}"
-        gain = _gain(multiplier, 0.01, "raising S_low by 1 %")
-    elif name == "compliance_max" and inner.compliance_max is not None:
-        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
-        gain = _gain(multiplier, 0.01, "raising it by 1 %")
-    else:
-        variable, _, end = name.rpartition(" ")
-        side = "widening the range there by 1 %"
-        if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
-            ends = inner.omega_S if variable == "omega_S" else inner.omega_T
-            value = ends[0 if end == "lower" else 1] / HZ
-            sign = variable.replace("omega", "ω")
-            words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
-            gain = _gain(multiplier, 0.01 / float(np.log(ends[1] / ends[0])), side)
-        elif end in ("lower", "upper") and variable in problem.names:
-            i = problem.names.index(variable)
-            value = (problem.lower if end == "lower" else problem.upper)[i]
-            unit, factor = shown_unit(problem.units[i], problem.upper[i])
-            width = factor * (problem.upper[i] - problem.lower[i])
-            words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
-            step = 0.01 * width
-            side = f"moving the bound outwards by {number(step, 3)} {unit}".rstrip()
-            gain = _gain(multiplier, 0.01, side)
-        else:
-            words = f"The constraint {name} binds"
-            gain = _gain(multiplier, 1.0, "loosening it by one unit")
-    return words + gain
-
-
-def _gain(multiplier: float | None, step: float, what: str) -> str:
+    words, step, loosened = _held(problem, name)
     if multiplier is None:
-        return "."
-    return f"; {what} would lower J by {number(multiplier * step, 3)}, to first order."
+        return f"{words}."
+    gain = number(multiplier * step, 3)
+    return f"{words}; {loosened} would lower J by {gain}, to first order."
+
+
+def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:
+    """What holds the design, a step that loosens it (in the multiplier's unit), that in words."""
+    inner, (variable, _, end) = problem.inner, name.rpartition(" ")
+    if name == "S_max":
+        return f"The peak of S is at S_max = {inner.S_max:g}", 0.01, "raising S_max by 1 %"
+    if name == "S_low":
+        return f"|S| at ω_low is at S_low = {inner.S_low:g}", 0.01, "raising S_low by 1 %"
+    if name == "compliance_max" and inner.compliance_max is not None:
+        words = f"‖GS‖∞ is at compliance_max = {1e6 * inner.compliance_max:g} µm/N"
+        return words, 0.01, "raising it by 1 %"
+    if end in ("lower", "upper") and variable in ("omega_S", "omega_T"):
+        ends = inner.omega_S if variable == "omega_S" else inner.omega_T
+        value, sign = ends[0 if end == "lower" else 1] / HZ, variable.replace("omega", "ω")
+        words = f"{sign} is at the {end} end of its range, {number(value)} Hz"
+        return words, 0.01 / float(np.log(ends[1] / ends[0])), "widening the range there by 1 %"
+    if end in ("lower", "upper") and variable in problem.names:
+        i = problem.names.index(variable)
+        value = (problem.lower if end == "lower" else problem.upper)[i]
+        _, unit, factor = theta_axes(problem)[i]
+        step = number(0.01 * factor * (problem.upper[i] - problem.lower[i]), 3)
+        words = f"{variable} is at its {end} bound, {number(factor * value)} {unit}".rstrip()
+        return words, 0.01, f"moving the bound outwards by {step} {unit}".rstrip()
+    return f"The constraint {name} binds", 1.0, "loosening it by one unit"

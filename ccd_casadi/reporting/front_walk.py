@@ -46,7 +46,8 @@ def _machine(problem: CoDesignProblem, point: FrontPoint) -> Place:
     drawing = plant_of(problem).drawing
     if drawing is None:
         return machine(problem, point.theta)
-    return Picture(drawing({"": point.theta}).svg)
+    shown = drawing({"": point.theta}).drawing
+    return shown if isinstance(shown, Picture) else None
 
 
 def _words(problem: CoDesignProblem, point: FrontPoint) -> str:

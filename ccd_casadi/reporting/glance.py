@@ -11,7 +11,6 @@ from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.loops import S_panel, marked
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
-from ccd_casadi.reporting.moves import MovePanels
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.units import HZ, counted, number
@@ -21,13 +20,15 @@ HEIGHT = 3.0  # inches of a row
 
 
 def glance(
-    problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: MovePanels
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView,
+    move: tuple[Lines, str, Table],
 ) -> Section:
     """Of a design on the plants that it is made for."""
+    error, caption, numbers = move
     S_max, several = problem.inner.S_max, len(view.open) > 1
     rows: tuple[tuple[Place, ...], ...] = (
         (machine(problem, theta), S_panel(view)),
-        (nyquist_panel(loci(view), S_max, HEIGHT), move.panels[-1]),
+        (nyquist_panel(loci(view), S_max, HEIGHT), error.rows[0][-1]),
     )
     peak = float(view.sizes[0].max())
     on = (
@@ -38,7 +39,7 @@ def glance(
         f"The machine at this design{on}. S stays out of the shaded area: its peak, "
         f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
-        f"from -1 in the Nyquist plot.{_margins(view)} {move.caption}"
+        f"from -1 in the Nyquist plot.{_margins(view)} {caption}"
     )
     head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]
     if view.scalar:
@@ -46,7 +47,7 @@ def glance(
         head, columns = [*head, "Re L", "Im L"], [*columns, L.real, L.imag]
     table = over_frequency(head, view.hz, *columns, special=marked(view))
     lines = Lines(rows, "At a glance", (HEIGHT, HEIGHT))
-    return Section("At a glance", (Figure(lines, words, (table, move.table)),))
+    return Section("At a glance", (Figure(lines, words, (table, numbers)),))
 
 
 def loci(view: LoopView) -> list[np.ndarray]:

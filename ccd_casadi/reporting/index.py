@@ -29,13 +29,11 @@ FILES = {
 
 
 def index_of(folder: Path) -> str:
-    """What a page in this folder links as the page of all pages; empty where it holds no run."""
-    return INDEX if (folder / "result.json").exists() else ""
-
-
-def index_above(folder: Path, run: Path) -> str:
-    """The same of a page in a folder of its own below the run's."""
-    return f"../{INDEX}" if folder.resolve().parent == run.resolve() else ""
+    """What a page in this folder links as the page of all pages of a run, here or one above."""
+    for place, link in ((folder, INDEX), (folder.resolve().parent, f"../{INDEX}")):
+        if (place / "result.json").exists():
+            return link
+    return ""
 
 
 def publish(folder: Path, path: Path, page: Page) -> None:

@@ -32,19 +32,11 @@ def sweep_data(
     samples = [s for s in truths.near(problem, theta) if s.certified]
     if len(samples) < LEAST_ROWS:
         return None
-    rows = np.array(
-        [
-            (
-                s.omega_S / HZ,
-                s.omega_T / HZ,
-                s.bandwidth / HZ,
-                s.sensitivity_peak,
-                s.sensitivity_low,
-                float(feasible(problem, s)),
-            )
-            for s in samples
-        ]
-    )
+    rows = np.array([
+        (s.omega_S / HZ, s.omega_T / HZ, s.bandwidth / HZ, s.sensitivity_peak, s.sensitivity_low,
+         float(feasible(problem, s)))
+        for s in samples
+    ])  # fmt: skip
     inner = problem.inner
     axes = [np.geomspace(*ends, GRID) for ends in (inner.omega_S, inner.omega_T)]
     limits = inner.levels
@@ -59,19 +51,12 @@ def sweep_data(
             for s in samples
         ]
         field = _interpolated(rows, limits[1] + np.max(others, axis=1), axes)
-    empty = np.empty((0, 0))
-    known = field is not None
-    return SweepMap(
-        rows=rows,
-        omega_S=axes[0] / HZ,
-        omega_T=axes[1] / HZ,
-        bandwidth_hz=field[0] / HZ if field is not None else empty,
-        peak=field[1] - limits[0] if field is not None else empty,
-        low=(field[2:] - limits[1:, None, None]).max(0) if field is not None else empty,
-        optimum=optimum,
-        source=source if known else NO_FIELD,
-        others=" or ".join(list(inner.bounds)[1:]),
-    )
+    named, empty = " or ".join(list(inner.bounds)[1:]), np.empty((0, 0))
+    omega_S, omega_T = (axis / HZ for axis in axes)
+    if field is None:
+        return SweepMap(rows, omega_S, omega_T, empty, empty, empty, optimum, NO_FIELD, named)
+    peak, low = field[1] - limits[0], (field[2:] - limits[1:, None, None]).max(0)
+    return SweepMap(rows, omega_S, omega_T, field[0] / HZ, peak, low, optimum, source, named)
 
 
 def _interpolated(rows: Array, low: Array, axes: list[Array]) -> Array | None:

@@ -22,9 +22,9 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.svg import CYCLE, GREY
+from ccd_casadi.drawing.svg import CYCLE, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box
-from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_words
+from ccd_casadi.reporting.facts import cost_axis, cost_words, theta_axes, theta_words
 from ccd_casadi.reporting.front_walk import front_walk
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import run_view
@@ -139,20 +139,15 @@ def _caption(front: Front) -> str:
 
 def _table(problem: CoDesignProblem, front: Front) -> Table:
     """One row a point."""
-    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
-    heads = (f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, shown, strict=True))
+    axes = theta_axes(problem)
     rows = tuple(
-        (
-            point.hardware_cost,
-            point.bandwidth / HZ,
-            point.predicted / HZ,
-            *(factor * v for (_, factor), v in zip(shown, point.theta, strict=True)),
-            ", ".join(point.active),
-            "efficient" if point.efficient else "",
-            "verified" if point.verified else point.reason,
-        )
+        (point.hardware_cost, point.bandwidth / HZ, point.predicted / HZ,
+         *(factor * v for (*_, factor), v in zip(axes, point.theta, strict=True)),
+         ", ".join(point.active), "efficient" if point.efficient else "",
+         "verified" if point.verified else point.reason)
         for point in front.points
-    )
+    )  # fmt: skip
+    heads = (axis_label(name, unit) for name, unit, _ in axes)
     head = ("f", "ω_b (Hz)", "predicted (Hz)", *heads, "what binds", "", "status")
     return Table(head, rows)
 
@@ -162,9 +157,8 @@ def table_responses(problem: CoDesignProblem, found: PostOptimal) -> Table:
     rows = []
     swept = any(item.ln_omega for item in found.responses)
     lower, upper = lifted_bounds(problem) if swept else box(problem)
-    units = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
-    shown = [factor for _, factor in units]
-    labels = [f"{n} ({u or '–'})" for n, (u, _) in zip(problem.names, units, strict=True)]
+    shown = [factor for *_, factor in theta_axes(problem)]
+    labels = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
     labels += ["ln ω_S", "ln ω_T"] if swept else []
     sizes = (upper - lower) * np.array([*shown, 1.0, 1.0] if swept else shown)
     for item in found.responses:
@@ -231,8 +225,8 @@ def rule_sentence(bandwidth_hz: float, natural_hz: Sequence[float]) -> str:
     ratio = first / bandwidth_hz
     low, high = RULE
     verdict = (
-        f"below the {low:g} to {high:g} that the rule of thumb asks for: the controller works "
-        "where the rule would not go, and its robustness to that resonance deserves a look"
+        f"below the {low:g} to {high:g} of the rule of thumb: check the robustness to that "
+        "resonance"
         if ratio < low
         else f"within the {low:g} to {high:g} of the rule of thumb"
         if ratio <= high

@@ -213,15 +213,10 @@ def tables_landscape(land: Landscape) -> tuple[Table, ...]:
     tables = []
     first, second = land.names
     if land.bandwidth_hz.size:
-        rows = range(0, len(land.first), TABLE_STEP)
-        columns = range(0, len(land.second), TABLE_STEP)
-        head = (
-            f"ω_b* in Hz; {first} ↓ {second} →",
-            *(number(float(land.second[j])) for j in columns),
-        )
-        body = tuple(
-            (float(land.first[i]), *(float(land.bandwidth_hz[i, j]) for j in columns)) for i in rows
-        )
-        tables.append(Table(head, body))
+        thinned = slice(0, None, TABLE_STEP)
+        heads = (number(float(value)) for value in land.second[thinned])
+        values = land.bandwidth_hz[thinned, thinned].T
+        head = (f"ω_b* in Hz; {first} ↓ {second} →", *heads)
+        tables.append(Table.of(head, land.first[thinned], *values))
     head = (axis_label(first, land.units[0]), axis_label(second, land.units[1]), "true ω_b* (Hz)")
-    return (*tables, Table(head, tuple(tuple(map(float, row)) for row in land.truths)))
+    return (*tables, Table.of(head, *land.truths.T))

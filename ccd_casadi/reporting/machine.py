@@ -1,4 +1,4 @@
-"""The machine as a picture: masses and springs, or its own drawing; and the shapes of its modes.
+"""The machine as a picture: masses and springs, or its modes; and the shapes of its modes to turn.
 
 Pictures are inline SVG of their own, without a script. Words in them take the page's colour.
 """
@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.drawing import svg
-from ccd_casadi.drawing.content import Picture, Table
+from ccd_casadi.drawing.content import Figure, Modes, Picture, Table
 from ccd_casadi.drawing.page import escape
+from ccd_casadi.drawing.pictures import ModeShapes
+from ccd_casadi.drawing.turntable import REACH
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
@@ -24,6 +26,7 @@ BLUE, GREEN, ORANGE = (
 SMALL = 1e-9  # share of the largest entry below which there is no spring
 MOST_NODES = 12
 SHOWN_MODES = 3
+SHOWN = 6  # of those to turn
 STEP, MIDDLE, ROW = 150.0, 78.0, 46.0  # between masses, height of their row, of a mode's row
 SIDE = 86.0  # of the reference mass's block
 
@@ -154,3 +157,43 @@ def modes_table(modal: ModalPlant) -> Table:
         zeta = "" if modal.rigid[i] else f"{100.0 * modal.D[i, i] / (2.0 * omega):.3g} %"
         rows.append((hz, zeta, f"{b[i] / b.max():.2g}", f"{c[i] / c.max():.2g}"))
     return Table(("mode", "damping", "driven", "measured"), tuple(rows))
+
+
+def mode_shape_figure(shapes: ModeShapes) -> Figure:
+    """The modes with their frequencies in Hz, to be turned."""
+    return Figure(Modes(shapes, turning=True), _caption(shapes), (table_modes(shapes),))
+
+
+def _caption(shapes: ModeShapes) -> str:
+    """Which modes are shown, what limits the loop first, and how to turn them."""
+    first, last = shapes.modes[0], shapes.modes[-1]
+    words = (
+        f"The first {last.numbers[-1]} flexible modes, {number(first.frequency)} to "
+        f"{number(last.frequency)} Hz"
+    )
+    words += f", seen from {shapes.view}" if shapes.view else ""
+    named = any(mode.words != first.words for mode in shapes.modes)
+    more = [f"the {first.words}"] if named else []
+    if len(shapes.modes) > 1:
+        factor = number(shapes.modes[1].frequency / first.frequency, 3)
+        more.append(f"a factor {factor} below the next")
+    words += f". The lowest is {', '.join(more)}" if more else ""
+    if any(len(mode.numbers) > 1 for mode in shapes.modes):
+        words += "; a pair has one frequency and two shapes, the other a quarter turn of this one"
+    return words + (
+        f". Displacements are exaggerated: the largest is drawn as {100 * REACH:.0f} % of the side."
+        " On screen, drag a picture or use the sliders to turn all of them."
+    )
+
+
+def table_modes(shapes: ModeShapes) -> Table:
+    """Every mode's frequency, largest displacement, and what else its plant says of it."""
+    head = ("mode", "shape", "frequency (Hz)", "largest displacement (1/√kg)")
+    rows = [
+        (
+            mode.places, mode.words, mode.frequency,
+            float(np.linalg.norm(mode.displacement, axis=1).max()), *mode.more.values(),
+        )
+        for mode in shapes.modes
+    ]  # fmt: skip
+    return Table((*head, *shapes.modes[0].more), tuple(rows))

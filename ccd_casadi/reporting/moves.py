@@ -1,7 +1,6 @@
-"""A move and a step of force of a design on every plant of its set."""
+"""A move and a step of force of a design on every plant of its set; a move on the machine."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,8 +8,9 @@ from ccd_casadi.analysis import loop_figures
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
-from ccd_casadi.drawing.svg import GREY
+from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table, Words
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
@@ -25,25 +25,16 @@ AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
+DRAWN = 1200  # points of a curve of a move on the machine
+COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 
 
-@dataclass(frozen=True)
-class MovePanels:
-    """Error of a move, without and with mass feedforward (the last one), its words and numbers."""
-
-    panels: tuple[Panel, ...]
-    caption: str
-    table: Table
-
-
-def move_panels(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    controller: StateSpace,
-    loops: Sequence[Loop],
-    bandwidth_hz: float,
-) -> MovePanels:
-    """The default move of `robustness` on the plants of `loops`, their rigid bodies free."""
+def move_parts(
+    problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
+    loops: Sequence[Loop], bandwidth_hz: float,
+) -> tuple[Lines, str, Table]:  # fmt: skip
+    """Error of the default move of `robustness` on the plants of `loops`, their rigid bodies free:
+    without and with mass feedforward (the last panel), its words and numbers."""
     profile = setpoint(LIMITS)
     modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
     ahead = mass_feedforward(modal, 0)
@@ -71,12 +62,8 @@ def move_panels(
         f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; for other moves "
         f"the options of robustness). {' '.join(words)}"
     )
-    return MovePanels(tuple(panels), caption, over_time(heads, *columns))
-
-
-def move_figure(found: MovePanels) -> Figure:
-    """What `move_panels` found."""
-    return Figure(Lines((found.panels,), "Error of a move", (3.2,)), found.caption, (found.table,))
+    lines = Lines((tuple(panels),), "Error of a move", (3.2,))
+    return lines, caption, over_time(heads, *columns)
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
@@ -123,4 +110,60 @@ def _words(name: str, made: Sequence[Move]) -> str:
     return (
         f"{name[0].upper()}{name[1:]}: error of at most {number(peak, 3)} µm, {settled}, "
         f"{number(force, 4)} N at most."
+    )
+
+
+def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
+    """Error and force over time in every way, a table, and how much force the move needs."""
+    shown = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
+    error, force = [], []
+    for way, colour in zip(found.ways, COLOURS, strict=False):
+        if way not in shown:
+            continue
+        m = way.move
+        at = np.unique(np.linspace(0, len(m.time) - 1, DRAWN).astype(int))
+        ms = 1e3 * m.time[at]
+        error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
+        force.append(Curve(ms, m.force[at, 0], "", colour))
+    end = Level(1e3 * found.profile.duration, "end of the setpoint", vertical=True)
+    lines = Lines(
+        ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
+         (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),
+        "A move of output 1, sampled with hold and delay", (3.0, 2.2),
+    )  # fmt: skip
+    head = ("way", "settled after, ms", "peak error, µm", "last error, µm", "peak force, N",
+            "at the limit")  # fmt: skip
+    rows = tuple(
+        (way.words, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.peak_error,
+         1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
+        for way in found.ways for m in (way.move,)
+    )  # fmt: skip
+    caption = (
+        "Settled: from the start until the error stays within "
+        f"{number(1e6 * found.window)} µm; last error: the largest over the last quarter of "
+        f"{number(1e3 * found.ways[0].move.time[-1])} ms, the amplitude of a limit cycle if there "
+        "is one. On the plant with its soft suspension, hold and delay exact (robustness lets the "
+        "rigid bodies go where that loop is stable)."
+    )
+    return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
+
+
+def _limit_words(found: OnHardware) -> str:
+    words = "" if found.forward is not None else "The plant holds no position: no feedforward. "
+    if len(found.ways) < 3:
+        return words + "Give --saturation to see the move with the force that there is."
+    if np.isnan(found.least_limit):
+        return words + (
+            "The unlimited move itself does not end in its window within the time watched: ask for "
+            "more stiffness at low frequencies (compliance_max, S_low), or widen the window."
+        )
+    peak = max(float(way.move.peak_force.max()) for way in found.ways[:2])
+    if found.least_limit == 1.0:
+        return (
+            words + "Of the limits tried none below the peak force lets the move end in its window."
+        )
+    return words + (
+        "With back-calculation the move ends in its window down to "
+        f"{100 * found.least_limit:.3g} % of the peak force, {number(found.least_limit * peak)} N "
+        "(tried in steps)."
     )

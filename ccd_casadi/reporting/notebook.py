@@ -18,11 +18,11 @@ from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import InnerResult
-from ccd_casadi.reporting.facts import theta_table
+from ccd_casadi.reporting.facts import theta_axes, theta_table
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.sections_page import conclusion_of, controller_blocks
 from ccd_casadi.reporting.verdict import run_head
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import Design, DesignFigures
 
@@ -72,8 +72,7 @@ def _(item: CoDesignProblem) -> str:
     inner, figure = item.inner, item.figure
     J = f"min {item.w1:g} f(θ) + ({item.w2:g}) {figure.symbol}"
     rows = []
-    for i, name in enumerate(item.names):
-        unit, factor = shown_unit(item.units[i], item.upper[i])
+    for i, (name, unit, factor) in enumerate(theta_axes(item)):
         numbers = (factor * value for value in (item.lower[i], item.upper[i], item.start[i]))
         rows.append((name, unit or "–", *numbers))
     facts = [

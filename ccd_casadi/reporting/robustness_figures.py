@@ -4,11 +4,10 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Band, Curve, Level, Lines, Panel, Table
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.loops import over_hz
 from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
-from ccd_casadi.robust.perturbed import Line
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
@@ -18,43 +17,39 @@ SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
 
 
-def gains(found: Study) -> Lines:
-    """S and T in one panel, GS and KS in one each."""
-    ends = (float(found.hz[0]), float(found.hz[-1]))
+def gains(found: Study, caption: str) -> Figure:
+    """S and T in one panel, GS and KS in one each; some frequencies, the peaks among them."""
+    hz, shown = found.hz, found.gains * np.array([[1.0], [1.0], [1e6], [1.0]])
+    ends = (float(hz[0]), float(hz[-1]))
 
     def panel(label: str, *curves: tuple[int, str]) -> Panel:
-        drawn = tuple(
-            Curve(found.hz, (1e6 if i == 2 else 1.0) * found.gains[i], name, CYCLE[k])
-            for k, (i, name) in enumerate(curves)
-        )
+        drawn = tuple(Curve(hz, shown[i], name, CYCLE[k]) for k, (i, name) in enumerate(curves))
         return over_hz(label, drawn, ends)
 
     rows = (
         (panel("σ_max (–)", (0, "S"), (1, "T")),),
         (panel("σ_max(GS) (µm/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))),
     )
-    return Lines(rows, "S, T, GS and KS over frequency")
+    special = hz[found.gains.argmax(axis=1)].tolist()
+    table = over_frequency(("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *shown, special=special)
+    return Figure(Lines(rows, "S, T, GS and KS over frequency"), caption, (table,))
 
 
-def gains_table(found: Study) -> Table:
-    """Some frequencies, the peaks among them."""
-    hz = found.hz
-    scale = np.array([[1.0], [1.0], [1e6], [1.0]])
-    return over_frequency(
-        ("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *scale * found.gains,
-        special=hz[found.gains.argmax(axis=1)].tolist(),
-    )  # fmt: skip
-
-
-def perturbed(run: FinishedRun, found: Study) -> Lines:
+def perturbed(run: FinishedRun, found: Study, caption: str) -> Figure:
     """Peak and bandwidth over the shift, and over the damping."""
     S_max = run.problem.inner.S_max
-    rows = []
-    for line, label, factor in (
-        (found.shift, "resonance shift (%)", 100.0),
-        (found.damping, "damping × (–)", 1.0),
+    rows, tables = [], []
+    for line, name, label, factor in (
+        (found.shift, "shift", "resonance shift (%)", 100.0),
+        (found.damping, "damping ×", "damping × (–)", 1.0),
     ):
-        x, peak, bandwidth = _columns(line)
+        judged = line.judged
+        x = np.array([item.place[0] for item in judged])
+        peak = np.array([item.peak if item.stable else np.nan for item in judged])
+        bandwidth = np.array([item.bandwidth / HZ for item in judged])
+        stable = ("yes" if item.stable else "NO" for item in judged)
+        peaks = (item.peak for item in judged)
+        tables.append(Table.of((name, "stable", "ω_b Hz", "‖S‖∞"), x, stable, bandwidth, peaks))
         # the axis shows what matters about S_max; a loop near instability has any peak
         top = min(float(np.nanmax(peak)) * 1.05, SHOWN_PEAK * S_max)
         limit = (Level(S_max, f"S_max {S_max:g}", colour=GREY),)
@@ -68,7 +63,8 @@ def perturbed(run: FinishedRun, found: Study) -> Lines:
                   y_range=span),
             Panel(label, "ω_b (Hz)", (faster,), x_range=ends),
         ))  # fmt: skip
-    return Lines(tuple(rows), "Peak of S and bandwidth off the model")
+    return Figure(Lines(tuple(rows), "Peak of S and bandwidth off the model"), caption,
+                  tuple(tables))  # fmt: skip
 
 
 def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -> tuple[Band, ...]:
@@ -82,15 +78,6 @@ def _unstable(x: Array, peak: Array, stable: Array, span: tuple[float, float]) -
     return tuple(found)
 
 
-def line_table(name: str, line: Line) -> Table:
-    """Every plant of a line."""
-    rows = tuple(
-        (item.place[0], "yes" if item.stable else "NO", item.bandwidth / HZ, item.peak)
-        for item in line.judged
-    )
-    return Table((name, "stable", "ω_b Hz", "‖S‖∞"), rows)
-
-
 def shown_peak(run: FinishedRun, found: Study) -> float:
     """The right end of the axis of peaks of the random plants."""
     S_max = run.problem.inner.S_max
@@ -98,8 +85,9 @@ def shown_peak(run: FinishedRun, found: Study) -> float:
     return float(min(1.02 * max(largest, S_max), SHOWN_PEAK * S_max))
 
 
-def tolerances(run: FinishedRun, found: Study) -> Lines:
-    """Empirical distributions of peak and bandwidth over the random plants."""
+def tolerances(run: FinishedRun, found: Study, caption: str) -> Figure:
+    """Distributions of peak and bandwidth over the random plants; in the table of quantiles the
+    unstable ones are infinite peaks."""
     judged = found.tolerances.judged
     peak = np.sort([item.peak for item in judged if item.stable])
     bandwidth = np.sort([item.bandwidth / HZ for item in judged if item.stable])
@@ -113,23 +101,19 @@ def tolerances(run: FinishedRun, found: Study) -> Lines:
         Panel("ω_b (Hz)", "share of the plants (–)", (Curve(bandwidth, share, colour=ORANGE),),
               y_range=(0.0, 1.08)),
     )  # fmt: skip
-    return Lines((panels,), "Peak and bandwidth of random hardware")
-
-
-def tolerance_table(found: Study) -> Table:
-    """Quantiles of the plants, the unstable ones counted as infinite peaks."""
-    judged = found.tolerances.judged
     peaks = np.sort([item.peak for item in judged])
     bands = np.sort([item.bandwidth / HZ if item.stable else 0.0 for item in judged])
-    rows = []
-    for share in (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0):
-        i = round(share * (len(judged) - 1))
-        rows.append((share, float(peaks[i]), float(bands[i])))
-    return Table(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), tuple(rows))
+    shares = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+    at = [round(share * (len(judged) - 1)) for share in shares]
+    table = Table.of(("share", "‖S‖∞", "ω_b Hz (0: unstable)"), shares, peaks[at], bands[at])
+    return Figure(Lines((panels,), "Peak and bandwidth of random hardware"), caption, (table,))
 
 
-def structured(bound: StructuredBound) -> Lines:
-    """1/μ is what is allowed of complex errors; the level is what is allowed of real ones."""
+def structured(bound: StructuredBound, caption: str) -> Figure:
+    """1/μ is what is allowed of complex errors; the level is what is allowed of real ones.
+
+    The table is of the surroundings of the highest peak.
+    """
     panel = Panel(
         "frequency (Hz)", "μ (–)", (Curve(bound.hz, bound.mu, "complex errors", BLUE),),
         levels=(
@@ -138,14 +122,9 @@ def structured(bound: StructuredBound) -> Lines:
         log_x=True, log_y=True,
         y_range=(1e-2, 3.0 * max(float(bound.mu.max()), 1.0 / bound.stiffness)),
     )  # fmt: skip
-    return Lines(((panel,),), "Structured singular value")
-
-
-def structured_table(bound: StructuredBound) -> Table:
-    """The surroundings of the highest peak."""
     best = np.sort(np.argsort(-bound.mu)[:ROWS])
-    rows = tuple((float(bound.hz[i]), float(bound.mu[i])) for i in best)
-    return Table(("Hz", "μ, complex errors"), rows)
+    table = Table.of(("Hz", "μ, complex errors"), bound.hz[best], bound.mu[best])
+    return Figure(Lines(((panel,),), "Structured singular value"), caption, (table,))
 
 
 def shown_until(found: Move) -> float:
@@ -153,7 +132,7 @@ def shown_until(found: Move) -> float:
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
 
 
-def move(found: Move) -> Lines:
+def move(found: Move, caption: str) -> Figure:
     """Setpoint, error and forces over time, the first part of the tail included."""
     shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
@@ -176,24 +155,10 @@ def move(found: Move) -> Lines:
         (Panel("time (ms)", f"error ({unit})", (error,), levels=(end, *near)),
          Panel("time (ms)", "force (N)", forces)),
     )  # fmt: skip
-    return Lines(rows, "Position, acceleration, error and force of a move")
-
-
-def move_table(found: Move) -> Table:
-    """Some instants."""
-    n = int(np.count_nonzero(found.time <= 2.0 * found.duration))
-    unit, scale = shown_unit("m", found.peak_error)
-    head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *_names(found.force))
+    names = [f"u{j + 1} N" for j in range(found.force.shape[1])]
+    head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *names)
     columns = (1e3 * found.time, 1e3 * found.position, found.acceleration, scale * found.error)
-    return over_time(head, *(column[:n] for column in (*columns, *found.force.T)))
-
-
-def _names(force: Array) -> list[str]:
-    return [f"u{j + 1} N" for j in range(force.shape[1])]
-
-
-def _columns(line: Line) -> tuple[Array, Array, Array]:
-    place = np.array([item.place[0] for item in line.judged])
-    peak = np.array([item.peak if item.stable else np.nan for item in line.judged])
-    bandwidth = np.array([item.bandwidth / HZ for item in line.judged])
-    return place, peak, bandwidth
+    n = int(np.count_nonzero(found.time <= 2.0 * found.duration))
+    table = over_time(head, *(column[:n] for column in (*columns, *found.force.T)))
+    lines = Lines(rows, "Position, acceleration, error and force of a move")
+    return Figure(lines, caption, (table,))

@@ -4,7 +4,7 @@ import numpy as np
 
 from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.drawing.content import Facts, Figure, Heading, Page, Section, Table, Words
+from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.verdict import head_of
@@ -49,9 +49,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         + _damping(found.damping, found.demands.damping)
         + f" Shift and damping together: worst at {100 * found.box.place[0]:+.2f} % and damping × "
         f"{found.box.place[1]:.3g}, {_outcome(found.box)}.",
-        f"Hardware within ±{100 * hard.tolerance:g} %: {sum(not j.stable for j in hard.judged)} of "
-        f"{len(hard.judged)} random plants unstable, "
-        f"{sum(j.stable and j.peak > S_max for j in hard.judged)} others above S_max; "
+        f"Hardware within ±{100 * hard.tolerance:g} %: {hard.unstable} of {len(hard.judged)} "
+        f"random plants unstable, {hard.above(S_max)} others above S_max; "
         f"{hard.within(S_max).words}. Worst found: {_outcome(hard.worst)}.",
     ]
     words += _bandwidth_lost(run, found)
@@ -103,16 +102,14 @@ def _bandwidth_lost(run: FinishedRun, found: Study) -> list[str]:
 
 def _moved(found: Study, i: int) -> str:
     move = found.moves[i]
-    way = "with mass feedforward" if move.feedforward else "without feedforward"
-    way += f", {'its rigid bodies free' if found.moves[0].free else 'on its soft suspension'}"
     settled = (
         f"settles {shown(move.settling, 's')} after its end"
         if np.isfinite(move.settling)
         else "does not settle while it is watched"
     )
     return (
-        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms {way}: "
-        f"{settled} (±{metres(move.window)}), RMS error {metres(move.rms_error)}, "
+        f"Move of {metres(found.demands.limits.stroke)} in {1e3 * move.duration:.4g} ms "
+        f"{move.words}: {settled} (±{metres(move.window)}), RMS error {metres(move.rms_error)}, "
         f"peak {metres(move.peak_error)}, peak force {max(move.peak_force):.4g} N."
     )
 
@@ -179,34 +176,25 @@ def _margins(found: Study) -> Section:
 def _gains(run: FinishedRun, found: Study) -> Section:
     names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
     tops = [
-        (name, number(factor * peak), _place(omega))
-        for name, (peak, omega), factor in zip(
-            names, found.peaks, (1.0, 1.0, 1e6, 1.0), strict=True
-        )
+        (name, number((1e6 if "µm" in name else 1.0) * peak), _place(omega))
+        for name, (peak, omega) in zip(names, found.peaks, strict=True)
     ]
     n, d = found.noise, found.demands
     # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
     share = 1e-9 if d.sensor == 1.0 else 1.0
     sensor = f"{1e9 * share * d.sensor:.4g} nm/√Hz"
-    rms = (
-        []
-        if n is None
-        else [
-            ("position by sensor noise", 1e9 * share * n.position_by_noise, f"nm RMS for {sensor}"),
-            ("force by sensor noise", share * n.force_by_noise, f"N RMS for {sensor}"),
-            (
-                "position by force noise",
-                1e6 * n.position_by_disturbance,
-                f"µm RMS for {d.disturbance:g} N/√Hz",
-            ),
-            ("force by force noise", n.force_by_disturbance, f"N RMS for {d.disturbance:g} N/√Hz"),
-        ]
-    )
+    force = f"{d.disturbance:g} N/√Hz"
+    rms = () if n is None else (
+        ("position by sensor noise", 1e9 * share * n.position_by_noise, f"nm RMS for {sensor}"),
+        ("force by sensor noise", share * n.force_by_noise, f"N RMS for {sensor}"),
+        ("position by force noise", 1e6 * n.position_by_disturbance, f"µm RMS for {force}"),
+        ("force by force noise", n.force_by_disturbance, f"N RMS for {force}"),
+    )  # fmt: skip
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
-    drawn = Figure(
-        figures.gains(found), "Sensitivity, complementary sensitivity, position by a force at the "
-        "actuators (GS), and force by sensor noise (KS).", (figures.gains_table(found),),
+    drawn = figures.gains(
+        found, "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), "
+        "and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
     body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
@@ -219,9 +207,7 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
         "multiplied. The controller stays. A gap in a curve is an unstable loop; where a curve "
         f"leaves at the top, the peak exceeds {figures.SHOWN_PEAK:g} S_max."
     )
-    tables = (figures.line_table("shift", found.shift),
-              figures.line_table("damping ×", found.damping))  # fmt: skip
-    drawn = Figure(figures.perturbed(run, found), caption, tables)
+    drawn = figures.perturbed(run, found, caption)
     rows = tuple(
         (number(item.place[0], 5), 100.0 * item.place[1], "yes" if item.stable else "NO",
          item.bandwidth / HZ, item.peak) for item in found.modes
@@ -234,18 +220,16 @@ def _perturbed(run: FinishedRun, found: Study) -> Section:
 def _tolerances(run: FinishedRun, found: Study) -> Section:
     hard, shown = found.tolerances, figures.shown_peak(run, found)
     count = len(hard.judged)
-    lost = sum(not item.stable for item in hard.judged)
-    beyond = sum(item.stable and item.peak > shown for item in hard.judged)
+    lost, beyond = hard.unstable, hard.above(shown)
     caption = (
         f"{count} plants with every hardware parameter uniformly within "
         f"±{100 * hard.tolerance:g} % of its value: the share of them below a peak of S, and below "
         f"a bandwidth. {lost} are unstable: both curves end at {number(1.0 - lost / count, 3)}."
-        + (
-            f" {beyond} more are stable and lie right of the axis, above a peak of {shown:.4g}."
-            if beyond
-            else ""
-        )
     )
+    if beyond:
+        caption += (
+            f" {beyond} more are stable and lie right of the axis, above a peak of {shown:.4g}."
+        )
     theta = theta_words({
         "theta": dict(zip(run.problem.names, hard.worst.place, strict=True)),
         "units": dict(zip(run.problem.names, run.problem.units, strict=True)),
@@ -253,7 +237,7 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
     words = (
         f"Worst found, by a local search from the worst of them: {theta}: {_outcome(hard.worst)}."
     )
-    drawn = Figure(figures.tolerances(run, found), caption, (figures.tolerance_table(found),))
+    drawn = figures.tolerances(run, found, caption)
     return Section("Hardware tolerances", (drawn, Words(words)))
 
 
@@ -270,8 +254,7 @@ def _structured(found: Study) -> list[Section]:
         "for |δ_i| < 1/μ. Real errors are allowed to be larger: up to the inverse of the level "
         f"shown, {bound.stiffness:.4g}."
     )
-    drawn = Figure(figures.structured(bound), caption, (figures.structured_table(bound),))
-    return [Section("Structured singular value", (drawn,))]
+    return [Section("Structured singular value", (figures.structured(bound, caption),))]
 
 
 def _move(found: Study) -> Section:
@@ -281,8 +264,7 @@ def _move(found: Study) -> Section:
         else "on its soft suspension, without which the loop is not stable"
     )
     moves = [
-        Figure(figures.move(move), f"{_moved(found, i)}{_cut(move)}", (figures.move_table(move),))
-        for i, move in enumerate(found.moves)
+        figures.move(move, f"{_moved(found, i)}{_cut(move)}") for i, move in enumerate(found.moves)
     ]
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "

@@ -52,8 +52,8 @@ def bandwidths_table(verified: VerifiedSections) -> Table:
     sampling, plants = sections_of_problem(problem).sampling, design.certificate.plants
     as_run = "continuous" if sampling is None else f"as sampled at {number(sampling.rate_hz)} Hz"
     least = f"the least of {counted(len(plants), 'plant')} of the set, which J counts"
-    rows = [(least, as_run, design.certificate.bandwidth), ("the model", as_run,
-                                                            plants[0].crossing)]  # fmt: skip
+    rows = [(least, as_run, design.certificate.bandwidth),
+            ("the model", as_run, plants[0].crossing)]  # fmt: skip
     if sampling is not None:
         found = measure(
             scaled_plant(problem, verified.theta), design.controller, problem.weights,
@@ -182,16 +182,12 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     """Gain and sections in Hz and damping; of `result` only `controller` is read."""
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
-    gains = (
-        f"Gain {number(controller['gain'], 6)} N/m"
-        if "gain" in controller
-        else ", ".join(
-            f"{channel['name']}: gain {number(channel['gain'], 6)} N/m"
-            for channel in controller["channels"]
-        )
-    )
+    channels = controller.get("channels", ())
+    gains = [f"{own['name']}: gain {number(own['gain'], 6)} N/m" for own in channels]
+    if "gain" in controller:
+        gains = [f"Gain {number(controller['gain'], 6)} N/m"]
     words = (
-        f"{gains}, order {controller['order']}, stable but for "
+        f"{', '.join(gains)}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."
     )
     return Words(words), sections_table(found)

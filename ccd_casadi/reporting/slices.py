@@ -7,10 +7,11 @@ import numpy as np
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import GREEN, GREY, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.landscape import predicted
 from ccd_casadi.reporting.true_samples import Truths, feasible
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, number
 from surrogates import GaussianProcess
 
 SLICE = 61
@@ -48,7 +49,7 @@ def slices_data(
         known = np.array([s.theta for s in inside]).reshape(-1, len(lower))
         values = np.array([s.bandwidth / HZ for s in inside])
     found = []
-    for k, name in enumerate(problem.names):
+    for k, (name, unit, factor) in enumerate(theta_axes(problem)):
         axis = np.linspace(lower[k], upper[k], SLICE)
         points = np.tile(np.array(theta), (SLICE, 1))
         points[:, k] = axis
@@ -59,7 +60,6 @@ def slices_data(
         away = np.abs((known - np.array(theta)) / (upper - lower))
         away[:, k] = 0.0
         near = (away.max(axis=1) <= NEARBY) & np.isfinite(values)
-        unit, factor = shown_unit(problem.units[k], upper[k])
         dots = np.column_stack([factor * known[near, k], values[near]])
         at = factor * float(theta[k])
         found.append(Slice(name, unit, factor * axis, bandwidth, deviation, dots, at))
@@ -139,5 +139,5 @@ def _tables(slices: list[Slice]) -> tuple[Table, ...]:
         if np.isfinite(s.bandwidth_hz).any():
             head = (axis_label(s.name, s.unit), "ω_b* (Hz)", "± 95 % (Hz)")
             columns = np.array([s.theta, s.bandwidth_hz, 1.96 * s.deviation_hz])[:, ::TABLE_STEP]
-        found.append(Table(head, tuple(tuple(map(float, row)) for row in columns.T)))
+        found.append(Table.of(head, *columns))
     return tuple(found)

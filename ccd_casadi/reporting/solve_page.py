@@ -1,6 +1,7 @@
 """The run report: `report.html` about a finished run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import cache, partial
@@ -23,8 +24,8 @@ from ccd_casadi.drawing.content import (
     Figure,
     Head,
     Heading,
+    Lines,
     Page,
-    Picture,
     Section,
     Source,
     Table,
@@ -38,7 +39,7 @@ from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_data, history_figure
+from ccd_casadi.reporting.history import history_figure
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.inner_sweep import sweep_data, sweep_figure
 from ccd_casadi.reporting.landscape import (
@@ -49,8 +50,8 @@ from ccd_casadi.reporting.landscape import (
 )
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
-from ccd_casadi.reporting.mode_shapes import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import MovePanels, force_step, move_figure, move_panels
+from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
+from ccd_casadi.reporting.moves import force_step, move_parts
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
@@ -79,12 +80,7 @@ Part = Callable[[], list[Section]]
 
 
 def write_report(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    solution: "Solution",
-    *,
-    quiet: bool = True,
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
 ) -> Path:
     """Write `folder`/report.html, atomically; reads the folder's samples.sqlite."""
     path = folder / "report.html"
@@ -93,12 +89,7 @@ def write_report(
 
 
 def solve_page(
-    folder: Path,
-    case: Case,
-    problem: CoDesignProblem,
-    solution: "Solution",
-    *,
-    quiet: bool = True,
+    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution", *, quiet: bool = True
 ) -> Page:
     """What the report shows; the bar counts its sections."""
     parts = _parts(folder, case, problem, solution)
@@ -114,7 +105,10 @@ def page_of_run(run: FinishedRun) -> Page:
     """The report of a run that kept none, as far as its folder holds it: the design by itself."""
     view = cache(partial(run_view, run))
     parts = design_parts(run.problem, run.problem, run.theta, run.controller, view, run.result)
-    sections = [section for name in ORDER if name in parts for section in parts[name]()]
+    sections = []
+    for name in (name for name in ORDER if name in parts):
+        with suppress(KeyError):  # a result.json of an earlier version knows less
+            sections += parts[name]()
     words = (
         "Drawn from case.toml, controller.json and result.json alone: how the design was found was "
         "not kept."
@@ -170,13 +164,17 @@ def design_parts(
     loops = cache(lambda: design_loops(own, theta, K))
 
     @cache
-    def move() -> MovePanels:
-        return move_panels(own, theta, K, loops(), view().bandwidth_hz)
+    def move() -> tuple[Lines, str, Table]:
+        return move_parts(own, theta, K, loops(), view().bandwidth_hz)
+
+    def move_section() -> list[Section]:
+        lines, caption, table = move()
+        return [Section("A move", (Figure(lines, caption, (table,)),))]
 
     parts: dict[str, Part] = {
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
-        "move": lambda: [Section("A move", (move_figure(move()),))],
+        "move": move_section,
         "force": lambda: [
             Section("A step of force", (force_step(loops(), view().bandwidth_hz),))
         ],
@@ -241,9 +239,7 @@ def stage_sections(
     """The plant's drawing and its mode shapes at the last of `thetas`, where it has them."""
     plant, found = plant_of(problem), []
     if plant.drawing is not None and thetas:
-        drawn = plant.drawing(thetas)
-        figure = Figure(Picture(drawn.svg), drawn.caption, (Table(drawn.head, drawn.rows),))
-        found.append(Section("The stage, before and after", (figure,)))
+        found.append(Section("The stage, before and after", (plant.drawing(thetas),)))
     if plant.shapes is not None and thetas:
         name, theta = list(thetas.items())[-1]
         figure = mode_shape_figure(plant.shapes(theta, SHOWN))
@@ -274,16 +270,10 @@ def _history(
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
         return Section(heading, (Words(words),))
-    history = history_data(
-        outcome.iterates,
-        theta=verified.theta,
-        predicted_hz=result["surrogate_bandwidth_hz"],
-        true_hz=result["bandwidth_hz"],
-        objective=result["objective"],
-        w2=problem.w2,
-        tolerance=case.outer.tolerance,
-    )
-    figure = history_figure(history, problem.names, lifted=len(outcome.surrogates) > 1)
+    figure = history_figure(
+        outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
+        lifted=len(outcome.surrogates) > 1,
+    )  # fmt: skip
     return Section(heading, (figure,))
 
 

@@ -5,15 +5,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import LoopView
+from ccd_casadi.analysis.loop_view import LoopView, frequency_and_damping
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Section, Table, Words
 from ccd_casadi.drawing.svg import BLUE, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant, true_inner
 from ccd_casadi.lti.closed_loop import largest
 from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
-from ccd_casadi.support.units import HZ, number, shown_unit
+from ccd_casadi.support.units import HZ, number
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
 if TYPE_CHECKING:
@@ -26,22 +27,18 @@ HEIGHTS = (3.0, 3.0)  # inches
 
 @dataclass(frozen=True)
 class _Side:
-    """One θ: name, colour, f, the loop over frequency, its poles in 1/s."""
+    """One θ: its name and colour, f, the loop over frequency."""
 
     name: str
     colour: str
     theta: tuple[float, ...]
     cost: float
     loop: LoopView
-    poles: np.ndarray
-
-    def objective(self, problem: CoDesignProblem) -> float:
-        return problem.w1 * self.cost + problem.w2 * HZ * self.loop.bandwidth_hz
 
     @property
-    def resonance(self) -> float:
-        """The first flexible one in Hz; NaN where there is none."""
-        return min(self.loop.resonances_hz, default=np.nan)
+    def roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """|p| in Hz and -Re p/|p| of the loop's poles, a conjugate pair once, in rising order."""
+        return frequency_and_damping(self.loop.loop.poles / HZ)
 
 
 def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[Section]:
@@ -65,8 +62,10 @@ def start_section(problem: CoDesignProblem, verified: "VerifiedDesign") -> list[
         _side(problem, "start", ORANGE, problem.start, made),
         _side(problem, "optimum", BLUE, verified.theta, verified.design),
     )
-    rows = ((_gains(problem, sides),), (_plants(sides), _pole_map(sides)))
-    figure = Figure(Lines(rows, HEADING, HEIGHTS), _caption(sides), (_poles_table(sides),))
+    lines = Lines(_panels(problem, sides), HEADING, HEIGHTS)
+    poles = [(s.name, float(hz), float(z)) for s in sides for hz, z in zip(*s.roots, strict=True)]
+    table = Table(("loop", "Hz", "damping ratio"), tuple(poles))
+    figure = Figure(lines, _caption(sides), (table,))
     return [Section(HEADING, (figure, _table(problem, sides)))]
 
 
@@ -79,74 +78,50 @@ def _side(
         gamma=f.gamma, bandwidth_hz=f.bandwidth / HZ, label=name,
     )  # fmt: skip
     cost = hardware_cost(plant_of(problem), theta)
-    return _Side(name, colour, theta, cost, loop, loop.loop.poles)
+    return _Side(name, colour, theta, cost, loop)
 
 
-def _gains(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Panel:
-    curves = tuple(Curve(s.loop.hz, s.loop.gains[0], s.name, s.colour) for s in sides)
+def _panels(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> tuple[tuple[Panel, ...], ...]:
+    """S over the plants and the poles of the loops."""
+    ends = sides[0].loop.ends
+    S = [Curve(s.loop.hz, s.loop.gains[0], s.name, s.colour) for s in sides]
+    G = [Curve(s.loop.hz, largest(s.loop.plant), s.name, s.colour) for s in sides]
+    poles = tuple(Curve(*s.roots, s.name, s.colour, line="", marker="x") for s in sides)
     at = [bandwidth_level(s.loop.bandwidth_hz, s.colour) for s in sides]
-    return sensitivity_panel(curves, sides[0].loop.ends, problem.inner.S_max, at)
-
-
-def _plants(sides: tuple[_Side, ...]) -> Panel:
-    curves = [Curve(s.loop.hz, largest(s.loop.plant), s.name, s.colour) for s in sides]
-    return over_hz("σ_max(G) (m/N)", curves, sides[0].loop.ends)
-
-
-def _pole_map(sides: tuple[_Side, ...]) -> Panel:
-    curves = tuple(
-        Curve(hz, zeta, s.name, s.colour, line="", marker="x")
-        for s in sides
-        for hz, zeta in [_frequency_and_damping(s.poles)]
+    pole_map = Panel(
+        "|pole| (Hz)", "damping ratio of the loop's poles (–)", poles, log_x=True, legend=None,
+        levels=(Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
+    )  # fmt: skip
+    return (
+        (sensitivity_panel(S, ends, problem.inner.S_max, at),),
+        (over_hz("σ_max(G) (m/N)", G, ends), pole_map),
     )
-    return Panel("|pole| (Hz)", "damping ratio of the loop's poles (–)", curves,
-                 levels=(Level(0.0, "unstable below", colour=GREY),), log_x=True,
-                 y_range=(-0.1, 1.1), legend=None)  # fmt: skip
-
-
-def _frequency_and_damping(poles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """|p| in Hz and -Re p/|p|, a conjugate pair once, in rising order."""
-    upper = poles[poles.imag >= 0.0]
-    upper = upper[np.argsort(np.abs(upper))]
-    size = np.abs(upper)
-    return size / HZ, -upper.real / np.maximum(size, np.finfo(float).tiny)
 
 
 def _caption(sides: tuple[_Side, ...]) -> str:
     start, end = sides
+    least = [number(float(side.roots[1].min()), 2) for side in sides]
     gained = 100.0 * (end.loop.bandwidth_hz / start.loop.bandwidth_hz - 1.0)
     cost = 100.0 * (end.cost / start.cost - 1.0) if start.cost else np.nan
     spared = f", f changes by {cost:+.3g} %" if np.isfinite(cost) else ""
     return (
         f"Each hardware with its own best controller. From the start to the optimum the bandwidth "
         f"changes by {gained:+.3g} %{spared}. Poles of the closed loops by size and damping "
-        f"ratio; the least damped one has {number(_least(start), 2)} at the start and "
-        f"{number(_least(end), 2)} at the optimum."
+        f"ratio; the least damped one has {least[0]} at the start and "
+        f"{least[1]} at the optimum."
     )
 
 
-def _least(side: _Side) -> float:
-    return float(_frequency_and_damping(side.poles)[1].min())
-
-
 def _table(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> Table:
-    rows = []
-    for i, name in enumerate(problem.names):
-        unit, factor = shown_unit(problem.units[i], problem.upper[i])
-        rows.append((name, unit or "–", *(factor * s.theta[i] for s in sides)))
+    rows = [
+        (name, unit or "–", *(factor * s.theta[i] for s in sides))
+        for i, (name, unit, factor) in enumerate(theta_axes(problem))
+    ]
+    J = (problem.w1 * s.cost + problem.w2 * HZ * s.loop.bandwidth_hz for s in sides)
     rows += [
         ("hardware cost f", problem.cost_unit or "–", *(s.cost for s in sides)),
-        ("first resonance", "Hz", *(s.resonance for s in sides)),
+        ("first resonance", "Hz", *(min(s.loop.resonances_hz, default=np.nan) for s in sides)),
         ("bandwidth ω_b", "Hz", *(s.loop.bandwidth_hz for s in sides)),
-        ("objective J", "–", *(s.objective(problem) for s in sides)),
+        ("objective J", "–", *J),
     ]
     return Table(("", "unit", "start", "optimum"), tuple(rows))
-
-
-def _poles_table(sides: tuple[_Side, ...]) -> Table:
-    rows = [
-        (s.name, float(hz), float(zeta))
-        for s in sides
-        for hz, zeta in zip(*_frequency_and_damping(s.poles), strict=True)
-    ]
-    return Table(("loop", "Hz", "damping ratio"), tuple(rows))

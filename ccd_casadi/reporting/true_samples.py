@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.sampling.keys import problem_hash, sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.store import SampleStore
 
 NEAR = 1e-6  # share of the box within which a design counts as one at θ

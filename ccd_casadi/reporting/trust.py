@@ -10,13 +10,8 @@ from ccd_casadi.support.units import number
 from surrogates import Quality
 from surrogates.gaussian_process import TWO_SIDED_95
 
-WORDS = {
-    "bandwidth": "bandwidth ω_b",
-    "sensitivity_peak": "peak of S",
-    "sensitivity_low": "|S| at ω_low",
-    "compliance": "compliance |GS|",
-    "rms_error": "RMS error",
-}
+WORDS = {"bandwidth": "bandwidth ω_b", "sensitivity_peak": "peak of S", "rms_error": "RMS error",
+         "sensitivity_low": "|S| at ω_low", "compliance": "compliance |GS|"}  # fmt: skip
 AXES = {"bandwidth": "Hz", "sensitivity_peak": "–", "sensitivity_low": "–", "compliance": "m/N",
         "rms_error": "nm"}  # fmt: skip
 LEAST_BAND = 3.0  # standardised residuals shown at least, either way
@@ -35,17 +30,13 @@ def _predicted(q: Quality) -> Panel:
     margin = 0.04 * float(np.ptp(both)) or 1.0
     span = (float(both.min()) - margin, float(both.max()) + margin)
     ends = np.array(span)
-    return Panel(
-        f"true ({AXES[q.name]})",
-        f"predicted ({AXES[q.name]})",
-        (
-            Curve(ends, ends, "", GREY, "--", width=0.8),
-            Curve(q.true, q.predicted, "", BLUE, "", "o"),
-        ),
-        x_range=span,
-        y_range=span,
-        title=WORDS[q.name],
+    curves = (
+        Curve(ends, ends, "", GREY, "--", width=0.8),
+        Curve(q.true, q.predicted, "", BLUE, "", "o"),
     )
+    unit = AXES[q.name]
+    return Panel(f"true ({unit})", f"predicted ({unit})", curves, x_range=span, y_range=span,
+                 title=WORDS[q.name])  # fmt: skip
 
 
 def _residuals(q: Quality) -> Panel:
@@ -77,36 +68,24 @@ def _caption(qualities: Sequence[Quality]) -> str:
 
 def table_trust(qualities: Sequence[Quality]) -> Table:
     """Errors left out, calibration, kinks and support at the design, output by output."""
-    return Table(
-        (
-            "output", "samples", "leave one out, rms", "largest", "k-fold, rms", "Q²",
-            "in 95 % bands", "samples look", "at the design",
-        ),
-        tuple(
-            (
-                WORDS[q.name], len(q.true),
-                *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max, q.kfold.rms)),
-                number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look,
-                q.at_design,
-            )
-            for q in qualities
-        ),
+    head = (
+        "output", "samples", "leave one out, rms", "largest", "k-fold, rms", "Q²",
+        "in 95 % bands", "samples look", "at the design",
     )  # fmt: skip
+    rows = tuple(
+        (WORDS[q.name], len(q.true),
+         *(f"{number(e, 3)} {q.unit}" for e in (q.loo.rms, q.loo.max, q.kfold.rms)),
+         number(q.loo.q2), f"{100 * q.coverage:.0f} %", q.samples_look, q.at_design)
+        for q in qualities
+    )  # fmt: skip
+    return Table(head, rows)
 
 
 def _data(qualities: Sequence[Quality]) -> tuple[Table, ...]:
     """The numbers behind the figure."""
+    unit = {q.name: AXES[q.name] for q in qualities}
     return tuple(
-        Table(
-            (
-                f"{WORDS[q.name]}, true ({AXES[q.name]})",
-                f"predicted ({AXES[q.name]})",
-                "residual / deviation",
-            ),
-            tuple(
-                tuple(map(float, row))
-                for row in zip(q.true, q.predicted, q.standardised, strict=True)
-            ),
-        )
+        Table.of((f"{WORDS[q.name]}, true ({unit[q.name]})", f"predicted ({unit[q.name]})",
+                  "residual / deviation"), q.true, q.predicted, q.standardised)
         for q in qualities
-    )
+    )  # fmt: skip

@@ -41,6 +41,15 @@ class Tolerances:
     worst: Judged
     difference: float | None = None
 
+    @property
+    def unstable(self) -> int:
+        """How many of the random plants are."""
+        return sum(not item.stable for item in self.judged)
+
+    def above(self, peak: float) -> int:
+        """How many of the stable ones have a larger peak of S."""
+        return sum(item.stable and item.peak > peak for item in self.judged)
+
     def within(self, S_max: float) -> Yield:
         """How many of the random plants are stable with a peak of S up to S_max."""
         return Yield(sum(one.stable and one.peak <= S_max for one in self.judged), len(self.judged))

@@ -9,7 +9,7 @@ from ccd_casadi.analysis.loop_view import loop_view
 from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.later_lines import at_solve
+from ccd_casadi.codesign.result import at_solve
 from ccd_casadi.codesign.verdict import Line as VerdictLine
 from ccd_casadi.codesign.verdict import State
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -30,9 +30,9 @@ from ccd_casadi.robust.perturbed import (
 from ccd_casadi.robust.signals import Noise, gains, highest, noise, norms
 from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.statics import Statics, statics
 
 NYQUIST = 0.999  # of half the sampling rate: where a grid ends
@@ -169,74 +169,57 @@ def loop_of(run: FinishedRun) -> Loop:
 
 def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
     """robustness.json: SI, and Hz where the name says so; shifts and tolerances are relative."""
-    bound, hard = found.structured, found.tolerances
+    bound, hard, d = found.structured, found.tolerances, found.demands
     peaks = [item.peak for item in hard.judged if item.stable]
-    names, d = run.problem.names, found.demands
-    limits = vars(d.limits) | {"window": d.window, "axis": d.axis + 1}
+    quantiles = np.quantile(peaks, [0.5, 0.95, 1.0]) if peaks else ()
+    margins, at, S_max = found.margins, found.statics, run.problem.inner.S_max
+    noise = None if found.noise is None else {
+        "sensor_density": d.sensor, "force_density": d.disturbance,
+        **{f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
+    }  # fmt: skip
+    structured = None if bound is None else {
+        "modes": bound.modes, "mu": 1.0 / bound.stiffness, "mu_complex": float(bound.mu.max()),
+        "hz": bound.worst_hz, "stiffness": bound.stiffness, "shift": bound.shift,
+    }  # fmt: skip
     return {
         "survives": found.survives,
-        "S_max": run.problem.inner.S_max,
+        "S_max": S_max,
         "bandwidth_hz": run.figures.bandwidth / HZ,
         "sensitivity_peak": run.figures.sensitivity_peak,
         "margins": {
-            "loops": [
-                {key: value for key, value in vars(item).items() if key != "disk"}
-                | {"disk": _disk(item.disk)}
-                for item in found.margins.loops
-            ],
-            "all_outputs": _disk(found.margins.outputs),
-            "all_inputs": _disk(found.margins.inputs),
+            "loops": [vars(item) | {"disk": _disk(item.disk)} for item in margins.loops],
+            "all_outputs": _disk(margins.outputs),
+            "all_inputs": _disk(margins.inputs),
         },
         "gains": {
             name: {"peak": peak, "peak_hz": omega / HZ}
             for name, (peak, omega) in zip(("S", "T", "GS", "KS"), found.peaks, strict=True)
         },
-        "static_stiffness": found.statics.stiffness,
-        "static_compliance": found.statics.compliance,
-        "static_share": found.statics.share,
+        "static_stiffness": at.stiffness,
+        "static_compliance": at.compliance,
+        "static_share": at.share,
         "period": None if run.sampled is None else run.sampled.period,
-        "noise": None
-        if found.noise is None
-        else {"sensor_density": d.sensor, "force_density": d.disturbance}
-        | {f"rms_{key}": value.tolist() for key, value in vars(found.noise).items()},
+        "noise": noise,
         "resonance_shift": _line(found.shift, "shift"),
         "damping": _line(found.damping, "factor"),
-        "single_modes": [
-            {"hz": item.place[0], "shift": item.place[1]} | _judged(item) for item in found.modes
-        ],
-        "worst_shift_and_damping": {"shift": found.box.place[0], "damping": found.box.place[1]}
-        | _judged(found.box),
+        "single_modes": [_judged(item, "hz", "shift") for item in found.modes],
+        "worst_shift_and_damping": _judged(found.box, "shift", "damping"),
         "tolerances": {
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
             "no_plant": hard.failed,
             "reduced_model_difference": hard.difference,
-            "unstable": sum(not item.stable for item in hard.judged),
-            "stable_above_S_max": sum(
-                item.stable and item.peak > run.problem.inner.S_max for item in hard.judged
-            ),
-            "yield": hard.within(run.problem.inner.S_max).entry,
-            "peak_quantiles": dict(
-                zip(("50", "95", "100"), np.quantile(peaks, [0.5, 0.95, 1.0]), strict=True)
-            )
-            if peaks
-            else {},
-            "worst": {"theta": dict(zip(names, hard.worst.place, strict=True))}
+            "unstable": hard.unstable,
+            "stable_above_S_max": hard.above(S_max),
+            "yield": hard.within(S_max).entry,
+            "peak_quantiles": dict(zip(("50", "95", "100"), quantiles, strict=False)),
+            "worst": {"theta": dict(zip(run.problem.names, hard.worst.place, strict=True))}
             | _judged(hard.worst),
         },
-        "structured": None
-        if bound is None
-        else {
-            "modes": bound.modes,
-            "mu": 1.0 / bound.stiffness,
-            "mu_complex": float(bound.mu.max()),
-            "hz": bound.worst_hz,
-            "stiffness": bound.stiffness,
-            "shift": bound.shift,
-        },
+        "structured": structured,
         "structured_not_computed_within_s": found.overrun,
         "move": {
-            "limits": limits,
+            "limits": vars(d.limits) | {"window": d.window, "axis": d.axis + 1},
             "duration": found.setpoint.duration,
             "reached": {
                 key: getattr(found.setpoint, key) for key in ("velocity", "acceleration", "jerk")
@@ -250,7 +233,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
 def survival_line(run: FinishedRun, found: Study) -> VerdictLine:
     """`survives` of the run's verdict: what the solve said, and what the study adds to it."""
     before, hard, d = at_solve(run.result, "survives"), found.tolerances, found.demands
-    lost = sum(not item.stable for item in hard.judged)
+    lost = hard.unstable
     said = []
     low, high = found.shift.stable
     ends = [f"below {100.0 * low:+.2g} %"] * (low > -d.shift)
@@ -288,8 +271,9 @@ def _disk(margin: DiskMargin) -> dict[str, float]:
     return vars(margin) | {"gain": margin.gain, "phase_deg": margin.phase_deg}
 
 
-def _judged(item: Judged) -> dict[str, Any]:
-    return {
+def _judged(item: Judged, *places: str) -> dict[str, Any]:
+    """Its figures, after the first of its places by these names."""
+    return dict(zip(places, item.place, strict=False)) | {
         "stable": item.stable,
         "bandwidth_hz": item.bandwidth / HZ,
         "sensitivity_peak": item.peak,
@@ -300,7 +284,7 @@ def _line(line: Line, name: str) -> dict[str, Any]:
     return {
         "stable_between": list(line.stable),
         "S_max_between": list(line.within),
-        "plants": [{name: item.place[0]} | _judged(item) for item in line.judged],
+        "plants": [_judged(item, name) for item in line.judged],
     }
 
 

@@ -1,11 +1,18 @@
-"""One true synthesis as a row of the store, and back; what nobody can have written is an error."""
+"""One true synthesis as a row of the store, and back; what nobody can have written is an error.
 
+Its key is a hash of what determines it, exact in every float.
+"""
+
+import hashlib
 import json
 import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any
+
+DAMAGED = "a row is damaged"
 
 
 @dataclass(frozen=True)
@@ -23,18 +30,18 @@ class Sample:
     omega_T: float
     outcome: str
     reason: str
-    gamma_opt: float
-    gamma_lower_bound: float
-    gamma: float
-    bandwidth: float
-    sensitivity_peak: float
-    sensitivity_peak_frequency: float
-    sensitivity_low: float
-    max_real_pole: float
-    norm: float
-    norm_bound: float
-    certified: bool
-    seconds: float
+    gamma_opt: float = math.nan
+    gamma_lower_bound: float = math.nan
+    gamma: float = math.nan
+    bandwidth: float = math.nan
+    sensitivity_peak: float = math.nan
+    sensitivity_peak_frequency: float = math.nan
+    sensitivity_low: float = math.nan
+    max_real_pole: float = math.nan
+    norm: float = math.nan
+    norm_bound: float = math.nan
+    certified: bool = False
+    seconds: float = 0.0
     gradients: tuple[float, ...] | None = None
     compliance: float = math.nan
 
@@ -42,7 +49,6 @@ class Sample:
 COLUMNS = tuple(field.name for field in fields(Sample))
 _REALS = frozenset(f.name for f in fields(Sample) if f.type is float)
 _TEXTS = frozenset(f.name for f in fields(Sample) if f.type is str)
-DAMAGED = "a row is damaged"
 _THETA, _CERTIFIED, _GRADIENTS = map(COLUMNS.index, ("theta", "certified", "gradients"))
 
 
@@ -93,3 +99,41 @@ def decoded(text: Any) -> Any:
         return json.loads(text)
     except (ValueError, TypeError, RecursionError) as error:
         raise sqlite3.DatabaseError(DAMAGED) from error
+
+
+def problem_hash(problem: Mapping[str, object]) -> str:
+    """SHA-256 of a mapping of plain values; exact in every float, blind to the mapping's order.
+
+    Raises ValueError for NaN and infinity, TypeError for what is no plain value.
+
+    >>> problem_hash({"a": 1, "b": 0.1}) == problem_hash({"b": 0.1, "a": 1.0})
+    True
+    """
+    text = json.dumps(_canonical(problem), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: float) -> str:
+    """The key of one synthesis of a problem, exact in every float."""
+    return problem_hash({"problem": problem, "theta": list(theta), "omega": [omega_S, omega_T]})
+
+
+def _canonical(value: object) -> object:
+    if isinstance(value, Mapping):
+        if not all(isinstance(key, str) for key in value):
+            raise TypeError("a name that is no text cannot be part of a key")
+        return {key: _canonical(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_canonical(item) for item in value]
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, str):
+        return f"'{value}"  # the mark keeps a text apart from the number that it spells
+    if isinstance(value, Integral) and abs(int(value)) > 2**53:
+        return str(int(value))  # no float is exact
+    if isinstance(value, Integral | Real):
+        number = float(value) + 0.0  # -0.0 becomes 0.0
+        if not math.isfinite(number):
+            raise ValueError(f"{number} cannot be part of a key; give finite numbers")
+        return number.hex()
+    raise TypeError(f"{type(value).__name__} cannot be part of a key")

@@ -16,10 +16,9 @@ import numpy as np
 
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies
 from ccd_casadi.inner_problem.true_function import TrueQuantities
-from ccd_casadi.sampling.keys import problem_hash, sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, problem_hash, sample_key
 from ccd_casadi.sampling.samples import (
     BandwidthSample,
     QuantitySample,
@@ -29,7 +28,7 @@ from ccd_casadi.sampling.samples import (
 )
 from ccd_casadi.sampling.spent import Spent
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.sampling.units import design_unit, frequencies, inner_unit
+from ccd_casadi.sampling.units import design_unit, inner_unit
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.progress import Progress

@@ -37,6 +37,11 @@ class BandwidthSample:
         return self.theta
 
     @property
+    def joint(self) -> Array:
+        """(θ, ln ω_S, ln ω_T)."""
+        return np.array([*self.theta, np.log(self.omega_S), np.log(self.omega_T)])
+
+    @property
     def value(self) -> float:
         """What J counts: the error where the inner problem is of that, else ω_b*."""
         return self.bandwidth if self.error is None else self.error
@@ -52,14 +57,12 @@ class QuantitySample:
     """Values and their derivatives (…, n_θ + 2) at x = (θ, ln ω_S, ln ω_T); NaN if uncertified.
 
     As `Sensitivities` has them: ω_b, ln of the bounded figures, γ_opt last.
-    `peak_frequency` is where S is largest, rad/s; NaN where it is not known.
     """
 
     x: tuple[float, ...]
     values: Array
     gradients: Array
     certified: bool
-    peak_frequency: float = float("nan")
 
 
 def sample_of(
@@ -142,5 +145,4 @@ def quantity_sample(x: tuple[float, ...], sample: Sample, inner: InnerProblem) -
         bounded = np.log([getattr(sample, name) for name, _ in inner.bounds.values()])
         values = np.array([sample.bandwidth, *bounded, sample.gamma_opt])
     gradients = np.array(sample.gradients).reshape(len(values), len(x))
-    where = sample.sensitivity_peak_frequency
-    return QuantitySample(x, values, gradients, sample.certified, where)
+    return QuantitySample(x, values, gradients, sample.certified)

@@ -3,21 +3,24 @@
 One θ's inner problem, or a chunk of single designs at (θ, ω_S, ω_T).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
 
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.envelope import bandwidth_gradient
-from ccd_casadi.inner_problem.problem import CoDesignProblem, true_design, true_inner
+from ccd_casadi.inner_problem.kinds import bandwidth_gradient
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    frequencies,
+    true_design,
+    true_inner,
+)
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
-from ccd_casadi.sampling.keys import sample_key
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import Sample, sample_key
 from ccd_casadi.sampling.samples import sample_of
-from ccd_casadi.support.arrays import Array
 
 # Rows of the store; key, θ and payload of the inner problem.
 Unit = tuple[list[Sample], tuple[str, tuple[float, ...], dict]]
@@ -54,14 +57,14 @@ def unit_of(
     for figures in result.rows:
         row_key = sample_key(problem_key, theta, figures.omega_S, figures.omega_T)
         rows[row_key] = sample_of(row_key, theta, figures, each)
-    optimum = result.optimum
+    optimum, slope = result.optimum, None
+    names = ("bandwidth", "omega_S", "omega_T")
+    if optimum is not None:
+        gradient = bandwidth_gradient(optimum, result.active, tuple(inner.bounds))
+        slope = [_number(v) for v in gradient]
     payload = {
-        "bandwidth": None if optimum is None else optimum.figures.bandwidth,
-        "gradient": None
-        if optimum is None
-        else [_number(v) for v in bandwidth_gradient(optimum, result.active, tuple(inner.bounds))],
-        "omega_S": None if optimum is None else optimum.figures.omega_S,
-        "omega_T": None if optimum is None else optimum.figures.omega_T,
+        **{name: None if optimum is None else getattr(optimum.figures, name) for name in names},
+        "gradient": slope,
         "active": list(result.active),
         "shortfall": result.shortfall,
         "violation": _number(result.violation),
@@ -86,14 +89,10 @@ def sections_unit(
         omega_T=0.0,
         outcome=design.outcome.name.lower(),
         reason=design.words,
-        gamma_opt=np.nan,
-        gamma_lower_bound=np.nan,
-        gamma=np.nan,
         bandwidth=value.bandwidth,
         sensitivity_peak=np.nan if highest is None else highest.S_peak,
         sensitivity_peak_frequency=np.nan if highest is None else highest.S_peak_frequency,
         sensitivity_low=max((plant.S_low for plant in peaks), default=np.nan),
-        max_real_pole=np.nan,
         norm=np.nan if worst is None else worst,
         norm_bound=1.0,
         certified=value.feasible,
@@ -128,15 +127,6 @@ def design_unit(
         design = true_design(problem, x[:-2], *frequencies(problem, x))
         samples.append(sample_of(key, x[:-2], design.figures, perf_counter() - began, design))
     return samples, None
-
-
-def frequencies(problem: CoDesignProblem, x: Sequence[float] | Array) -> tuple[float, float]:
-    """ω_S, ω_T from their logarithms; exp(log(bound)) may miss the bound by a rounding error."""
-    inner = problem.inner
-    return (
-        float(np.clip(np.exp(x[-2]), *inner.omega_S)),
-        float(np.clip(np.exp(x[-1]), *inner.omega_T)),
-    )
 
 
 def _number(value: float) -> float | None:

@@ -1,5 +1,6 @@
 """report.html of a comparison: the methods, their cost, paths and loops, the paper beside."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from ccd_casadi.drawing.content import Figure, Head, Page, Section, Source, Tabl
 from ccd_casadi.drawing.svg import axis_label
 from ccd_casadi.inner_problem.design_loops import design_view
 from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.reporting.facts import theta_axes
 from ccd_casadi.reporting.landscape import landscape_data, tables_landscape
 from ccd_casadi.reporting.loops import figure_gains, table_gains
 from ccd_casadi.reporting.solve_page import stage_sections
@@ -20,7 +22,7 @@ from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import number, shown_unit
+from ccd_casadi.support.units import number
 
 
 def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]) -> Page:
@@ -81,12 +83,10 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
             continue
         label = LABELS[method.name]
         own = [
-            descent
-            for descent in comparison.descents
-            if descent.gradient is method.descent.gradient
-            and descent.start == comparison.problem.start
-            and descent.iterates
-        ]
+            d for d in comparison.descents
+            if d.gradient is method.descent.gradient and d.iterates
+            and d.start == comparison.problem.start
+        ]  # fmt: skip
         if own:
             found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
         if method.descent.start != comparison.problem.start:
@@ -96,9 +96,8 @@ def histories(comparison: Comparison) -> dict[str, Descent]:
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:
     """All methods in one table, the paper's figures below them."""
-    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
-    factors = {name: factor for name, (_, factor) in zip(problem.names, shown, strict=True)}
-    names = [axis_label(n, unit) for n, (unit, _) in zip(problem.names, shown, strict=True)]
+    factors = {name: factor for name, _, factor in theta_axes(problem)}
+    names = [axis_label(name, unit) for name, unit, _ in theta_axes(problem)]
     cost = f"cost f ({problem.cost_unit})" if problem.cost_unit else "cost f"
     head = (
         "method", *names, cost, "ω_b (Hz)", "J", "f₁ (Hz)", "‖S‖∞", "syntheses", "box look",
@@ -110,40 +109,13 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             empty = ("–",) * (len(head) - 2)
             rows.append((LABELS[name], *empty, figures["status"]))
             continue
-        rows.append(
-            (
-                LABELS[name],
-                *(number(factors[key] * figures["theta"][key], 4) for key in problem.names),
-                number(figures["hardware_cost"], 5),
-                number(figures["bandwidth_hz"], 5),
-                number(figures["objective"], 6),
-                number(figures["first_resonance_hz"], 5),
-                number(figures["sensitivity_peak"], 5),
-                str(figures["syntheses_to_optimum"]),
-                str(figures["syntheses"] - figures["syntheses_to_optimum"] or "–"),
-                number(figures["seconds"], 2),
-                "yes" if figures["certificate"]["passed"] else "no",
-            )
-        )
+        spent = figures["syntheses_to_optimum"]
+        own = (str(spent), str(figures["syntheses"] - spent or "–"), number(figures["seconds"], 2),
+               "yes" if figures["certificate"]["passed"] else "no")  # fmt: skip
+        rows.append((LABELS[name], *_row(figures, factors), *own))
     for name, label in (("sequential", "paper: sequential"), ("nested_ccd", "paper: nested CCD")):
-        item = answer["published"].get(name)
-        if item is not None:
-            theta = item.get("theta", {})
-            rows.append(
-                (
-                    label,
-                    *(number(factors[k] * theta[k], 4) if k in theta else "–" for k in factors),
-                    number(item["hardware_cost"], 5),
-                    number(item["bandwidth_hz"], 4),
-                    number(item["objective"], 5),
-                    number(item["first_resonance_hz"], 4),
-                    "–",
-                    "–",
-                    "–",
-                    "–",
-                    "–",
-                )
-            )
+        if name in answer["published"]:
+            rows.append((label, *_row(answer["published"][name], factors), *["–"] * 4))
     words = (
         "Each formulation of ours ends with a polish and a KKT certificate on the true problem. "
         "Syntheses are those to the optimum; what the global check over the box adds to them "
@@ -159,6 +131,17 @@ def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, W
             "do not have."
         )
     return Table(head, tuple(rows)), Words(words)
+
+
+def _row(figures: Mapping[str, Any], factors: Mapping[str, float]) -> tuple[str, ...]:
+    """θ, then what is known of the design; dashes for the rest."""
+    theta = figures.get("theta", {})
+    shown = {"hardware_cost": 5, "bandwidth_hz": 5, "objective": 6, "first_resonance_hz": 5,
+             "sensitivity_peak": 5}  # fmt: skip
+    return (
+        *(number(factors[key] * theta[key], 4) if key in theta else "–" for key in factors),
+        *(number(figures.get(key), digits) for key, digits in shown.items()),
+    )
 
 
 def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:

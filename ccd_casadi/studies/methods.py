@@ -7,11 +7,11 @@ import numpy as np
 from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table, ThetaPath
 from ccd_casadi.drawing.svg import CYCLE, axis_label
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.reporting.facts import cost_axis
+from ccd_casadi.reporting.facts import cost_axis, theta_axes
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Method
 from ccd_casadi.studies.steepest_descent import Descent
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ
 
 LABELS = {
     "nested": "nested",
@@ -26,19 +26,15 @@ LABELS = {
 
 def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Syntheses spent, least J and its bandwidth (Hz) after each feasible design of a run."""
-    spent, objective, bandwidth = [], [], []
-    best = np.inf
+    found, best = [], np.inf
     for entry in method.trace:
         if np.isfinite(entry.objective) and entry.objective < best:
             best = entry.objective
-            spent.append(entry.syntheses)
-            objective.append(best)
-            bandwidth.append(entry.bandwidth / HZ)
-    if method.trace and spent:
-        spent.append(method.trace[-1].syntheses)
-        objective.append(objective[-1])
-        bandwidth.append(bandwidth[-1])
-    return np.array(spent, float), np.array(objective), np.array(bandwidth)
+            found.append((entry.syntheses, best, entry.bandwidth / HZ))
+    if found:
+        found.append((method.trace[-1].syntheses, *found[-1][1:]))
+    spent, objective, bandwidth = np.array(found, float).reshape(-1, 3).T
+    return spent, objective, bandwidth
 
 
 def cost_figure(methods: Sequence[Method]) -> Figure:
@@ -89,16 +85,16 @@ def descent_figure(problem: CoDesignProblem, descent: Descent) -> Figure:
     """θ, J, hardware cost and bandwidth over the iterations of a descent (figures 9 and 10)."""
     items = descent.iterates
     steps = np.arange(len(items), dtype=float)
-    shown = [shown_unit(u, v) for u, v in zip(problem.units, problem.upper, strict=True)]
-    theta = np.array([item.theta for item in items]) * [factor for _, factor in shown]
+    axes = theta_axes(problem)
+    theta = np.array([item.theta for item in items]) * [factor for *_, factor in axes]
     J = np.array([item.objective for item in items])
     bandwidth = np.array([item.bandwidth for item in items]) / HZ
     cost = (J - problem.w2 * HZ * bandwidth) / problem.w1 if problem.w1 > 0.0 else None
     parameters = tuple(
         Curve(steps, theta[:, k], axis_label(name, unit), CYCLE[k % len(CYCLE)], marker=".")
-        for k, (name, unit) in enumerate(zip(problem.names, (u for u, _ in shown), strict=True))
+        for k, (name, unit, _) in enumerate(axes)
     )
-    units = {unit for unit, _ in shown if unit}
+    units = {unit for _, unit, _ in axes if unit}
     y = f"parameters ({units.pop()})" if len(units) == 1 else "parameters (own units)"
     x = "iteration (–)"
     lower = [

@@ -5,10 +5,15 @@ from pathlib import Path
 from string import Template
 
 
+def package_path(name: str) -> Path:
+    """Of a file of the package, by its path in there."""
+    return Path(__file__).parents[1] / name
+
+
 @cache
 def package_text(name: str) -> str:
-    """The text of a file of the package, by its path in there."""
-    return (Path(__file__).parents[1] / name).read_text(encoding="utf-8")
+    """Its text."""
+    return package_path(name).read_text(encoding="utf-8")
 
 
 def filled(name: str, **values: object) -> str:

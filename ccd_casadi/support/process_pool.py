@@ -3,10 +3,9 @@
 A task whose worker dies is tried once more, in a new one.
 """
 
-import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from multiprocessing import connection
 from reprlib import Repr
 from typing import Protocol, Self
@@ -97,46 +96,39 @@ class Workers:
         if self._mapping:
             raise RuntimeError("these workers are busy with another map: finish or close that one")
         self._mapping = True
+        waiting, retried = deque(range(done_here, len(tasks))), set[int]()
         running: dict[connection.Connection, tuple[WorkerProcess, int]] = {}
         try:
-            yield from self._map(function, tasks, deque(range(done_here, len(tasks))), running)
+            while waiting or running:
+                raise_dropped()
+                self._feed(function, tasks, waiting, running)
+                for pipe in connection.wait(list(running)):
+                    assert isinstance(pipe, connection.Connection)
+                    worker, index = running[pipe]
+                    try:
+                        done, value = worker.answer()
+                    except WorkerLost:
+                        code = worker.process.exitcode
+                        self._end([worker])
+                        del running[pipe]
+                        if index in retried:
+                            words = f"exit code {code}; -9: killed, perhaps out of memory"
+                            held = _SHORT.repr(tasks[index])
+                            raise WorkerLost(
+                                f"a worker process died twice ({words}) on the task {held}"
+                            ) from None
+                        retried.add(index)
+                        waiting.appendleft(index)
+                        continue
+                    # Only now: an interrupted answer leaves the worker among those to be ended.
+                    del running[pipe]
+                    self._feed(function, tasks, waiting, running)
+                    if not done:
+                        raise value
+                    yield value
         finally:
             self._mapping = False
             self._end([worker for worker, _ in running.values()])
-
-    def _map(
-        self,
-        function: Callable[[T], R],
-        tasks: Sequence[T],
-        waiting: deque[int],
-        running: dict[connection.Connection, tuple[WorkerProcess, int]],
-    ) -> Iterator[R]:
-        retried: set[int] = set()
-        while waiting or running:
-            raise_dropped()
-            self._feed(function, tasks, waiting, running)
-            for pipe in connection.wait(list(running)):
-                assert isinstance(pipe, connection.Connection)
-                worker, index = running[pipe]
-                answer = worker.answer()
-                # Only now: an interrupted answer leaves the worker among those to be ended.
-                del running[pipe]
-                if answer is None:
-                    code = worker.exit_code()
-                    self._end([worker])
-                    if index in retried:
-                        raise WorkerLost(
-                            f"a worker process died twice (exit code {code}; -9: killed, perhaps "
-                            f"out of memory) on the task {_SHORT.repr(tasks[index])}"
-                        )
-                    retried.add(index)
-                    waiting.appendleft(index)
-                    continue
-                self._feed(function, tasks, waiting, running)
-                done, value = pickle.loads(answer)  # our own child wrote it, into its pipe
-                if not done:
-                    raise value
-                yield value
 
     def _feed(
         self,
@@ -147,10 +139,9 @@ class Workers:
     ) -> None:
         """Give every idle worker a task, starting processes up to `count`."""
         while waiting and len(running) < self.count:
-            message = pickle.dumps((function, tasks[waiting[0]]))
-            worker = self._idle(running)
+            worker, index = self._idle(running), waiting[0]
             running[worker.pipe] = (worker, waiting.popleft())
-            worker.send(message)
+            worker.begin(function, tasks[index])
 
     def _idle(
         self, running: dict[connection.Connection, tuple[WorkerProcess, int]]
@@ -167,11 +158,6 @@ class Workers:
 
     def _end(self, workers: list[WorkerProcess]) -> None:
         with interrupts_held():
-            ended = [worker for worker in workers if worker in self._workers]
-            for worker in ended:
-                worker.process.kill()
-            for worker in ended:
-                worker.process.join()
-                worker.process.close()
-                worker.pipe.close()
+            for worker in [worker for worker in workers if worker in self._workers]:
+                worker.end()
                 self._workers.remove(worker)

@@ -5,21 +5,26 @@ it held. What goes through the pipe is pickled, which is how Python's processes 
 processes that this one started, and is never stored.
 """
 
+import math
 import multiprocessing
 import os
 import pickle
 import signal
 import threading
+import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import connection, resource_tracker
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, Self, TypeVar
 
 T = TypeVar("T")
+P = ParamSpec("P")
 R = TypeVar("R")
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+GRACE = 2.0  # s of processor time beyond the deadline, after which the system ends the process
+STARTING = 60.0  # seconds that the process itself may take to come up
 _SPAWN = multiprocessing.get_context("spawn")  # a fork would copy locks that threads hold
 
 
@@ -27,38 +32,105 @@ class WorkerLost(RuntimeError):
     """Workers died again and again on one task (killed, or out of memory), or never came back."""
 
 
+class Overrun(RuntimeError):
+    """The call did not return within its time, or its process died."""
+
+
 class WorkerProcess:
     """One spawned process and the parent's end of its pipe."""
 
     def __init__(self) -> None:
-        self.pipe, theirs = _SPAWN.Pipe()
-        # A daemon: it is ended at exit even where the pool was not left properly.
-        self.process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
-        with _one_thread_each():
+        track_resources()
+        with interrupts_held(), _one_thread_each():
+            self.pipe, theirs = _SPAWN.Pipe()
+            # A daemon: it is ended at exit even where the pool was not left properly.
+            self.process = _SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
             self.process.start()
         theirs.close()  # the process holds it alone: its death is an end of file here
 
-    def send(self, message: bytes) -> None:
+    def begin(self, function: Callable[[T], object], task: T) -> None:
+        """Let it go on with this task."""
+        message = pickle.dumps((function, task))
         with suppress(OSError):  # it is dead: its answer will say so
             self.pipe.send_bytes(message)
 
-    def answer(self) -> bytes | None:
-        """What the process sent; None where it died."""
+    def answer(self, seconds: float | None = None) -> tuple[bool, Any]:
+        """(True, what the task came to) or (False, what it raised).
+
+        Raises WorkerLost if the process died, and Overrun after so many seconds.
+        """
         try:
-            return self.pipe.recv_bytes()
+            if not self.pipe.poll(seconds):
+                raise Overrun(f"no answer within {seconds:g} s")
+            answer = self.pipe.recv_bytes()
         except (EOFError, OSError):
-            return None
+            self.process.join(1.0)
+            code = self.process.exitcode
+            raise WorkerLost(f"a worker process died (exit code {code})") from None
+        found: tuple[bool, Any] = pickle.loads(answer)  # our own child wrote it, into its pipe
+        return found
 
     def end(self) -> None:
         """Kill it, whatever it is doing."""
-        self.process.kill()
-        self.process.join()
-        self.process.close()
-        self.pipe.close()
+        with interrupts_held():
+            self.process.kill()
+            self.process.join()
+            self.process.close()
+            self.pipe.close()
 
-    def exit_code(self) -> int | None:
-        self.process.join(1.0)
-        return self.process.exitcode
+
+class Runner:
+    """One process for calls that may never return: killed at its deadline, started anew.
+
+    Compiled code that loops cannot be interrupted from Python; its process can. A context manager.
+    """
+
+    def __init__(self) -> None:
+        self._process: WorkerProcess | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.end()
+        self._process = None
+
+    def call(
+        self, seconds: float, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """function(*args, **kwargs), in that process; whatever it raises is raised here.
+
+        Raises Overrun after `seconds`, and where the process dies.
+        """
+        try:
+            if self._process is None or not self._process.process.is_alive():
+                self.__exit__()
+                self._process = WorkerProcess()
+                self._process.begin(bool, None)
+                self._process.answer(STARTING)
+            self._process.begin(_apply, (seconds, function, args, kwargs))
+            done, value = self._process.answer(seconds)
+        except BaseException as error:  # what it is doing is of no use any more
+            self.__exit__()
+            if isinstance(error, WorkerLost):
+                raise Overrun("the process died") from None
+            raise
+        if not done:
+            raise value
+        result: R = value
+        return result
+
+
+def _apply(task: tuple) -> object:
+    """The call, and the end of this process should it go on when its parent is gone."""
+    seconds, function, args, kwargs = task
+    with suppress(ImportError):  # Windows has no such limit: the parent alone ends the process
+        import resource
+
+        spent = math.ceil(time.process_time() + seconds + GRACE)
+        resource.setrlimit(resource.RLIMIT_CPU, (spent, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+    return function(*args, **kwargs)
 
 
 @contextmanager

@@ -32,24 +32,11 @@ def measure(
 
     The figures end where the certificate fails; ω_low in rad/s.
     """
-    w0, K = plant.omega_0, controller.in_units(plant.omega_0, plant.force)
-    row = np.full(int(Figure.COUNT), np.nan)
+    w0, row = plant.omega_0, np.full(int(Figure.COUNT), np.nan)
     row[Figure.GAMMA_OPT], row[Figure.GAMMA_LOWER_BOUND] = gamma_opt, gamma_lower_bound
     row[Figure.LIMITED_BY_BOUND] = 0.0
-    judge(
-        plant.A,
-        plant.B,
-        plant.C,
-        np.ascontiguousarray(K.A),
-        np.ascontiguousarray(K.B),
-        np.ascontiguousarray(K.C),
-        np.ascontiguousarray(K.D),
-        weights.scaled(w0),
-        weights.delta,
-        gamma,
-        omega_low / w0,
-        row,
-    )
+    loop = (plant.A, plant.B, plant.C, *_scaled(plant, controller), weights.scaled(w0))
+    judge(*loop, weights.delta, gamma, omega_low / w0, row)
     return figures_from_row(row, weights.omega_S, weights.omega_T, w0)
 
 
@@ -78,14 +65,16 @@ def responses(
     plant: ScaledPlant, controller: StateSpace, omega: Array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """G (k, p, m), K (k, m, p) and S (k, p, p) at jω in SI, for frequencies (k,) in rad/s."""
-    G, K, Dk = _prepared(plant, controller)
+    *parts, Dk = _scaled(plant, controller)
+    G, K = prepare(plant.A, plant.B, plant.C), prepare(*parts)
     scaled = np.asarray(omega, float) / plant.omega_0
     g = np.array([response(G, w) for w in scaled])
     k = np.array([response(K, w) + Dk for w in scaled])
     return g / plant.force, k * plant.force, sensitivity(g @ k)
 
 
-def _prepared(plant: ScaledPlant, controller: StateSpace) -> tuple:
+def _scaled(plant: ScaledPlant, controller: StateSpace) -> tuple[Array, Array, Array, Array]:
+    """A controller's matrices in the plant's units, as the kernels take them."""
     K = controller.in_units(plant.omega_0, plant.force)
-    A, B, C, D = (np.ascontiguousarray(getattr(K, part)) for part in "ABCD")
-    return prepare(plant.A, plant.B, plant.C), prepare(A, B, C), D
+    A, B, C, D = (np.ascontiguousarray(part) for part in (K.A, K.B, K.C, K.D))
+    return A, B, C, D

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES, Geometry, axis_lengths, bays, mass
+from ccd_casadi.drawing.content import Figure, Picture, Table
 from ccd_casadi.drawing.page import escape
-from ccd_casadi.drawing.pictures import Drawing
 from ccd_casadi.drawing.svg import BLACK, LONGEST_LABEL
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import number
@@ -31,12 +31,11 @@ MEANINGS = (
 )
 
 
-def drawing(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> Drawing:
+def drawing(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> Figure:
     """Stages by name at equal scale with their dimensions in mm; θ in m."""
     head = ("length", "what it is", "unit", *thetas)
-    return Drawing(
-        draw_stages(geometry, thetas), _caption(geometry, thetas), head, _rows(geometry, thetas)
-    )
+    table = Table(head, _rows(geometry, thetas))
+    return Figure(Picture(draw_stages(geometry, thetas)), _caption(geometry, thetas), (table,))
 
 
 def draw_stages(geometry: Geometry, thetas: Mapping[str, Sequence[float]]) -> str:

@@ -13,7 +13,7 @@ from ccd_casadi.case_studies.rib_stage.model import OUTPUTS, RibStage
 from ccd_casadi.case_studies.rib_stage.pictures import mode_shapes
 from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
-from ccd_casadi.drawing.pictures import Drawing
+from ccd_casadi.drawing.content import Figure
 from ccd_casadi.plants.eigenpairs import StageError
 from ccd_casadi.plants.ordered import Ordered
 from ccd_casadi.plants.plant import Evaluate, Plant
@@ -102,7 +102,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
 
 def _drawing(
     stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]
-) -> Drawing:
+) -> Figure:
     from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
 
     return drawing(stage.geometry, {name: order.own(theta) for name, theta in thetas.items()})
@@ -125,7 +125,7 @@ def _points(points: Points) -> tuple[Point, ...] | None:
 
 def _point_mass(x: float, y: float, mass: float, side: float) -> PointMass:
     if not mass > 0.0:
-        raise StageError(f"point_masses: {mass:g} kg is no mass; give a number above 0")
+        raise StageError(f"point_masses: {mass:g} kg is not a mass; give a number above 0")
     if max(abs(x), abs(y)) > 0.5 * side * (1.0 + 1e-12):
         raise StageError(f"point_masses: ({x:g}, {y:g}) is off the stage; move it inside")
     return PointMass(float(x), float(y), float(mass))

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.support.deadline import Overrun, Runner
 from ccd_casadi.support.errors import MissingPackage, require
+from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.backends import lmi, slicot
 from ccd_casadi.synthesis.backends.standard_plant import (
     Attempt,

@@ -4,7 +4,7 @@ SB10AD accepts a γ when its Riccati solver reports no error and the loop is sta
 neither X >= 0 nor the norm. Its γ is therefore only a search variable: a design counts when the
 certificate passes, and not otherwise. Left to itself it starts at 1e100 and goes on in steps of
 0.1, which does not end; here the search starts at a finite γ and bisects. It is still Fortran
-that nothing can interrupt: call it through `deadline.Runner` where the plant is not known.
+that nothing can interrupt: call it through `worker_process.Runner` where the plant is not known.
 """
 
 import warnings

@@ -1,0 +1,2 @@
+/* Back-calculation: states x forces. */
+static const double L[] = $L;

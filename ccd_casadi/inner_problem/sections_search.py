@@ -1,0 +1,169 @@
+"""The search of a controller of fixed structure at a θ, its anchors, and the worst plants.
+
+A multi-start search gives anchors, the distinct best controllers; plants of the box on which these
+exceed a bound join the set, and the design is made anew from the anchors, until none is found.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ccd_casadi.fixed_structure import SectionsDesign
+from ccd_casadi.fixed_structure.design import Progress
+from ccd_casadi.fixed_structure.least_error import LeastError, least_error
+from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import searched, sections_value, too_slow
+from ccd_casadi.inner_problem.sections_plant_set import (
+    bounds_of,
+    plants_of,
+    sections_of_problem,
+    uncertain_plant,
+    with_channels,
+    with_sections,
+)
+from ccd_casadi.inner_problem.sections_problem import Member
+from ccd_casadi.inner_problem.sections_robustness import worst_members
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.process_pool import Pool
+
+MOST_ANCHORS = 3
+DISTINCT = 0.1  # relative: local optima further below the best are no anchors
+ROUNDS, ROUNDS_OF_ERROR = 6, 4  # of a design on the set and a search for plants that are worse
+SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
+
+
+def race(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    progress: Progress | None = None,
+    workers: Pool | None = None,
+    only_anchors: bool = False,
+) -> SectionsDesign:
+    """A multi-start search at θ: the problem's starts, and its anchors beside them or alone."""
+    sections = sections_of_problem(problem)
+    anchors = [np.array(kappa) for kappa in sections.anchors]
+    starts = None if only_anchors else sections.starts
+    return searched(problem, plants_of(problem, theta), anchors, starts, progress, workers)
+
+
+def with_range(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with its channels and the range of K's frequencies, by the plant at its start,
+    alike at every θ.
+
+    A range that moved with θ would move ω_b*(θ) where it binds, unseen by the envelope gradient.
+    """
+    problem = with_channels(problem)
+    sections = sections_of_problem(problem)
+    if sections.frequencies is not None:
+        return problem
+    plant = scaled_plant(problem, problem.start)
+    poles = np.abs(np.linalg.eigvals(plant.A))
+    fastest = FASTEST * max(1.0, float(poles.max())) * plant.omega_0
+    slowest = SLOWEST * plant.omega_0
+    if sections.sampling is not None:
+        fastest = min(fastest, 2.0 / sections.sampling.period)
+        slowest = min(slowest, 0.01 * fastest)
+    return with_sections(problem, frequencies=(slowest, fastest))
+
+
+def prepared(
+    problem: CoDesignProblem,
+    progress: Progress | None = None,
+    workers: Pool | None = None,
+    only_anchors: bool = False,
+) -> tuple[CoDesignProblem, SectionsDesign]:
+    """The problem with anchors and members: searched at its start θ, worst plants added.
+
+    With `only_anchors` the anchors that it has alone are where searches start. The design is the
+    search's last; where it is not certified the problem has no anchors, and each θ is searched on
+    its own. All of it is of the largest bandwidth, whatever the problem minimises.
+    """
+    asked = sections_of_problem(problem).minimise
+    problem = with_range(with_sections(problem, minimise="bandwidth"))
+    corners = uncertain_plant(problem, problem.start).corners()
+    members = tuple((option, tuple(map(float, point))) for option, point in corners)
+    problem = with_sections(problem, members=members)
+
+    made = race(problem, problem.start, progress, workers, only_anchors)
+    for turn in range(ROUNDS):
+        wider = _wider(problem, problem.start, made, turn, progress) if made.certified else None
+        if wider is None:
+            break
+        problem = with_sections(wider, anchors=_anchors(made))
+        made = sections_value(problem, problem.start).design
+    if made.certified:
+        problem = with_sections(problem, anchors=_anchors(made))
+    return with_sections(problem, minimise=asked), made
+
+
+def _wider(
+    problem: CoDesignProblem, theta: Sequence[float], made: SectionsDesign, turn: int,
+    progress: Progress | None,
+) -> CoDesignProblem | None:  # fmt: skip
+    """The problem with the plants that are worse than its own, None where there are none."""
+    found = worst_members(problem, theta, made, turn, progress)[1]
+    members = (*sections_of_problem(problem).members, *found)
+    return with_sections(problem, members=members) if found else None
+
+
+def _anchors(made: SectionsDesign) -> tuple[tuple[float, ...], ...]:
+    """The certified design's κ first, then those of the other local optima near it."""
+    own = tuple(map(float, made.kappa))
+    others = [
+        optimum.kappa
+        for optimum in made.local_optima
+        if (1.0 - DISTINCT) * made.bandwidth <= optimum.bandwidth < (1.0 - 1e-3) * made.bandwidth
+    ]
+    return (own, *others)[:MOST_ANCHORS]
+
+
+def joined(problem: CoDesignProblem, kappa: Array, members: Sequence[Member]) -> CoDesignProblem:
+    """The problem with one more anchor, first, of what it minimises, and more members."""
+    sections = sections_of_problem(problem)
+    sections = sections.with_anchor(tuple(map(float, kappa)), MOST_ANCHORS + 1)
+    return replace(problem, controller=replace(sections, members=(*sections.members, *members)))
+
+
+def least_error_at(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    progress: Progress | None = None,
+) -> tuple[CoDesignProblem, LeastError]:
+    """The problem with the plants that were found worse on the way, and the design on all of them,
+    which is the first of its anchors of least error.
+
+    The problem has a budget; `made` is its certified design of largest bandwidth.
+    """
+    budget, wider = problem.budget, problem
+    assert budget is not None
+    for turn in range(ROUNDS_OF_ERROR):
+        problem, sections = wider, sections_of_problem(wider)
+        found = least_error(
+            plants_of(problem, theta), bounds_of(problem), made, budget,
+            sampling=sections.sampling, least_bandwidth=sections.bandwidth_least,
+            initial=[np.array(kappa) for kappa in sections.error_anchors], progress=progress,
+        )  # fmt: skip
+        wider = _wider(problem, theta, found.design, turn, progress) or problem
+        if wider is problem:
+            break
+    return joined(problem, found.design.kappa, ()), found
+
+
+def least_from(
+    problem: CoDesignProblem,
+    theta: Sequence[float],
+    made: SectionsDesign,
+    progress: Progress | None = None,
+) -> tuple[CoDesignProblem, SectionsDesign]:
+    """The problem and the design that it counts, from one of largest bandwidth: that itself, or the
+    one of least error, not certified where it has to be slower than is allowed."""
+    if problem.figure is BANDWIDTH or not made.certified:
+        return problem, made
+    made = too_slow(problem, made)
+    if not made.certified:
+        return problem, made
+    problem, found = least_error_at(problem, theta, made, progress)
+    return problem, found.design
