@@ -84,7 +84,7 @@ def test_every_dependency_is_pinned_to_one_version() -> None:
         lines = (ROOT / name).read_text().splitlines()
         for line in lines:
             if line and not line.startswith(("#", "-r ")):
-                package, _, version = line.partition("==")
+                package, _, version = line.partition(";")[0].strip().partition("==")
                 assert version, f"{name}: {line}"
                 assert package.strip() == package
                 assert np.all([c.isalnum() or c in "-_.+" for c in package + version]), line
