@@ -145,10 +145,11 @@ def test_a_circle_is_round_without_a_browser_too(width):
     from ccd_casadi.explorer.figures import CENTRE, HALF
 
     size = {"inner_width": width - 70, "inner_height": 180}
+    fit = package_text("explorer/assets/round.js")
     code = f"""
 const axis = () => ({{setv(found) {{ Object.assign(this, found) }}}})
 const figure = {{...{json.dumps(size)}, x_range: axis(), y_range: axis()}}
-;((figure, centre, half) => {{ {package_text('explorer/assets/round.js')} }})(figure, {CENTRE}, {json.dumps(HALF)})
+;((figure, centre, half) => {{ {fit} }})(figure, {CENTRE}, {json.dumps(HALF)})
 console.log(JSON.stringify([figure.x_range, figure.y_range]))"""
     node = Path(api.__file__).parent / "driver" / "node"
     found = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)
