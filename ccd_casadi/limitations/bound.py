@@ -40,9 +40,13 @@ def outside(limits: Limits, known: float = np.inf) -> float:
     begin = min([BEGIN * most, known, *zeros])
     if not np.isfinite(begin):
         return np.inf
-    begin = _where(_Search(limits, begin, -1, FEW).multiplier, begin, most, 1.0 + OVER)[0]
-    search = _Search(limits, begin, -1)
-    omega_b, weight = _where(search.multiplier, begin, most, 1.0 + OVER)
+    for size in (FEW, MANY):  # where to make the basis; small programmes are not always solved
+        search = _Search(limits, begin, -1, size)
+        omega_b, _, met = _where(search.multiplier, begin, most, 1.0 + OVER)
+        if met:
+            break
+    search = _Search(limits, omega_b, -1)
+    omega_b, weight, _ = _where(search.multiplier, omega_b, most, 1.0 + OVER)
     for number in range(TRIES):
         if omega_b >= most:
             break
@@ -152,15 +156,15 @@ class _Search:
 
 def _where(
     scaling: Callable[[float], tuple[float, Array]], begin: float, most: float, aim: float
-) -> tuple[float, Array]:
-    """The ω_b at which the scaling is as aimed at; secants in ln, between what is known."""
+) -> tuple[float, Array, bool]:
+    """The ω_b at which the scaling is as aimed at, and whether it is; secants in ln, bracketed."""
     x, low, high, slope = float(np.log(begin)), -np.inf, float(np.log(most)), 0.8
     before: tuple[float, float] | None = None
     for _ in range(SECANTS):
         g, weight = scaling(float(np.exp(x)))
         error = float(np.log(np.clip(g / aim, 0.1, 10.0)))  # ∞: a programme not solved
         if abs(error) < CLOSE:
-            break
+            return float(np.exp(x)), weight, True
         low, high = (max(low, x), high) if error < 0.0 else (low, min(high, x))
         if before is not None and x != before[0]:
             slope = float(np.clip((error - before[1]) / (x - before[0]), 0.3, 5.0))
@@ -168,4 +172,4 @@ def _where(
         x += float(np.clip(-error / slope, -LARGEST, LARGEST))
         if not low < x < high:
             x = 0.5 * (low + high) if low > -np.inf else high
-    return float(np.exp(x)), weight
+    return float(np.exp(x)), weight, False

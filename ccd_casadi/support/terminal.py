@@ -51,4 +51,6 @@ def say(text: str, stream: TextIO | None = None) -> None:
     stream = stream or sys.stdout
     if stream.isatty():
         text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
+        if stream is sys.stderr:  # where a bar may stand
+            text = f"\r\x1b[2K{text}"
     print(text, file=stream, flush=True)
