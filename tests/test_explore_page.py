@@ -14,6 +14,7 @@ from ccd_casadi.cases.case import load_case
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support import errors
+from ccd_casadi.support.package_text import package_text
 
 PATIENCE = 240e3  # ms: the machine may be busy
 # Pixels of one unit of Re L and of Im L.
@@ -142,13 +143,13 @@ def test_a_circle_is_round_without_a_browser_too(width):
     api = pytest.importorskip("playwright", reason="playwright is not installed")
     pytest.importorskip("bokeh", reason="bokeh is not installed")
     from ccd_casadi.explorer.figures import CENTRE, HALF
-    from ccd_casadi.support.package_text import package_text
 
     size = {"inner_width": width - 70, "inner_height": 180}
+    fit = package_text("explorer/assets/round.js")
     code = f"""
 const axis = () => ({{setv(found) {{ Object.assign(this, found) }}}})
 const figure = {{...{json.dumps(size)}, x_range: axis(), y_range: axis()}}
-;((figure, centre, half) => {{ {package_text("explorer/assets/round.js")} }})(figure, {CENTRE}, {json.dumps(HALF)})
+;((figure, centre, half) => {{ {fit} }})(figure, {CENTRE}, {json.dumps(HALF)})
 console.log(JSON.stringify([figure.x_range, figure.y_range]))"""
     node = Path(api.__file__).parent / "driver" / "node"
     found = subprocess.run([node, "-e", code], capture_output=True, text=True, check=True)

@@ -50,7 +50,8 @@ def trap(tmp_path: Path) -> Path:
 def trapped_run(two_mass_run: Path, trap: Path) -> Path:
     """A finished run whose case file was exchanged for the trap."""
     folder = Path(shutil.copytree(two_mass_run, trap.parent / "run"))
-    (folder / "report.json").unlink()  # with it `report` asks for no plant
+    for name in ("report.json", "report.html"):  # with them `report` needs no plant
+        (folder / name).unlink()
     shutil.copy(trap, folder / "case.toml")
     shutil.copy(trap.parent / "trap.py", folder)
     return folder
