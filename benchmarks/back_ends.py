@@ -6,13 +6,16 @@ OPENBLAS_NUM_THREADS=1 python benchmarks/back_ends.py [two masses, 40] [stages, 
 import sys
 from collections import Counter
 
+import lmi
 import numpy as np
 from problems import OMEGA_LOW, Problem, stage, two_masses, weights
 
 from ccd_casadi.support.worker_process import Runner
-from ccd_casadi.synthesis.backends.mixed import TITLES, synthesise_with, verdicts
+from ccd_casadi.synthesis.backends.mixed import SOLVERS, TITLES, synthesise_with, verdicts
 
 SEED = 0
+SOLVERS["lmi"] = lmi.solve
+TITLES["lmi"] = "LMI (Clarabel)"
 
 
 def problems(masses: int, stages: int) -> list[Problem]:

@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     elif words[0] in OWN:
         wrong = f"{words[0]} takes nothing more, as in: ccd {words[0]}"
     else:
-        wrong = f"{words[0]!r} is no command; there are {', '.join((*COMMANDS, *OWN))}"
+        wrong = f"{words[0]!r} is not a command; there are {', '.join((*COMMANDS, *OWN))}"
     say(one_line(wrong), sys.stderr)
     return ExitCode.BAD_INPUT
 

@@ -23,7 +23,7 @@ def summary(solution: "Solution") -> str:
     from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.design_entries import budget_lines
     from ccd_casadi.inner_problem.sections_words import channel_words
-    from ccd_casadi.reporting.verdict import terminal_lines
+    from ccd_casadi.reporting.verdict import advice, terminal_lines
     from ccd_casadi.sampling.spent import cost_words
 
     result = solution.result
@@ -33,6 +33,7 @@ def summary(solution: "Solution") -> str:
     peak = f"peak {result['sensitivity_peak']:.5f} at {result['sensitivity_peak_hz']:.4g} Hz"
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
+        *(f"decision      {words}" for words in (advice(result),) if words),
         *terminal_lines(result),
         f"theta         {_theta(result)}",
         f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",

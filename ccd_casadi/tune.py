@@ -42,6 +42,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     answer, case = answer_of(found.case, found.design), found.case
     result = clean({
         "status": answer.status, **answer.figures, "seconds": perf_counter() - began,
+        "models": [norm for norm in found.norms if norm is not None],  # ‖S‖∞ of each model's loop
         "seed": options.seed, "formulation": "tune", "versions": versions(),
     })  # fmt: skip
     write_json(folder / "result.json", result)

@@ -128,7 +128,7 @@ def _decode(cls: Any, value: Any) -> Any:
     if typing.get_origin(cls) is np.ndarray:
         array = np.array(value, dtype=float)
         if not np.isfinite(array).all():  # null and 1e999 come in as nan and inf
-            raise ValueError("an array holds what is no finite number")
+            raise ValueError("an array holds what is not a finite number")
         return array
     if cls is float and (type(value) not in (int, float) or not np.isfinite(value)):
         raise ValueError(f"expected a finite number, found {value!r}")
@@ -136,4 +136,4 @@ def _decode(cls: Any, value: Any) -> Any:
 
 
 def _refuse(constant: str) -> float:
-    raise ValueError(f"{constant} is no number")
+    raise ValueError(f"{constant} is not a number")

@@ -199,7 +199,7 @@ def test_a_morph_is_read_as_written(tmp_path) -> None:
     np.testing.assert_array_equal(again.points(theta), morph.points(theta))
     np.testing.assert_array_equal(again.velocities(theta), morph.velocities(theta))
     (tmp_path / "x.npz").write_bytes(b"no archive")
-    with pytest.raises(PlantError, match="is no morphed mesh"):
+    with pytest.raises(PlantError, match="is not a morphed mesh"):
         read_morph(tmp_path / "x.npz")
 
 

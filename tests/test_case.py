@@ -142,7 +142,7 @@ def test_a_wrong_plant_function_is_told(
 @pytest.mark.parametrize(
     ("function", "words"),
     [
-        ("broken", "plant.function: broken raised ZeroDivisionError: division by zero; mend it"),
+        ("broken", "plant.function: broken raised ZeroDivisionError: division by zero; correct it"),
         ("absent", "defines no function absent; check plant.function"),
         ("not_callable", "defines no function not_callable; check plant.function"),
     ],
@@ -193,14 +193,14 @@ def test_theta_of_the_command_line(text: str, theta: tuple[float, ...]) -> None:
         ("", "is not of the form name=value; give m1=..,m2=.."),
         ("60,60", "is not of the form name=value; give m1=..,m2=.."),
         ("m1=60,m2=60,", "is not of the form name=value; give m1=..,m2=.."),
-        ("m1=60,m3=60", "'m3' is no parameter of the case; known are m1, m2"),
+        ("m1=60,m3=60", "'m3' is not a parameter of the case; known are m1, m2"),
         ("m1=60,m2=60,m1=60", "m1 is given twice; give it once"),
         ("m1=heavy,m2=60", "m1 = 'heavy' is not a number; give one"),
         ("m1=,m2=60", "m1 = '' is not a number; give one"),
         ("m1=nan,m2=60", "m1 = nan is outside its bounds; give 55 to 70"),
         ("m1=60,m2=inf", "m2 = inf is outside its bounds; give 55 to 70"),
         ("m1=60,m2=54.9", "m2 = 54.9 is outside its bounds; give 55 to 70"),
-        ("m1=60,m\n3=60", "is no parameter of the case"),
+        ("m1=60,m\n3=60", "is not a parameter of the case"),
     ],
 )
 def test_wrong_theta_of_the_command_line(text: str, words: str) -> None:
@@ -231,7 +231,7 @@ def test_another_package_offers_a_plant_by_its_entry_point(
         theta = problem.start
         D = mechanics(plant_of(problem), theta).D
         np.testing.assert_array_equal(D, mechanics(build(problem.names), theta).D)
-        with pytest.raises(CaseError, match="no option of pair"):
+        with pytest.raises(CaseError, match="not an option of pair"):
             parse_case(edited(("plant", {"model": "pair", "mass": 1.0})), tmp_path / "x.toml")
         with pytest.raises(CaseError, match="did you mean pair"):
             parse_case(edited(("plant", {"model": "pairs"})), tmp_path / "x.toml")

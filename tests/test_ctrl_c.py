@@ -57,7 +57,7 @@ def test_what_stumbles_over_a_dropped_ctrl_c_counts_as_one() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     with ctrl_c_noticed():
         pass
-    assert not was_ctrl_c(error), "an earlier command's Ctrl-C is no excuse for the next"
+    assert not was_ctrl_c(error), "an earlier command's Ctrl-C is not an excuse for the next"
     assert was_ctrl_c(KeyboardInterrupt())
 
 

@@ -119,7 +119,7 @@ def test_what_is_no_address_is_told(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = told(address, tmp_path, capsys)
-    assert words.startswith(f"--scheduler {address}: is no address; give what `dask")
+    assert words.startswith(f"--scheduler {address}: is not an address; give what `dask")
 
 
 @pytest.mark.parametrize("kind", ["tcp://127.0.0.1:{}", "tcp://127.0.0.1:99999", "carrier://a:{}"])

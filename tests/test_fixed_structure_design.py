@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fixed_structure_loops import BOUNDS, FAST, WEIGHTS, loop, plant
-from helpers import HZ, SUSPENSION, random_plant, two_mass_model
+from helpers import HZ, SUSPENSION, random_plant, two_mass, two_mass_model
 
 from ccd_casadi.fixed_structure import (
     Bounds,
@@ -25,7 +25,7 @@ from ccd_casadi.fixed_structure.figures import assess
 from ccd_casadi.fixed_structure.local_search import Point
 from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.optimality import optimality
-from ccd_casadi.fixed_structure.race import distinct, run_race
+from ccd_casadi.fixed_structure.race import WITHIN, distinct, run_race, started
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random, by_rules, kept, redrawn
 from ccd_casadi.fixed_structure.structure import response, state_space
@@ -411,3 +411,17 @@ def test_what_is_redrawn_never_loses_what_was_found() -> None:
     assert again[0].merit >= first[0].merit
     assert not any(runner.running for runner in again)
     assert len(distinct(again, 5)) == len({tuple(kappa) for kappa in distinct(again, 5)})
+
+
+def test_a_slow_controller_starts_at_its_own_bandwidth() -> None:
+    """A climb from ω₀/10 left an anchor whose bandwidth is below that, and never came back."""
+    bounds = Bounds(S_max=2.5, S_low=0.9, omega_low=0.2 * HZ, shape=1.5)
+    problem = problem_for([two_mass(60.0, 60.0)], Structure(biquads=0), bounds)
+    inside = 0
+    for kappa in kept(problem, by_rules(problem, np.geomspace(0.01, 0.3, 8))):
+        point = started(problem, kappa)
+        assert np.log(problem.low) <= point.tau <= problem.begin(kappa)
+        lowered = point.tau < problem.begin(kappa)
+        assert not lowered or point.assessment.violation <= WITHIN
+        inside += lowered
+    assert inside

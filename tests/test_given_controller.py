@@ -63,7 +63,7 @@ def test_json_of_either_kind_and_the_runs_own(two_mass_run: Path, tmp_path: Path
         ("k.toml", "gain = 1.0\nnotches = []", "unknown key"),
         ("k.toml", "gain = 1.0\nnotch = [{ zero_hz = 3.0 }]", "notch 1: give"),
         ("k.toml", "gain = ", "is not valid TOML"),
-        ("k.json", '{"A": [[1]], "B": 3}', "no matrices"),
+        ("k.json", '{"A": [[1]], "B": 3}', "not matrices"),
         ("k.json", '{"A": [[1]], "B": [[1]], "C": [[1, 2]], "D": [[0]]}', "no state space"),
         ("k.txt", "", ".json, .toml or .mat"),
     ],

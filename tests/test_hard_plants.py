@@ -4,15 +4,17 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from benchmark_scripts import benchmark
 from hard_plants import HARD, regularised
 
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.support.worker_process import Runner
-from ccd_casadi.synthesis.backends import lmi, slicot
+from ccd_casadi.synthesis.backends import slicot
 from ccd_casadi.synthesis.backends.standard_plant import close
 
 pytest.importorskip("cvxpy")
 pytest.importorskip("slycot")
+lmi = benchmark("lmi")
 LIMIT = 60.0  # seconds a back end: 5 where the machine is idle
 BACKOFF = 1.02
 ADDED = (1e-6, 1e-4, 1e-2)  # disturbances and costs of an irregular plant, relative

@@ -12,7 +12,7 @@ import pytest
 from ccd_casadi.solve import main as solve
 
 ROOT = Path(__file__).parent.parent
-CURSOR = (ROOT / "ccd_casadi" / "drawing" / "assets" / "cursor.js").read_text()
+OURS = [path.read_text() for path in (ROOT / "ccd_casadi" / "drawing" / "assets").glob("*.js")]
 
 HOSTILE = "kg</td></pre><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\\\frac$ {0} %s"
 PLANT = """
@@ -70,8 +70,10 @@ def pages_are_inert(folder: Path, least: int) -> None:
     assert len(pages) >= least
     for page in pages:
         text = page.read_text()
-        assert Page(text.replace(f"<script>{CURSOR}</script>", "")).active == [], page.name
         assert "<script>alert" not in text
+        for script in OURS:
+            text = text.replace(f"<script>{script}</script>", "")
+        assert Page(text).active == [], page.name
     assert any("&lt;script&gt;alert(1)" in page.read_text() for page in pages), "shown as text"
 
 
@@ -80,7 +82,7 @@ def test_reports_show_markup_as_text(hostile_run: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["insight", "deploy.__main__", "robustness.__main__", "compare"])
+@pytest.mark.parametrize("name", ["insight", "deploy", "robustness", "compare"])
 def test_every_other_report_shows_markup_as_text(
     hostile_run: Path, tmp_path: Path, name: str
 ) -> None:

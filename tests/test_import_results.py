@@ -117,9 +117,9 @@ def test_the_summary_says_what_was_written(
     ("file", "old", "new", "words"),
     [
         ("index.csv", "beam_10.frd", "beam_11.frd", "beam_11.frd: cannot be read"),
-        ("index.csv", "beam_10.frd", "beam.op2", "is no .frd (CalculiX) or .f06 (Nastran)"),
+        ("index.csv", "beam_10.frd", "beam.op2", "is not a .frd (CalculiX) or .f06 (Nastran)"),
         ("index.csv", "results", "file", "has neither a column results nor"),
-        ("index.csv", "0.01", "light", "damping: 'light' is no number"),
+        ("index.csv", "0.01", "light", "damping: 'light' is not a number"),
         ("dofs.csv", "in,force,1,z", "in,force,99,z", "node: 99 has no displacements"),
         ("dofs.csv", "in,force,1,z", "in,force,1,w", "direction: 'w' is none of x, y, z"),
         ("dofs.csv", "in,force", "out,force", "names no in"),

@@ -145,7 +145,7 @@ HEAD = "t,mode,frequency_hz,damping,in:u,out:y\n"
         (HEAD.replace("in:u", "out:z") + "0,1,1,0.1,1,1\n", "has no column in:NAME"),
         (HEAD.replace("t,", "") + "1,1,0.1,1,1\n", "no column of theta"),
         (HEAD + "0,1,1,0.1,1\n", "line 2: has 5 columns, the header 6"),
-        (HEAD + "0,1,fast,0.1,1,1\n", "line 2: frequency_hz: 'fast' is no number"),
+        (HEAD + "0,1,fast,0.1,1,1\n", "line 2: frequency_hz: 'fast' is not a number"),
         (HEAD + "0,1,nan,0.1,1,1\n", "line 2: frequency_hz: 'nan' is not finite"),
         (HEAD + "0,1,-1,0.1,1,1\n", "frequency_hz: is negative"),
         (HEAD + "0,1,1,1.5,1,1\n", "damping: is 1.5"),

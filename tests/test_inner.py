@@ -150,11 +150,11 @@ def test_infeasible_problem_names_what_cannot_be_met(solve) -> None:
     assert result.optimum is None
     assert np.isnan(result.bandwidth)
     least = min(row.sensitivity_peak for row in result.rows)
-    assert "where S_max = 1.05 is asked" in result.shortfall
+    assert "where S_max = 1.05 is required" in result.shortfall
     assert f"the least peak of S of all is {least:.4g}" in result.shortfall
     assert least > 1.05
     result = solve(plant, PAPER, replace(INNER, S_low=1e-4))
-    assert "where S_low = 0.0001 is asked" in result.shortfall
+    assert "where S_low = 0.0001 is required" in result.shortfall
     assert "the least |S(j omega_low)| of all is" in result.shortfall
     # each bound is met by some, both by none that was tried
     result = solve(plant, PAPER, replace(INNER, S_max=1.3, S_low=0.012))

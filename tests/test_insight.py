@@ -150,6 +150,6 @@ def test_command_writes_numbers_and_a_page(two_mass_run: Path, tmp_path: Path) -
 
 def test_command_names_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main([str(tmp_path / "nothing"), "--quiet"]) == 2
-    assert "is no folder" in capsys.readouterr().err
+    assert "is not a folder" in capsys.readouterr().err
     assert main([str(tmp_path), "--points", "1"]) == 2
     assert "from 2 to 9999" in capsys.readouterr().err

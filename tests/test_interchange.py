@@ -104,10 +104,10 @@ def test_a_foreign_file_with_the_matrices_alone(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"A": np.eye(3)}, "sizes of A, B, C, D do not fit"),
-        ({"A": np.full((2, 2), np.nan)}, r"G.A: is no finite real matrix"),
-        ({"A": "pole"}, r"G.A: is no finite real matrix"),
+        ({"A": np.full((2, 2), np.nan)}, r"G.A: is not a finite real matrix"),
+        ({"A": "pole"}, r"G.A: is not a finite real matrix"),
         ({"B": None}, "has no B"),
-        ({"Ts": -1.0}, "no sampling period"),
+        ({"Ts": -1.0}, "not a sampling period"),
     ],
 )
 def test_a_damaged_struct_is_named(tmp_path: Path, change: dict, words: str) -> None:

@@ -178,10 +178,10 @@ def test_two_channels_are_designed_on_two_responses_and_judged_apart(tmp_path: P
     [
         ("f_hz,re\n1,2\n2,3\n3,4\n4,5\n5,6\n", "needs re and im"),
         ("re,im\n1,2\n", "no column f_hz"),
-        ("f_hz,re,im\n1,2,x\n", "no table of numbers"),
+        ("f_hz,re,im\n1,2,x\n", "not a table of numbers"),
         ("f_hz,re,im\n1,2,3\n2,3,4\n", "five lines"),
         ("f_hz,re,im\n" + "1,2,3\n" * 6, "have to rise"),
-        ("", "no table of numbers"),
+        ("", "not a table of numbers"),
     ],
 )
 def test_mistakes_in_files(tmp_path: Path, text: str, words: str) -> None:

@@ -87,7 +87,7 @@ def test_a_mat_file_is_the_same_plant(tmp_path: Path) -> None:
     [
         ("stage.csv", "none.csv", "plant.file.*No such file"),
         ('file = "stage.csv"', "", "plant.file: is missing"),
-        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: is no option"),
+        ('file = "stage.csv"', 'file = "stage.csv"\nzeta = 0.1', "plant.zeta: is not an option"),
         ('file = "stage.csv"', 'file = "stage.csv"\nunstable_poles = -1', "unstable_poles"),
         ("biquads = 0", "[theta.m]\nlower = 1.0\nupper = 2.0", "theta: has no effect"),
         ('structure = "sections"', "", "controller.structure: needs"),
@@ -105,14 +105,14 @@ def test_mistakes_are_named(tmp_path: Path, old: str, new: str, words: str) -> N
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.csv", b"", "no table of numbers"),
-        ("a.csv", b"f_hz,re,im\n1,2,three\n", "no table of numbers"),
-        ("a.csv", b"f_hz,re,im\n1,2\n", "no table of numbers"),
+        ("a.csv", b"", "not a table of numbers"),
+        ("a.csv", b"f_hz,re,im\n1,2,three\n", "not a table of numbers"),
+        ("a.csv", b"f_hz,re,im\n1,2\n", "not a table of numbers"),
         ("a.csv", b"time,re,im\n1,2,3\n", "no column f_hz"),
         ("a.csv", b"f_hz,re\n1,2\n", "needs re and im"),
         ("a.csv", b"f_hz,re,im\n" + b"1,2,3\n" * 6, "have to rise"),
         ("a.csv", b"f_hz,re,im\n1,2,3\n", "five lines or more"),
-        ("a.csv", b"\xff\xfe\x00\x01", "no table of numbers"),
+        ("a.csv", b"\xff\xfe\x00\x01", "not a table of numbers"),
         ("a.mat", b"no such thing", r"\.mat file"),
         ("a.mat", b"\x89HDF\r\n\x1a\n" + bytes(600), r"\.mat file"),
     ],

@@ -90,7 +90,7 @@ def test_inner_designs_show_their_figures() -> None:
         replace(asked, inner=replace(asked.inner, S_max=1.01, sweep_points=(3, 3)), method="sweep"),
         (60.0, 60.0),
     )
-    assert "where S_max = 1.01 is asked" in shown(none)
+    assert "where S_max = 1.01 is required" in shown(none)
     made = ccd.synthesise(
         ccd.scaled_plant(asked, (60.0, 60.0)),
         asked.weights.at(800.0 * HZ, 40.0 * HZ), omega_low=HZ,

@@ -215,7 +215,7 @@ def test_lost_workers_leave_a_run_to_be_resumed(
     [
         ("m1=60", "m2 is missing; give all of m1, m2"),
         ("60,60", "not of the form name=value"),
-        ("m1=60,m9=60", "'m9' is no parameter of the case; known are m1, m2"),
+        ("m1=60,m9=60", "'m9' is not a parameter of the case; known are m1, m2"),
         ("m1=60,m2=6o", "is not a number"),
         ("m1=60,m2=nan", "outside its bounds"),
         ("m1=60,m2=80", "outside its bounds; give 55 to 70"),

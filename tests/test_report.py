@@ -275,7 +275,7 @@ def test_unverified_result_says_why() -> None:
     *_, solution, text = run("three")
     assert solution.result["status"] == "not_verified"
     assert "✕ not verified" in text
-    assert "failed: prediction" in text
+    assert "Failed: prediction" in text
     assert "UNVERIFIED" in text
 
 

@@ -155,4 +155,4 @@ def test_a_scheduler_that_is_none_is_refused_in_one_line(
     assert main([str(folder), "--scheduler", "nowhere"]) == 2
     errors = capsys.readouterr().err
     assert errors.count("\n") == 1
-    assert errors.startswith("--scheduler nowhere: is no address; give what `dask scheduler`")
+    assert errors.startswith("--scheduler nowhere: is not an address; give what `dask scheduler`")

@@ -67,7 +67,7 @@ def test_theta_may_come_in_any_order() -> None:
         ("outputs", "twist", "choose one of"),
         ("modes", 12, "choose 10 or 20"),
         ("poisson", 0.5, "between 0 and 0.5"),
-        ("rib_count", 3, "is no option of rib_stage"),
+        ("rib_count", 3, "is not an option of rib_stage"),
         ("actuators", [[0.15, 0.15]], "not lie on one line"),
         ("actuators", [[0.15]], "give a list of rows of 2 numbers"),
         ("actuators", 3, "give a list of rows of 2 numbers"),

@@ -225,7 +225,7 @@ def test_what_no_robust_design_meets_is_infeasible(tmp_path: Path, capsys) -> No
     assert main([str(path), *options]) == 3
     err = capsys.readouterr().err
     assert len(err.splitlines()) == 1
-    for words in ("none found", "where S_max = 1.3 is asked", "is not proven", "[robust]"):
+    for words in ("none found", "where S_max = 1.3 is required", "is not proven", "[robust]"):
         assert words in err
     assert "cannot" not in err
 

@@ -254,9 +254,9 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
         (["--axis", "2"], "--axis: is 2; the plant has outputs 1 to 1"),
         (["--damping", "1.5", "2"], "--damping: is 1.5 2"),
         (["--tolerance", "-1"], "--tolerance"),
-        (["--shift", "60"], "no number above 0 and below 50"),
-        (["--stroke", "0"], "no number above 0"),
-        (["--samples", "0"], "no whole number"),
+        (["--shift", "60"], "not a number above 0 and below 50"),
+        (["--stroke", "0"], "not a number above 0"),
+        (["--samples", "0"], "not a whole number"),
     ],
 )
 def test_a_wrong_option_is_named(

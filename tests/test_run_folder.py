@@ -34,14 +34,14 @@ def test_the_design_is_measured_again_as_it_was_written(two_mass_run: Path) -> N
     ("name", "change", "words"),
     [
         ("controller.json", lambda c: c["A"].pop(), "A"),
-        ("controller.json", lambda c: c.pop("B"), "B: is no matrix"),
-        ("controller.json", lambda c: c["D"][0].__setitem__(0, None), "D: is no finite matrix"),
+        ("controller.json", lambda c: c.pop("B"), "B: is not a matrix"),
+        ("controller.json", lambda c: c["D"][0].__setitem__(0, None), "D: is not a finite matrix"),
         ("controller.json", lambda c: c["D"][0].__setitem__(0, 1e9), "not certified"),
         ("result.json", lambda r: r.update(status="infeasible"), "no feasible design"),
         ("result.json", lambda r: r["theta"].update(m1=1.0), "theta.m1: is outside"),
         ("result.json", lambda r: r["theta"].update(m1="x"), "theta.m1"),
         ("result.json", lambda r: r["theta"].pop("m1"), "theta: does not name m1, m2"),
-        ("result.json", lambda r: r.update(gamma=float("nan")), "gamma: is no number"),
+        ("result.json", lambda r: r.update(gamma=float("nan")), "gamma: is not a number"),
         ("result.json", lambda r: r.update(omega_S_hz=-1.0), "omega_S_hz: is not positive"),
     ],
 )
@@ -71,5 +71,5 @@ def test_a_damaged_file_is_named(
 
 
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="is no folder"):
+    with pytest.raises(UserError, match="is not a folder"):
         read_run(tmp_path / "nothing")

@@ -97,7 +97,7 @@ def test_too_much_bandwidth_is_said(tmp_path: Path) -> None:
     case = least(bandwidth_least=500.0 * HZ)
     found = solve(case, Direct(starts=1), store=tmp_path / "samples.sqlite").result
     assert found["status"] == "infeasible"
-    assert "bandwidth_least_hz asks for 500 Hz" in found["reason"]
+    assert "bandwidth_least_hz requires 500 Hz" in found["reason"]
 
 
 def test_j_counts_the_error_where_a_sample_has_one() -> None:

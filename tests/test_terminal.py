@@ -11,7 +11,7 @@ import pytest
 
 import ccd_casadi
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.support.terminal import wrapped
+from ccd_casadi.support.terminal import coloured, wrapped
 
 
 def on_screen(columns: int, *words: str) -> list[str]:
@@ -34,9 +34,12 @@ def on_screen(columns: int, *words: str) -> list[str]:
 
 @pytest.mark.parametrize("columns", [60, 80])
 def test_an_answer_is_wrapped_to_the_terminal(columns: int) -> None:
-    """No word is broken and none lost, and no bar stays on a line of the answer."""
-    lines = on_screen(columns, "check", str(ccd_casadi.TWO_MASS))
-    assert max(map(len, lines)) <= columns
+    """Lines break between words, paths are whole, and no bar stays on a line of the answer."""
+    case = str(ccd_casadi.TWO_MASS)
+    lines = on_screen(columns, "check", case)
+    told = [line for line in lines if case not in line and "compiling" not in line]
+    assert max(map(len, told)) <= columns
+    assert any(case in line for line in lines)
     assert any(line.startswith("plant         two_mass: 1 input") for line in lines)
     ends = [line for line in lines if line.startswith("checking the plant")]
     assert len(ends) == 1
@@ -48,6 +51,14 @@ def test_a_line_goes_on_under_its_words() -> None:
     broken = wrapped(line, 50).split("\n")
     assert all(part.startswith(" " * 23) for part in broken[1:])
     assert " ".join(" ".join(broken).split()) == " ".join(line.split())
+
+
+def test_the_state_of_a_line_has_its_colour(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert coloured("survives      warned   so") == "survives      \x1b[33mwarned\x1b[0m   so"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert coloured("survives      warned   stable") == "survives      warned   stable"
 
 
 def test_work_that_ends_early_ends_its_bar(capsys: pytest.CaptureFixture[str]) -> None:

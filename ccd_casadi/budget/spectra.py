@@ -72,7 +72,7 @@ class ShapedSpectrum:
             raise ValueError(f"the level of a spectrum is {self.level}; give a number above 0")
         for corner in (*self.zeros, *self.poles):
             if len(corner) not in (1, 2) or not all(value > 0.0 for value in corner):
-                raise ValueError(f"{corner} is no corner; give (Hz,) or (Hz, damping), above 0")
+                raise ValueError(f"{corner} is not a corner; give (Hz,) or (Hz, damping), above 0")
 
     @property
     def relative_degree(self) -> int:

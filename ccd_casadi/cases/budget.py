@@ -146,7 +146,7 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
+        reason = getattr(error, "strerror", None) or "it is not text"
         raise fail(f"{place}.file", f"{shown(path.name)} cannot be read: {reason}") from None
     found: list[list[float]] = []
     for number_, line in enumerate(lines, 1):
@@ -158,7 +158,7 @@ def _read(path: Path, place: str, fail: Fail) -> list[list[float]]:
         except ValueError:
             row = []
         if len(row) != 2:
-            words = f"line {number_} of {shown(path.name)} is no pair Hz, density; mend it"
+            words = f"line {number_} of {shown(path.name)} is not a pair Hz, density; correct it"
             raise fail(f"{place}.file", words)
         found.append(row)
     if len(found) > MOST_ROWS:

@@ -79,7 +79,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise fail(f"is not valid TOML: {error}; mend that line") from None
+        raise fail(f"is not valid TOML: {error}; correct that line") from None
     except RecursionError:
         raise fail("is not valid TOML: nested too deeply; flatten its arrays") from None
     except ValueError:
@@ -189,7 +189,7 @@ def parse_theta(case: Case, text: str) -> tuple[float, ...]:
         if not equals:
             raise fail(f"{shown(part)} is not of the form name=value; give {'=..,'.join(names)}=..")
         if name not in names:
-            raise fail(f"{shown(name)} is no parameter of the case{closest(name, names)}")
+            raise fail(f"{shown(name)} is not a parameter of the case{closest(name, names)}")
         if name in found:
             raise fail(f"{name} is given twice; give it once")
         try:

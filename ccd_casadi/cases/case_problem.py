@@ -92,7 +92,7 @@ def problem_of(case: Case) -> CoDesignProblem:
     except Exception as error:
         if function is None:
             raise
-        words = f"{function} raised {described(error)}; mend it"
+        words = f"{function} raised {described(error)}; correct it"
         raise CaseError(one_line(f"{case.path}: plant.function: {words}")) from error
     return problem
 

@@ -65,7 +65,7 @@ class ChannelSection:
     bandwidth_ratio: float = key(
         number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
         1.0,
-        says="this channel's bandwidth is at least so many times ω_b, which is the slowest one's",
+        says="this channel's bandwidth is at least this many times ω_b, which is the slowest one's",
     )
 
 

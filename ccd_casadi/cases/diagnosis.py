@@ -213,7 +213,7 @@ def _rigid(
     if expected is not None and count != expected:
         words = (
             f"{count} rigid-body modes {place}, where suspension.rigid_modes expects "
-            f"{expected}{least}; mend the stiffness (K v = 0 for a rigid-body motion v), or "
+            f"{expected}{least}; correct the stiffness (K v = 0 for a rigid-body motion v), or "
             "suspension.rigid_modes"
         )
         return [Finding(Severity.ERROR, Topic.RIGID_MODES, words, index)]

@@ -154,10 +154,10 @@ def read_options(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror}; name a readable file") from None
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"is not valid TOML: {error}; mend it") from None
+        raise ValueError(f"is not valid TOML: {error}; correct it") from None
     for key in ("model", "function"):
         if key in found:
-            raise ValueError(f"{key} is no option of a plant; drop it")
+            raise ValueError(f"{key} is not an option of a plant; drop it")
     return found
 
 

@@ -95,7 +95,8 @@ def _response(
 ) -> MeasuredResponse:
     for key, value in plant.items():
         if key != "model" and key not in _PLANT:
-            raise fail(f"plant.{key}", f"is no option of {MODEL}; known are {', '.join(_PLANT)}")
+            known = ", ".join(_PLANT)
+            raise fail(f"plant.{key}", f"is not an option of {MODEL}; known are {known}")
         wrong = None if key == "model" else _PLANT[key](value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)

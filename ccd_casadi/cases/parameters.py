@@ -41,7 +41,7 @@ def parameters_of(
 def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
     place = f"theta.{name}"
     if not name.isidentifier():
-        raise fail(place, "is no identifier; use letters, digits and _")
+        raise fail(place, "is not an identifier; use letters, digits and _")
     if not isinstance(entry, Mapping):
         raise fail(place, f"is {shown(entry)}; write a table [theta.{name}]")
     for key, value in entry.items():
@@ -70,7 +70,8 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
     if lower > upper:
         raise fail(f"{place}.lower", f"{lower:g} is above upper = {upper:g}; swap them")
     if lower == upper or not math.isfinite(upper - lower):
-        raise fail(f"{place}.lower", f"{lower:g} to {upper:g} is no range; widen it, or give fixed")
+        words = f"{lower:g} to {upper:g} is not a range; widen it, or give fixed"
+        raise fail(f"{place}.lower", words)
     start = float(entry.get("start", 0.5 * lower + 0.5 * upper))
     if not lower <= start <= upper:
         words = f"{start:g} is outside {lower:g} to {upper:g}; give a start within the bounds"

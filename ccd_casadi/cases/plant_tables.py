@@ -77,9 +77,9 @@ def plant_table(
     checks = {} if known is None else known.checks
     for key, value in options.items():
         if not key.isidentifier():
-            raise fail(f"plant.{key}", "is no keyword; use a Python identifier")
+            raise fail(f"plant.{key}", "is not a keyword; use a Python identifier")
         if takes is not None and key not in takes:
-            raise fail(f"plant.{key}", f"is no option of {model}{closest(key, takes)}")
+            raise fail(f"plant.{key}", f"is not an option of {model}{closest(key, takes)}")
         wrong = _MODEL_OPTIONS.get((model, key), checks.get(key, _option))(value)
         if wrong is not None:
             raise fail(f"plant.{key}", wrong)
@@ -128,7 +128,7 @@ def theta_tables(
     if needed is not None:
         for name in table:
             if name not in needed:
-                raise fail(f"theta.{name}", f"is no parameter of {model}{closest(name, needed)}")
+                raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
         for name in needed:
             if name not in table:
                 words = f"is missing; add a table [theta.{name}], which {model} needs"

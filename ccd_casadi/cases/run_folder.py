@@ -99,7 +99,7 @@ def read_run(folder: str | Path) -> FinishedRun:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise UserError(f"{folder}: is no folder; name the run folder of a finished solve")
+        raise UserError(f"{folder}: is not a folder; name the run folder of a finished solve")
     result = read_json(folder / "result.json")
     if result.get("status") == "infeasible":
         words = "the run found no feasible design; there is nothing to work on"
@@ -264,7 +264,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 def _number(path: Path, table: Mapping[str, Any], key: str) -> float:
     value = table.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{path}: {key}: is no number; solve the case again")
+        raise UserError(f"{path}: {key}: is not a number; solve the case again")
     if value <= 0.0:
         raise UserError(f"{path}: {key}: is not positive; solve the case again")
     return float(value)
@@ -307,7 +307,7 @@ def _matrix(path: Path, table: Mapping[str, Any], key: str) -> Array:
     try:
         matrix = np.array(table[key], dtype=float)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{path}: {key}: is no matrix; solve the case again") from None
+        raise UserError(f"{path}: {key}: is not a matrix; solve the case again") from None
     if matrix.ndim != 2 or matrix.size == 0 or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {key}: is no finite matrix; solve the case again")
+        raise UserError(f"{path}: {key}: is not a finite matrix; solve the case again")
     return matrix

@@ -196,7 +196,7 @@ def remedies(problem: CoDesignProblem, share: float | None = None) -> str:
 def missed_words(problem: CoDesignProblem, figures: DesignFigures) -> str:
     """Which bounds a design misses, and by how much; empty where it keeps them all."""
     found = [
-        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is asked"
+        f"{LABELS[name]} {missed_by(value, bound)} where {name} = {bound:g} is required"
         for name, (of, bound) in problem.inner.bounds.items()
         if (value := getattr(figures, of)) > bound
     ]

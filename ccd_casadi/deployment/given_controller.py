@@ -165,7 +165,7 @@ def _from_matrices(path: Path, table: Mapping[str, Any]) -> Given:
         parts = [np.array(table[name], dtype=float) for name in "ABCD"]
         period, delay = float(table.get("period", 0.0)), float(table.get("delay", 0.0))
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path}: A, B, C, D are no matrices: {error}") from None
+        raise UserError(f"{path}: A, B, C, D are not matrices: {error}") from None
     A, B, C, D = parts
     fits = all(part.ndim == 2 and np.isfinite(part).all() for part in parts) and (
         A.shape == (len(A), len(A))

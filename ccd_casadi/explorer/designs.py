@@ -207,7 +207,8 @@ def judged(
     if not figures.certified:
         return Standing.REFUSED, figures.outcome.value
     missed = [
-        f"{FIGURES[name]} {missed_by(getattr(figures, of), most)} where {name} = {most:g} is asked"
+        f"{FIGURES[name]} {missed_by(getattr(figures, of), most)} where {name} = {most:g} is "
+        "required"
         for name, (of, most) in problem.inner.bounds.items()
         if getattr(figures, of) > most
     ]

@@ -88,7 +88,7 @@ def given_decoupling(
         M = np.array(rows, float).T
         length = np.linalg.norm(M, axis=0)
         if not (length > 0.0).all() or np.linalg.cond(M / length) > 1e6:
-            raise PlantError(f"the channels' directions of {word} are not independent; mend them")
+            raise PlantError(f"the channels' directions of {word} are not independent; change them")
         found.append(M / length)
     return Decoupling(tuple(names), found[0], found[1])
 

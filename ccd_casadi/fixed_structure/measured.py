@@ -128,7 +128,7 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
         columns = {COLUMNS.get(name, name): column for name, column in
                    zip(names, table.T, strict=True)}  # fmt: skip
     except (OSError, ValueError, IndexError) as error:
-        reason = getattr(error, "strerror", None) or "it is no table of numbers with a header"
+        reason = getattr(error, "strerror", None) or "it is not a table of numbers with a header"
         raise UserError(f"{path}: cannot be read as a frequency response: {reason}") from None
     return _of_columns(columns, path)
 
@@ -167,7 +167,7 @@ def _mat(path: Path) -> dict[str, np.ndarray]:
         words = f"cannot be read as a frequency response: {error.strerror or error}"
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # whatever its reader stumbles over in a damaged or newer file
-        words = f"is no .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
+        words = f"is not a .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
         raise UserError(f"{path}: {words}") from None
     return _named(variables)
 

@@ -25,6 +25,7 @@ OVERTAKING = 4.0  # times the gain of its last round: what a search behind may s
 WORTH = 1e-4  # in ln ω_b: along a flat valley many come to one end; to be ahead by less is nothing
 MERGED = 1e-3  # in κ and τ: searches as close as that are one
 SAME = 2e-3  # relative: bandwidths of one local optimum
+LOWERED = 6  # steps at most to the bandwidth of a controller
 WITHIN = 1e-4  # ln: a violation that the end of a search may have
 
 
@@ -88,9 +89,24 @@ def run_race(
 
 
 def started(problem: LoopProblem, kappa: Array) -> Point:
-    """A controller at the bandwidth that searches start from."""
+    """A controller at the bandwidth that searches start from; lower if it keeps its bounds there.
+
+    A climb that began above the bandwidth that a controller has would leave it for good; one below
+    ω_low is none.
+    """
     tau = problem.begin(kappa)
-    return Point(kappa, tau, assess(problem, kappa, tau))
+    first = point = Point(kappa, tau, assess(problem, kappa, tau))
+    for _ in range(LOWERED):
+        peaks = point.assessment.peaks
+        if peaks is None or not (over := peaks.value > WITHIN).any():
+            return point
+        if not (peaks.to_tau[over] > 0.0).all():
+            break
+        tau -= float((peaks.value[over] / peaks.to_tau[over]).max())
+        if tau < np.log(problem.low):
+            break
+        point = Point(kappa, tau, assess(problem, kappa, tau))
+    return first
 
 
 def finished(runners: Sequence[Runner]) -> list[Runner]:

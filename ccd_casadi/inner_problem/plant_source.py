@@ -134,7 +134,7 @@ def _own_function(source: PlantSource) -> ModelFunction:
     module = importlib.util.module_from_spec(spec)
     late = PlantError(
         f"{path.name}:{source.function} did not return within {source.seconds:g} s; "
-        "mend it, or give it longer with plant_seconds in a table [limits]"
+        "correct it, or give it longer with plant_seconds in a table [limits]"
     )
     try:
         limited(loader.exec_module, source.seconds, late)(module)

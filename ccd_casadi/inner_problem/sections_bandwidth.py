@@ -145,7 +145,7 @@ def too_slow(problem: CoDesignProblem, made: SectionsDesign) -> SectionsDesign:
     if made.bandwidth >= least:
         return made
     words = f"no controller was found above {made.bandwidth / HZ:.4g} Hz"
-    words += f", inner.bandwidth_least_hz asks for {least / HZ:.4g} Hz"
+    words += f", inner.bandwidth_least_hz requires {least / HZ:.4g} Hz"
     short = {"bandwidth_least_hz": least / made.bandwidth}
     return replace(made, outcome=SectionsOutcome.BOUND_NOT_MET, words=words, short=short)
 

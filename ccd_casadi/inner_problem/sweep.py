@@ -305,7 +305,7 @@ def shortfall(problem: InnerProblem, rows: Sequence[DesignFigures]) -> str:
         label = LABELS[name]
         value = float(getattr(nearest, attribute))
         if value > bound:
-            missed.append(f"{label} {missed_by(value, bound)} where {name} = {bound:g} is asked")
+            missed.append(f"{label} {missed_by(value, bound)} where {name} = {bound:g} is required")
             best = min(float(getattr(row, attribute)) for row in certified)
             if best > bound:
                 least.append(f"the least {label} of all is {missed_by(best, bound)}")

@@ -29,6 +29,7 @@ from numba.core.dispatcher import Dispatcher
 from ccd_casadi.kernels import sources
 from ccd_casadi.support.options import usable_cores
 from ccd_casadi.support.progress import Progress
+from ccd_casadi.support.terminal import say
 
 PACKAGE = __name__.rpartition(".")[0]
 PARTS = ("search", "certificate", "rows", "curvature")
@@ -207,7 +208,7 @@ def _alone(file: Path) -> Iterator[None]:
 
 def _say(words: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # stderr is closed
-        print(words, file=sys.stderr, flush=True)
+        say(words, sys.stderr)
 
 
 class _Report(event.Listener):

@@ -103,7 +103,7 @@ def build_plant(model: ModelFunction, names: Sequence[str], options: Mapping[str
     except TypeError as error:
         raise PlantError(f"the plant model does not take its options: {error}") from error
     except KeyError as error:
-        raise PlantError(f"the plant model asks for a theta that the case lacks: {error}") from None
+        raise PlantError(f"the plant model needs a theta that the case lacks: {error}") from None
     check_keys(result)
     M, K, B, C = (ca.SX(result[key]) for key in ("mass", "stiffness", "input", "output"))
     n = M.shape[0]

@@ -225,8 +225,8 @@ def rule_sentence(bandwidth_hz: float, natural_hz: Sequence[float]) -> str:
     ratio = first / bandwidth_hz
     low, high = RULE
     verdict = (
-        f"below the {low:g} to {high:g} that the rule of thumb asks for: the controller works "
-        "where the rule would not go, and its robustness to that resonance deserves a look"
+        f"below the {low:g} to {high:g} of the rule of thumb: check the robustness to that "
+        "resonance"
         if ratio < low
         else f"within the {low:g} to {high:g} of the rule of thumb"
         if ratio <= high

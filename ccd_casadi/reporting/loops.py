@@ -239,7 +239,7 @@ def _caption(view: LoopView) -> str:
     if plants > 1:
         words = words.replace("peak of S is", "peak of S on the model is")
     near = [
-        f"|{name}| comes to {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
+        f"|{name}| reaches {100.0 * share[i]:.4g} % of {view.bounded.words[k]} at "
         f"{number(float(view.hz[i]), 3)} Hz"
         for k, (name, share) in enumerate(zip(NAMES, view.shares, strict=True))
         if np.isfinite(share).any()

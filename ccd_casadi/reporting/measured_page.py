@@ -39,7 +39,11 @@ def measured_page(
     """report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
     lines = f"{len(case.responses[0].hz)} lines of {case.file}"
-    basis = " and by the poles of the closed loop" if answer.get("models") else "; no model"
+    norms = answer.get("models")
+    basis = (
+        f", and on the model: its sampled loop has stable poles and ‖S‖∞ = {number(max(norms))}"
+        if norms else "; no model"
+    )  # fmt: skip
     lead = (
         f"A controller of order {answer['controller']['order']} with a bandwidth of "
         f"{number(answer['bandwidth_hz'])} Hz, designed and judged on {lines}{basis}."
@@ -67,10 +71,12 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
     for one, colour in zip(case.responses, cycle((BLUE, GREEN, ORANGE)), strict=False):
         hz, K = one.hz, controller_response(controller, one.hz, case.period)
         joint = one.matrix @ K
-        S, reach = sensitivity(joint), between(hz, joint)  # drawn at the middle of two lines
-        curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
-                                       np.where(reach < np.inf, reach, np.nan), colour=GREY,
-                                       width=0.9))  # fmt: skip
+        S = sensitivity(joint)
+        if not one.modelled:  # of a model ‖S‖∞ is known
+            reach = between(hz, joint)  # drawn at the middle of two lines
+            curves["at most"].append(Curve(np.sqrt(hz[1:] * hz[:-1]),
+                                           np.where(reach < np.inf, reach, np.nan), colour=GREY,
+                                           width=0.9))  # fmt: skip
         gains = {"G": one.matrix, "S": S, "KS": K @ S, "T": joint @ S}
         for name, M in gains.items():
             curves[name].append(Curve(hz, largest(M), colour=colour))
@@ -93,11 +99,12 @@ def _loop(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any])
         (over_hz("|KS| (N/m)", curves["KS"], ends, levels=(at,)),
          over_hz("|T| (–)", curves["T"], ends, levels=(at,))),
     )  # fmt: skip
-    words = (
-        "Every bound is required on every line: S out of the shaded area, L out of the disk. "
-        "Grey: what |S| may reach between two lines, if GK bends there as around them. A resonance "
-        "that fits between two lines is not seen."
-    )
+    words = "Every bound is required on every line: S out of the shaded area, L out of the disk."
+    if curves["at most"]:
+        words += (
+            " Grey: what |S| may reach between two lines, if GK bends there as around them. A "
+            "resonance that fits between two lines is not seen."
+        )
     table = over_frequency(
         ("Hz", "|G| m/N", "|S|", "Re L", "Im L", "|KS| N/m", "|T|"),
         hz, curves["G"][0].y, size, loci[0].real, loci[0].imag, curves["KS"][0].y,
@@ -116,8 +123,9 @@ def _facts(case: MeasuredCase, answer: Mapping[str, Any]) -> list[Fact]:
     found = [
         ("Bandwidth", f"{number(answer['bandwidth_hz'])} Hz", runs),
         ("Peak of S", number(answer["sensitivity_peak"]),
-         f"at {number(answer['sensitivity_peak_hz'], 4)} Hz, S_max {bounds.S_max:g}; between lines "
-         f"at most {number(answer['sensitivity_peak_between_lines'])}"),
+         f"at {number(answer['sensitivity_peak_hz'], 4)} Hz, S_max {bounds.S_max:g}" + (
+             "" if answer.get("models") else
+             f"; between lines at most {number(answer['sensitivity_peak_between_lines'])}")),
         ("|S| at ω_low", number(answer["sensitivity_low"]),
          f"at most {bounds.S_low:g} at {number(bounds.omega_low / HZ)} Hz"),
         ("Compliance", f"{number(1e6 * answer['compliance_max'], 4)} µm/N", "the largest |GS|"),

@@ -11,6 +11,13 @@ from ccd_casadi.drawing.paint import head_html
 from ccd_casadi.support.terminal import columns, wrapped
 
 LINES = ("certified", "optimal", "predicted", "survives", "deployable")
+NEXT = {  # what to do about a line that failed
+    "certified": "solve the case again",
+    "optimal": "more starts or box_points in [outer]",
+    "predicted": "retrain, or more points in [sampling]",
+    "survives": "a [robust] set in the case",
+    "deployable": "a higher rate or less delay",
+}
 STATUS = {
     "verified": "verified",
     "not_verified": "not verified",
@@ -71,7 +78,8 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
     """The head of a page that is about the run itself: badge and verdict are the run's."""
     good = result["status"] == "verified"
     reason = head_words(result) if good else str(result.get("reason") or "")
-    reason = f"{reason.rstrip('.')}. {advice(result)}".strip()
+    reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
+    reason = f"{advice(result)} {reason}".strip()
     status = STATUS.get(result["status"], "not verified")
     return head_of(title, good, status, reason, meta, lead, result)
 
@@ -87,22 +95,23 @@ def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
 
 
 def advice(result: Mapping[str, Any]) -> str:
-    """What to do with the design, in a sentence; nothing of a run without a verdict."""
+    """The decision: build this or not, and what comes next; nothing of a run without a verdict."""
     states = {line.name: line.state for line in lines_of(result)}
     failed = [name for name, state in states.items() if state == State.FAILED]
     if not states:
         return ""
     if failed or result.get("status") != "verified":
-        return f"Do not build this: {', '.join(failed) or 'it is not verified'}."
+        why = f"{' and '.join(failed)} failed" if failed else "it is not verified"
+        return f"Do not build this: {why}. Next: {NEXT[failed[0]] if failed else 'see why'}."
     if states.get("survives") == State.WARNED:
-        return (
-            "Do not build this loop as it is: a plant a little off its model is not survived. "
-            "Next: a [robust] set in the case."
-        )
+        words = "Do not build this: it does not survive small errors of its model."
+        return f"{words} Next: {NEXT['survives']}."
     warned = [name for name, state in states.items() if state == State.WARNED]
     if warned:
-        return f"Look at {', '.join(warned)} before it is built."
-    return "Next: deploy." if states.get("deployable") == State.UNKNOWN else ""
+        return f"Build this if these warnings are acceptable: {', '.join(warned)}."
+    if states.get("deployable") == State.UNKNOWN:
+        return "Build this after deploy: hold and delay are not judged yet."
+    return "Build this."
 
 
 def head_words(result: Mapping[str, Any]) -> str:

@@ -59,7 +59,7 @@ class Cluster:
             logging.getLogger(name).setLevel(logging.CRITICAL)  # losses are dealt with here
         if not re.fullmatch(r"\w+://.+:\d+", self.address):
             what = "what `dask scheduler` prints, for instance tcp://127.0.0.1:8786"
-            raise self._mistake(f"is no address; give {what}")
+            raise self._mistake(f"is not an address; give {what}")
         try:
             self._client = distributed.Client(
                 self.address, timeout=CONNECT_SECONDS, set_as_default=False

@@ -121,7 +121,7 @@ def sample_key(problem: str, theta: Sequence[float], omega_S: float, omega_T: fl
 def _canonical(value: object) -> object:
     if isinstance(value, Mapping):
         if not all(isinstance(key, str) for key in value):
-            raise TypeError("a name that is no text cannot be part of a key")
+            raise TypeError("a name that is not text cannot be part of a key")
         return {key: _canonical(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]

@@ -167,7 +167,7 @@ def run_folder(case: Path, out: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise UserError(f"{folder}: exists and is no folder; choose another --out") from None
+        raise UserError(f"{folder}: exists and is not a folder; choose another --out") from None
     except OSError as error:
         raise UserError(
             f"{folder}: cannot be made: {error.strerror}; choose another --out"
@@ -183,7 +183,7 @@ def _folder(text: str) -> Path:
     while not os.path.lexists(place):
         place = os.path.dirname(place)
     if not os.path.isdir(place):
-        raise argparse.ArgumentTypeError(f"{place} is no directory; choose another")
+        raise argparse.ArgumentTypeError(f"{place} is not a directory; choose another")
     if not os.access(place, os.W_OK | os.X_OK):
         raise argparse.ArgumentTypeError(f"{place} is not writable; choose another")
     return Path(text)

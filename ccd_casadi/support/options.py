@@ -60,7 +60,7 @@ def whole(least: int, most: int = 999_999_999) -> Callable[[str], int]:
     def convert(text: str) -> int:
         # Nine digits are enough for anyone, and within what every random generator takes.
         if not (text.isdecimal() and len(text) < 10 and least <= int(text) <= most):
-            words = f"{text[:20]!r} is no whole number from {least} to {most}; give one"
+            words = f"{text[:20]!r} is not a whole number from {least} to {most}; give one"
             raise argparse.ArgumentTypeError(words)
         return int(text)
 
@@ -88,7 +88,7 @@ def number(
             value = math.nan
         inside = least < value < most if strict else least <= value <= most
         if not (inside and math.isfinite(value)):
-            raise argparse.ArgumentTypeError(f"{text[:20]!r} is no {words}; give one")
+            raise argparse.ArgumentTypeError(f"{text[:20]!r} is not a {words}; give one")
         return value
 
     return convert

@@ -87,5 +87,5 @@ def restored(kind: Any, data: Any) -> Any:
     if kind is float:
         return float(data)
     if type(data) is not kind:
-        raise TypeError(f"{data!r} is no {kind.__name__}")
+        raise TypeError(f"{data!r} is not a {kind.__name__}")
     return data

@@ -9,6 +9,9 @@ from typing import TextIO
 WIDTH = 100  # characters of a line at most, and where no terminal is
 LABEL = re.compile(r"\s*(\S+( \S+)*?\s{2,})?((passed|warned|failed|unknown)\s{2,})?")
 
+COLOURS = {"passed": 32, "verified": 32, "warned": 33, "failed": 31, "not_verified": 31}
+STATE = re.compile(rf"^(\w+\s{{2,}})({'|'.join(COLOURS)})\b")
+
 
 def columns(stream: TextIO) -> int:
     """Of the terminal behind a stream, at most WIDTH."""
@@ -36,9 +39,18 @@ def wrapped(line: str, width: int) -> str:
     )  # fmt: skip
 
 
+def coloured(line: str) -> str:
+    """The word of a verdict or status behind its label in green, yellow or red."""
+    if "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb":
+        return line
+    return STATE.sub(lambda m: f"{m[1]}\x1b[{COLOURS[m[2]]}m{m[2]}\x1b[0m", line)
+
+
 def say(text: str, stream: TextIO | None = None) -> None:
     """Print lines; a stream that is no terminal gets them as they are."""
     stream = stream or sys.stdout
     if stream.isatty():
-        text = "\n".join(wrapped(line, columns(stream)) for line in text.split("\n"))
+        text = "\n".join(coloured(wrapped(line, columns(stream))) for line in text.split("\n"))
+        if stream is sys.stderr:  # where a bar may stand
+            text = f"\r\x1b[2K{text}"
     print(text, file=stream, flush=True)

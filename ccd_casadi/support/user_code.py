@@ -93,7 +93,7 @@ def limited(function: Callable[..., Any], seconds: float, late: UserError) -> Ca
                 words = described(error)
                 if isinstance(error, Exception) and words != type(error).__name__:
                     raise
-                raise type(late)(f"the function raised {words}; mend it") from None
+                raise type(late)(f"the function raised {words}; correct it") from None
         if inspect.iscoroutine(value):
             value.close()  # else Python warns that nobody awaited it
             raise type(late)("the function is an async one; write a plain def")

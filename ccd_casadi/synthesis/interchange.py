@@ -82,7 +82,7 @@ def from_control(system: Any) -> tuple[StateSpace, float]:
     import control
 
     if not isinstance(system, control.StateSpace | control.TransferFunction):
-        words = "is no control.StateSpace or control.TransferFunction; convert it with control.ss"
+        words = "is not a control.StateSpace or TransferFunction; convert it with control.ss"
         raise UserError(f"{type(system).__name__}: {words}")
     if system.dt is True:
         raise UserError("the system is in discrete time without a period; give it a dt in s")
@@ -115,7 +115,7 @@ def write_mat(path: Path, design: DesignFile) -> None:
     content: dict[str, Any] = {}
     for name, named in design.systems.items():
         if not (name.isidentifier() and name.isascii() and len(name) <= LONGEST_NAME):
-            raise UserError(f"{path}: {name!r} is no name for a variable in MATLAB")
+            raise UserError(f"{path}: {name!r} is not a name for a variable in MATLAB")
         content[name] = {
             **{part: getattr(named.system, part) for part in PARTS},
             "Ts": named.period,
@@ -152,7 +152,7 @@ def read_mat(path: Path) -> DesignFile:
         words = "is a MATLAB 7.3 file; write it with save(…, '-v7')"
         raise UserError(f"{path}: {words}") from None
     except Exception as error:  # a damaged file fails anywhere inside the reader
-        raise UserError(f"{path}: is no readable .mat file: {_one_line(error)}") from None
+        raise UserError(f"{path}: is not a readable .mat file: {_one_line(error)}") from None
     systems = {name: _system(path, name, struct) for name, struct in _structs(path, content)}
     if not systems:
         raise UserError(f"{path}: holds no struct with A, B, C, D; save one for each system")
@@ -193,7 +193,7 @@ def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
     if "Ts" in struct:
         Ts = _matrix(path, f"{name}.Ts", struct["Ts"])
         if Ts.size != 1 or Ts[0, 0] < 0.0:
-            raise UserError(f"{path}: {name}.Ts: is no sampling period in s, or 0")
+            raise UserError(f"{path}: {name}.Ts: is not a sampling period in s, or 0")
         period = float(Ts[0, 0])
     inputs, outputs = text("InputName"), text("OutputName")
     return NamedSystem(
@@ -209,7 +209,7 @@ def _system(path: Path, name: str, struct: Mapping[str, Any]) -> NamedSystem:
 def _matrix(path: Path, name: str, value: Any) -> Array:
     matrix = np.asarray(value)
     if matrix.ndim != 2 or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
-        raise UserError(f"{path}: {name}: is no finite real matrix")
+        raise UserError(f"{path}: {name}: is not a finite real matrix")
     return np.ascontiguousarray(matrix, dtype=float)
 
 

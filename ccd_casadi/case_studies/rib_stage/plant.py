@@ -125,7 +125,7 @@ def _points(points: Points) -> tuple[Point, ...] | None:
 
 def _point_mass(x: float, y: float, mass: float, side: float) -> PointMass:
     if not mass > 0.0:
-        raise StageError(f"point_masses: {mass:g} kg is no mass; give a number above 0")
+        raise StageError(f"point_masses: {mass:g} kg is not a mass; give a number above 0")
     if max(abs(x), abs(y)) > 0.5 * side * (1.0 + 1e-12):
         raise StageError(f"point_masses: ({x:g}, {y:g}) is off the stage; move it inside")
     return PointMass(float(x), float(y), float(mass))

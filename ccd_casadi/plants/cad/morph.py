@@ -156,7 +156,7 @@ def read_morph(file: str | Path) -> Morph:
             )
     except Exception as error:
         words = "write it with ccd_casadi.plants.cad.draw_morph"
-        raise PlantError(f"{Path(file).name}: is no morphed mesh ({error}); {words}") from None
+        raise PlantError(f"{Path(file).name}: is not a morphed mesh ({error}); {words}") from None
     return morph
 
 

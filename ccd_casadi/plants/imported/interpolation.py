@@ -51,7 +51,7 @@ class InterpolatedModes:
             )
             raise PlantError(
                 f"the sample {words} has {counts[s]} rigid-body modes, another {counts.max()}; "
-                "mend the table, or rigid_below_hz"
+                "correct the table, or rigid_below_hz"
             )
         self.table, self.rigid = table, int(counts[0])
         damping = table.zeta[:, self.rigid :]

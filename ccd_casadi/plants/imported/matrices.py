@@ -160,7 +160,7 @@ def _matrix(path: Path) -> csc_array:
                 raise PlantError(f"{path}: holds {', '.join(held) or 'nothing'}; save one matrix")
             value = next(iter(held.values()))
         else:
-            raise PlantError(f"{path}: is no .mtx, .npz or .mat; save the matrix as one of these")
+            raise PlantError(f"{path}: is not a .mtx, .npz or .mat; save the matrix as one of them")
     except PlantError:
         raise
     except Exception as error:  # whatever a reader makes of a damaged or foreign file
@@ -169,7 +169,7 @@ def _matrix(path: Path) -> csc_array:
     try:
         matrix = csc_array(value if issparse(value) else np.asarray(value), dtype=float)
     except (ValueError, TypeError) as error:
-        raise PlantError(f"{path}: is no real matrix: {error}") from None
+        raise PlantError(f"{path}: is not a real matrix: {error}") from None
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise PlantError(f"{path}: is {matrix.shape}, not square; save the whole matrix")
     if not np.isfinite(matrix.data).all() or not matrix.nnz:
@@ -203,7 +203,7 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise PlantError(f"{path}: cannot be read: {error}; add it") from None
     if not rows or any("None" in row or "None" in row.values() for row in rows):
-        raise PlantError(f"{path}: holds no rows, or other cells than its header; mend it")
+        raise PlantError(f"{path}: holds no rows, or other cells than its header; correct it")
     if columns:
         for row in rows:
             row.setdefault("gain", "1")
@@ -218,7 +218,7 @@ def number_in(path: Path, key: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise PlantError(f"{path}: {key}: {text[:40]!r} is no number; give one") from None
+        raise PlantError(f"{path}: {key}: {text[:40]!r} is not a number; give one") from None
     if not math.isfinite(value):
         raise PlantError(f"{path}: {key}: {text[:40]!r} is not finite; give a number")
     return value

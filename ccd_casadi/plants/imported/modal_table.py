@@ -132,7 +132,7 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, float]]]:
     try:
         parsed = list(csv.reader(line for _, line in numbered))
     except csv.Error as error:
-        raise PlantError(f"{path}: is no CSV: {error}; separate numbers by commas") from None
+        raise PlantError(f"{path}: is not a CSV: {error}; separate numbers by commas") from None
     if len(parsed) < 2:
         raise PlantError(f"{path}: holds no rows; give a header and one row a mode")
     header = [name.strip() for name in parsed[0]]
@@ -147,13 +147,13 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, float]]]:
 def _row(path: Path, number: int, header: list[str], cells: list[str]) -> dict[str, float]:
     place = f"{path}: line {number}"
     if len(cells) != len(header):
-        raise PlantError(f"{place}: has {len(cells)} columns, the header {len(header)}; mend it")
+        raise PlantError(f"{place}: has {len(cells)} columns, the header {len(header)}; correct it")
     row = {}
     for name, cell in zip(header, cells, strict=True):
         try:
             row[name] = float(cell)
         except ValueError:
-            raise PlantError(f"{place}: {name}: {cell[:40]!r} is no number; give one") from None
+            raise PlantError(f"{place}: {name}: {cell[:40]!r} is not a number; give one") from None
         if not math.isfinite(row[name]):
             raise PlantError(f"{place}: {name}: {cell[:40]!r} is not finite; give a number")
     if row.get("frequency_hz", 0.0) < 0.0:

@@ -77,7 +77,7 @@ def read_modes(path: Path) -> ResultModes:
     """The modes in a .frd or .f06 file. Raises PlantError where there are none."""
     readers = {".frd": _frd, ".f06": _f06}
     if path.suffix.lower() not in readers:
-        raise PlantError(f"{path}: is no .frd (CalculiX) or .f06 (Nastran); name one of these")
+        raise PlantError(f"{path}: is not a .frd (CalculiX) or .f06 (Nastran); name one of these")
     try:
         lines = path.read_text(encoding="latin-1").splitlines()
     except OSError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import MissingPackage, require
 from ccd_casadi.support.worker_process import Overrun, Runner
-from ccd_casadi.synthesis.backends import lmi, slicot
+from ccd_casadi.synthesis.backends import slicot
 from ccd_casadi.synthesis.backends.standard_plant import (
     Attempt,
     Solver,
@@ -21,30 +21,9 @@ from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 from ccd_casadi.synthesis.weights import Weights
 
-
-@dataclass(frozen=True)
-class Backend:
-    """A name, what it needs, and where its solver is."""
-
-    name: str
-    title: str
-    needs: tuple[str, ...]
-    extra: str
-
-    def solver(self) -> Solver:
-        """Its solver. Raises MissingPackage where a package that it needs is not installed."""
-        for package in self.needs:
-            require(package, self.extra)
-        return slicot.solve if self.name == "slicot" else lmi.solve
-
-
-SLICOT = Backend("slicot", "SB10AD (slycot)", ("slycot",), "slicot")
-LMI = Backend("lmi", "LMI (Clarabel)", ("cvxpy", "clarabel"), "lmi")
-
-
-RICCATI = "riccati"
-_GENERAL = {item.name: item for item in (SLICOT, LMI)}
-TITLES = {RICCATI: "one Riccati (ours)"} | {key: item.title for key, item in _GENERAL.items()}
+RICCATI, SLICOT = "riccati", "slicot"
+SOLVERS: dict[str, Solver] = {SLICOT: slicot.solve}
+TITLES = {RICCATI: "one Riccati (ours)", SLICOT: "SB10AD (slycot)"}
 
 
 @dataclass(frozen=True)
@@ -76,9 +55,9 @@ def synthesise_with(
     runner: Runner | None = None,
     limit: float = 60.0,
 ) -> BackendResult:
-    """One synthesis by "riccati", "slicot" or "lmi", certified; ω_low in rad/s.
+    """One synthesis by "riccati" or one of `SOLVERS`, certified; ω_low in rad/s.
 
-    With a `runner` the optional back ends run in its process and are killed after `limit`
+    With a `runner` those run in its process and are killed after `limit`
     seconds. Raises MissingPackage where a package is not installed.
     """
     began = time.perf_counter()
@@ -86,7 +65,7 @@ def synthesise_with(
         design = synthesise(plant, weights, omega_low=omega_low, gamma_backoff=gamma_backoff)
         gamma_opt, reason = design.figures.gamma_opt, design.figures.outcome.value
         return BackendResult(backend, gamma_opt, design, reason, time.perf_counter() - began)
-    task = (_GENERAL[backend], mixed_sensitivity(plant, weights), gamma_backoff)
+    task = (SOLVERS[backend], mixed_sensitivity(plant, weights), gamma_backoff)
     try:
         attempt, seconds = _timed(*task) if runner is None else runner.call(limit, _timed, *task)
     except Overrun as overrun:
@@ -103,9 +82,9 @@ def synthesise_with(
     return BackendResult(backend, attempt.gamma_opt, design, figures.outcome.value, seconds)
 
 
-def _timed(backend: Backend, plant: StandardPlant, gamma_backoff: float) -> tuple[Attempt, float]:
-    """The attempt and the seconds that it took, imports not counted."""
-    solve = backend.solver()
+def _timed(solve: Solver, plant: StandardPlant, gamma_backoff: float) -> tuple[Attempt, float]:
+    """The attempt and the seconds that it took, the import of slycot not counted."""
+    require("slycot", "slicot")
     began = time.perf_counter()
     attempt = solve(plant, gamma_backoff=gamma_backoff)
     return attempt, time.perf_counter() - began

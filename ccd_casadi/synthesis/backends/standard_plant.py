@@ -3,7 +3,7 @@
 ẋ = A x + B1 w + B2 u,   z = C1 x + D11 w + D12 u,   y = C2 x + D21 w + D22 u,   u = K y
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -108,18 +108,6 @@ def close(plant: StandardPlant, K: StateSpace) -> StateSpace:
     B = np.vstack([plant.B1 + plant.B2 @ DD, K.B @ F @ plant.D21])
     C = np.hstack([plant.C1 + plant.D12 @ DC, plant.D12 @ EC])
     return StateSpace(A, B, C, plant.D11 + plant.D12 @ DD)
-
-
-def without_d22(plant: StandardPlant) -> StandardPlant:
-    """The plant with D22 = 0; `with_d22` turns its controller into one of the plant itself."""
-    return replace(plant, D22=np.zeros_like(plant.D22))
-
-
-def with_d22(K: StateSpace, D22: Array) -> StateSpace:
-    """K (I + D22 K)⁻¹: what `K` has to be where y carries D22 u as well."""
-    E = np.linalg.inv(np.eye(D22.shape[0]) + D22 @ K.D)
-    DE = K.D @ E
-    return StateSpace(K.A - K.B @ E @ D22 @ K.C, K.B @ E, K.C - DE @ D22 @ K.C, DE)
 
 
 @dataclass(frozen=True)

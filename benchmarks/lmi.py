@@ -11,10 +11,11 @@ backed-off γ, keeps X as far from singular as it can. Two forms:
   its infimum at Y = ∞, and u = F x + F_w w is all that is left to find. Mixed sensitivity is of
   this kind.
 
-Cost grows with the sixth power of the order: some ten states.
+Cost grows with the sixth power of the order: some ten states. Needs cvxpy (the extra `bench`).
 """
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,6 @@ from ccd_casadi.synthesis.backends.standard_plant import (
     Attempt,
     StandardPlant,
     balance,
-    with_d22,
-    without_d22,
 )
 
 STRICT = 1e-7  # a definite matrix is at least this much so
@@ -38,10 +37,9 @@ LARGEST = 20  # states
 def solve(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
     """Minimal γ of the LMI, then a controller at gamma_backoff times it.
 
-    Raises MissingPackage without cvxpy and clarabel.
+    Raises MissingPackage without cvxpy.
     """
-    cvxpy = require("cvxpy", "lmi")
-    require("clarabel", "lmi")
+    cvxpy = require("cvxpy", "bench")
     n = len(plant.A)
     if n > LARGEST:
         reason = f"the LMI of {n} states is too large; at most {LARGEST}"
@@ -54,6 +52,18 @@ def solve(plant: StandardPlant, *, gamma_backoff: float = 1.02) -> Attempt:
     gamma = gamma_backoff * gamma_opt
     relaxed = make(cvxpy, P, gamma)[1]
     return Attempt(gamma_opt, gamma, with_d22(relaxed or K, plant.D22))
+
+
+def without_d22(plant: StandardPlant) -> StandardPlant:
+    """The plant with D22 = 0; `with_d22` turns its controller into one of the plant itself."""
+    return replace(plant, D22=np.zeros_like(plant.D22))
+
+
+def with_d22(K: StateSpace, D22: Array) -> StateSpace:
+    """K (I + D22 K)⁻¹: what `K` has to be where y carries D22 u as well."""
+    E = np.linalg.inv(np.eye(D22.shape[0]) + D22 @ K.D)
+    DE = K.D @ E
+    return StateSpace(K.A - K.B @ E @ D22 @ K.C, K.B @ E, K.C - DE @ D22 @ K.C, DE)
 
 
 def _knows_disturbance(P: StandardPlant) -> bool:
