@@ -31,7 +31,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.worker_process import Overrun, Runner
-from ccd_casadi.synthesis.backends import slicot
+from ccd_casadi.synthesis.backends.mixed import solve_slicot
 from ccd_casadi.synthesis.backends.standard_plant import balance, close, mixed_sensitivity
 from ccd_casadi.synthesis.synthesis import Design, synthesise
 
@@ -87,7 +87,7 @@ def compared(design: Design, plant: ScaledPlant, runner: Runner) -> dict:
         given, C1=scale * given.C1, D11=scale * given.D11, D12=scale * given.D12
     )  # fmt: skip
     try:
-        found = runner.call(10.0, slicot.solve, scaled)
+        found = runner.call(10.0, solve_slicot, scaled)
     except Overrun:
         return {"sb10ad": "over 10 s"}
     if found.controller is None:

@@ -25,10 +25,7 @@ from surrogates.polynomial import Polynomial
 
 SCHEMA = "surrogates/2"
 READABLE = (SCHEMA, "surrogates/1")
-KINDS: dict[str, type[Any]] = {
-    "gaussian_process": GaussianProcess,
-    "polynomial": Polynomial,
-}
+KINDS: dict[str, type[Any]] = {"gaussian_process": GaussianProcess, "polynomial": Polynomial}
 
 
 class SurrogateFileError(ValueError):

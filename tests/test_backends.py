@@ -29,11 +29,7 @@ from ccd_casadi.synthesis.backends.mixed import (
     synthesise_with,
     verdicts,
 )
-from ccd_casadi.synthesis.backends.standard_plant import (
-    StandardPlant,
-    close,
-    mixed_sensitivity,
-)
+from ccd_casadi.synthesis.backends.standard_plant import StandardPlant, close, mixed_sensitivity
 
 ROOT = Path(__file__).resolve().parents[1]
 

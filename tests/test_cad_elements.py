@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from ccd_casadi.plants.cad.elements import Body, Material
-from ccd_casadi.plants.cad.extension import extended
 from ccd_casadi.plants.cad.modes import reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph, write_morph
 from ccd_casadi.plants.cad.plant import CadStage, plant_of_stage
-from ccd_casadi.plants.cad.solid import volumes
+from ccd_casadi.plants.cad.solid import extended, volumes
 from ccd_casadi.plants.plant import constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
 

@@ -26,12 +26,7 @@ from ccd_casadi.fixed_structure.loop_problem import Curve
 from ccd_casadi.fixed_structure.peak_search import Brackets
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.fixed_structure.starts import at_random
-from ccd_casadi.fixed_structure.structure import (
-    response,
-    response_and_slopes,
-    roots,
-    state_space,
-)
+from ccd_casadi.fixed_structure.structure import response, response_and_slopes, roots, state_space
 from ccd_casadi.kernels import sections
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled

@@ -9,7 +9,7 @@ from hard_plants import HARD, regularised
 
 from ccd_casadi.lti.norms import gains
 from ccd_casadi.support.worker_process import Runner
-from ccd_casadi.synthesis.backends import slicot
+from ccd_casadi.synthesis.backends.mixed import solve_slicot
 from ccd_casadi.synthesis.backends.standard_plant import close
 
 pytest.importorskip("cvxpy")
@@ -32,7 +32,7 @@ def test_one_back_end_at_least_keeps_what_it_claims(source: str, runner: Runner)
     hard = HARD[source]
     grid = np.concatenate([[0.0, np.inf], np.geomspace(1e-5, 1e5, 500)])
     kept = []
-    for solve in (slicot.solve, lmi.solve):
+    for solve in (solve_slicot, lmi.solve):
         for size in ADDED if hard.irregular else (0.0, *ADDED):
             given = regularised(hard.plant, size) if size else hard.plant
             found = runner.call(LIMIT, solve, given, gamma_backoff=BACKOFF)

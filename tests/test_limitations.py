@@ -22,8 +22,7 @@ from ccd_casadi.limitations.limits import limits_of, magnitude
 from ccd_casadi.limitations.of_problem import limits_of_problem
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.facts import Zero
-from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
+from ccd_casadi.plants.facts import Zero, bandwidth_limit_hz
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.synthesis import synthesise

@@ -24,8 +24,8 @@ from surrogates import (
     loo_errors,
     quality_of,
 )
-from surrogates.calibration import calibrated
 from surrogates.covariance import observed_covariance
+from surrogates.maximum_likelihood import calibrated
 from surrogates.validation import held_out
 
 

@@ -116,9 +116,7 @@ def light_roots(controller: StateSpace, bandwidth: float) -> tuple[tuple[float, 
     return tuple(sorted(found))
 
 
-def step_response(
-    loop: Loop, direction: Array, seconds: float, points: int
-) -> tuple[Array, Array]:
+def step_response(loop: Loop, direction: Array, seconds: float, points: int) -> tuple[Array, Array]:
     """Times (k,) in s and y (k, p) after a unit step of the reference in `direction` (p,).
 
     Exact at the instants: those of a sampled loop, or `points` of a continuous one.

@@ -93,12 +93,7 @@ def evaluate_budget(
         return float(np.sqrt(sum(getattr(item, name) ** 2 for item in found)))
 
     return BudgetFigures(
-        found,
-        total("error"),
-        total("average"),
-        total("deviation"),
-        total("force"),
-        budget.window,
+        found, total("error"), total("average"), total("deviation"), total("force"), budget.window
     )
 
 

@@ -48,10 +48,7 @@ def points_to_check(problem: CoDesignProblem, seed: int = 0) -> list[tuple[float
 
 
 def diagnose(
-    problem: CoDesignProblem,
-    rigid_modes: int | None = None,
-    quiet: bool = True,
-    seed: int = 0,
+    problem: CoDesignProblem, rigid_modes: int | None = None, quiet: bool = True, seed: int = 0
 ) -> tuple[tuple[PlantFacts, ...], tuple[Finding, ...]]:
     """Facts and findings of the problem's plant over its box; `rigid_modes` are expected if given.
 

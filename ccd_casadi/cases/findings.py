@@ -13,9 +13,8 @@ from enum import StrEnum
 import numpy as np
 
 from ccd_casadi.inner_problem.problem import CoDesignProblem
-from ccd_casadi.plants.facts import PlantFacts, Zero
+from ccd_casadi.plants.facts import PlantFacts, Zero, bandwidth_limit_hz
 from ccd_casadi.plants.plant import Mechanics
-from ccd_casadi.plants.rhp_zeros import bandwidth_limit_hz
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
 

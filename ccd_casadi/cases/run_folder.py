@@ -230,9 +230,7 @@ def _with_directions(
     return replace(problem, controller=replace(sections, channels=channels))
 
 
-Reader = Callable[
-    [Path, Case, CoDesignProblem, tuple[float, ...], Mapping[str, Any]], FinishedRun
-]
+Reader = Callable[[Path, Case, CoDesignProblem, tuple[float, ...], Mapping[str, Any]], FinishedRun]
 _READERS: dict[type[ControllerProblem], Reader] = {
     MixedSensitivityProblem: _read_mixed,
     SectionsProblem: _read_sections,

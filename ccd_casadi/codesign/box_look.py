@@ -46,11 +46,7 @@ MESH = 13  # points a side over (ω_S, ω_T) for the optimistic values
 
 
 def look_over_box(
-    outer: Outer,
-    end: End,
-    points: int,
-    seed: int,
-    processes: tuple[GaussianProcess, ...] = (),
+    outer: Outer, end: End, points: int, seed: int, processes: tuple[GaussianProcess, ...] = ()
 ) -> BoxLook:
     """Look at `points` θ over the box for a J lower than that of an end.
 

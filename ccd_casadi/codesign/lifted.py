@@ -147,9 +147,7 @@ def fit_quantities(
 
 
 def update_quantities(
-    problem: CoDesignProblem,
-    samples: list[QuantitySample],
-    processes: tuple[GaussianProcess, ...],
+    problem: CoDesignProblem, samples: list[QuantitySample], processes: tuple[GaussianProcess, ...]
 ) -> tuple[GaussianProcess, ...]:
     """The same processes conditioned on more samples, hyperparameters kept but for their noise.
 

@@ -13,13 +13,7 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.design_plants import failure_words
-from ccd_casadi.codesign.direct import (
-    Direct,
-    acceptable,
-    polish,
-    solve_direct,
-    true_objective,
-)
+from ccd_casadi.codesign.direct import Direct, acceptable, polish, solve_direct, true_objective
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.front_learners import LiftedLearner

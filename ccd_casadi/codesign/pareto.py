@@ -15,11 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ccd_casadi.codesign.front_learners import Learner
-from ccd_casadi.codesign.outer_problem import (
-    NonlinearProgram,
-    OuterFailure,
-    solve_program,
-)
+from ccd_casadi.codesign.outer_problem import NonlinearProgram, OuterFailure, solve_program
 from ccd_casadi.codesign.sections_entries import bound_words
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.plant import hardware_cost

@@ -142,5 +142,3 @@ def concluded_at(
 def nothing_found(outer: Outer, words: str) -> Searched:
     """No design, and why."""
     return Searched(outer, FormulationResult(None, None, (), (), None, False, words), None, 0)
-
-

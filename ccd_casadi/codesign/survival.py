@@ -105,18 +105,14 @@ def shift_range(
 
 
 def damping_range(
-    loops: LoopsOffModel,
-    f: Callable[[Loop], float],
-    limits: tuple[float, float] = FACTORS,
+    loops: LoopsOffModel, f: Callable[[Loop], float], limits: tuple[float, float] = FACTORS
 ) -> tuple[float, float]:
     """The factors of damping around 1, within `limits`, up to which f <= 0."""
 
     def end(limit: float) -> float:
         size, sign = abs(math.log(limit)), math.copysign(1.0, math.log(limit))
         found = reach(
-            lambda x: f(loops.at(Perturbation(damping=math.exp(sign * x)))),
-            lambda x: E_FOLD,
-            size,
+            lambda x: f(loops.at(Perturbation(damping=math.exp(sign * x)))), lambda x: E_FOLD, size
         )
         return limit if found == size else math.exp(sign * found)
 
@@ -124,10 +120,7 @@ def damping_range(
 
 
 def survival_of(
-    problem: CoDesignProblem,
-    loops: LoopsOffModel,
-    bandwidth: float,
-    marks: Sequence[float] = (),
+    problem: CoDesignProblem, loops: LoopsOffModel, bandwidth: float, marks: Sequence[float] = ()
 ) -> Survival:
     """The figures of a problem's finished loop."""
     return survival(

@@ -36,4 +36,3 @@ def feedforward(plant: StateSpace, period: float, delay: float) -> Array:
     series = np.fft.fft(ahead, axis=0).real / POINTS
     powers = (RADIUS * nearest) ** np.arange(ORDER + 1)
     return np.asarray(series[: ORDER + 1] / powers[:, None, None])
-

@@ -230,4 +230,3 @@ def _polynomial(v: Mapping[str, float], root: str) -> tuple[float, float, float]
     if f"{root}_damping" not in v:
         return 0.0, 1.0 / w, 1.0
     return 1.0 / w**2, 2.0 * v[f"{root}_damping"] / w, 1.0
-

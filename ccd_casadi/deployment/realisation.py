@@ -43,9 +43,7 @@ class Realisation:
 
 
 def realise(
-    channels: Sequence[Channel],
-    controllers: Sequence[StateSpace],
-    saturation: float | None = None,
+    channels: Sequence[Channel], controllers: Sequence[StateSpace], saturation: float | None = None
 ) -> Realisation:
     """The controllers of all channels as one block-diagonal system from e to u."""
     parts, blocks = [], []

@@ -208,4 +208,3 @@ def _root(gramian: Array) -> Array:
 
 def _sizes(K: StateSpace) -> tuple[int, int, int]:
     return len(K.A), K.B.shape[1], K.C.shape[0]
-

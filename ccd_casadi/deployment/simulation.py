@@ -58,10 +58,7 @@ def simulate(
 
 
 def measure_set(
-    plants: Sequence[StateSpace],
-    controller: StateSpace,
-    bandwidth: float,
-    seed: int,
+    plants: Sequence[StateSpace], controller: StateSpace, bandwidth: float, seed: int
 ) -> tuple[MeasuredSensitivity, ...]:
     """S from a random-phase multisine on one reference after the other; ω_b to expect in rad/s.
 
@@ -112,4 +109,3 @@ def _crossing(omega: Array, gain: Array) -> float:
     x, y = np.log(omega), np.log(gain / HALF_POWER)
     i = above[0] - 1
     return float(np.exp(x[i] - y[i] * (x[i + 1] - x[i]) / (y[i + 1] - y[i])))
-

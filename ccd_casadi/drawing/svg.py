@@ -40,6 +40,7 @@ COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
 LONGEST_LABEL = 40
 
+
 @contextmanager
 def style() -> Iterator[None]:
     """Our style while a figure is built and written, and the caller's again after it."""

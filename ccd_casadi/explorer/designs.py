@@ -129,10 +129,7 @@ def elements_at(problem: CoDesignProblem, theta: Sequence[float]) -> Elements:
 
 
 def present(
-    problem: CoDesignProblem,
-    knobs: Knobs,
-    elements: Elements,
-    point: tuple[float, float],
+    problem: CoDesignProblem, knobs: Knobs, elements: Elements, point: tuple[float, float]
 ) -> Look:
     """One certified synthesis at θ and `point` = (ω_S, ω_T) in rad/s, clipped to the ranges."""
     began = perf_counter()

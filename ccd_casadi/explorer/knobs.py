@@ -68,10 +68,7 @@ def case_at(case: Case, knobs: Knobs) -> Case:
         case,
         theta=tuple(replace(parameter, start=value) for parameter, value in parameters),
         inner=replace(
-            case.inner,
-            S_max=knobs.S_max,
-            omega_S_hz=knobs.omega_S_hz,
-            omega_T_hz=knobs.omega_T_hz,
+            case.inner, S_max=knobs.S_max, omega_S_hz=knobs.omega_S_hz, omega_T_hz=knobs.omega_T_hz
         ),
         robust=replace(case.robust, resonance_shift=knobs.resonance_shift),
         loop=loop,

@@ -15,7 +15,6 @@ from ccd_casadi.support.package_text import package_text
 Change = tuple[Model, dict[str, Any]]  # a model, and new values of its properties
 
 
-
 class Message(DataModel):
     """Its content reaches every figure in one piece.
 

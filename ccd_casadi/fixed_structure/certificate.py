@@ -305,4 +305,3 @@ def _balanced(system: StateSpace) -> StateSpace:
 
 def _size(system: StateSpace) -> float:
     return float(np.abs(np.linalg.eigvals(system.A)).max())
-

@@ -152,9 +152,7 @@ def synthesise(
     runners = run_race(
         problem, np.array(field), lambda words: tell(f"whole loop: {words}"), workers
     )
-    return concluded(
-        problem, plants, sampling, runners, len(field), evaluations, seed, begun, tell
-    )
+    return concluded(problem, plants, sampling, runners, len(field), evaluations, seed, begun, tell)
 
 
 def _joined(

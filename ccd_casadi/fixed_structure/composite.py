@@ -136,12 +136,7 @@ def composite_problem(
 
 @assess.register
 def _(
-    problem: CompositeProblem,
-    kappa: Array,
-    tau: float,
-    *,
-    each: bool = False,
-    **depths: float,
+    problem: CompositeProblem, kappa: Array, tau: float, *, each: bool = False, **depths: float
 ) -> Assessment:
     found = [
         assess(part.problem, kappa[part.place], tau + part.lead, each=each, **depths)

@@ -144,9 +144,7 @@ def static_decoupling(measured: MeasuredResponse) -> Decoupling:
     return Decoupling(names, U, Vt.T)
 
 
-def _judged(
-    problem: LineProblem, kappa: Array, period: float | None, spent: int
-) -> MeasuredDesign:
+def _judged(problem: LineProblem, kappa: Array, period: float | None, spent: int) -> MeasuredDesign:
     """The controller at κ and what the judge says of it."""
     structure, bounds, plants = problem.structure, problem.bounds, problem.plants
     si = structure.in_units(kappa, plants.omega_0, plants.force)
@@ -160,9 +158,7 @@ def _judged(
     if broken:
         words = f"exceeds its bound on {', '.join(broken)} (relative); {words}"
     usable = figures.stable and figures.sure and not broken
-    return MeasuredDesign(
-        structure, si, K, figures.bandwidth, figures, usable, words, spent
-    )
+    return MeasuredDesign(structure, si, K, figures.bandwidth, figures, usable, words, spent)
 
 
 def _pool(problem: LineProblem, starts: int, rng: np.random.Generator) -> list[Array]:

@@ -5,7 +5,6 @@
 The parameters of all channels stand one after the other in κ = ln(values), g = ∂ln K_i/∂κ.
 """
 
-
 from ccd_casadi.kernels.compiled import compiled
 
 GAIN, INTEGRATOR, REAL, PAIR = 0, 1, 2, 3

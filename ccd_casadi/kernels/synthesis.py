@@ -6,11 +6,7 @@ from ccd_casadi.kernels.balance import balancing, in_coordinates, rounding_noise
 from ccd_casadi.kernels.blocks import add, symmetric_part, transposed
 from ccd_casadi.kernels.bound_peak import bound_error
 from ccd_casadi.kernels.compiled import compiled
-from ccd_casadi.kernels.disturbance import (
-    disturbance_bound,
-    filter_solution,
-    innovations_plant,
-)
+from ccd_casadi.kernels.disturbance import disturbance_bound, filter_solution, innovations_plant
 from ccd_casadi.kernels.figures import Code, Figure
 from ccd_casadi.kernels.frequency import prepare
 from ccd_casadi.kernels.gamma import gamma_lower_bound, optimal_gamma

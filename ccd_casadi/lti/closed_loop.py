@@ -1,6 +1,6 @@
 """The loop of a plant and a controller: one closed-loop matrix, and every response out of it.
 
-    e = r - y,   u = K e,   y = G (u + d)
+e = r - y,   u = K e,   y = G (u + d)
 """
 
 from dataclasses import dataclass

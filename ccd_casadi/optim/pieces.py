@@ -77,10 +77,7 @@ class _Pieces(Model[Local]):
     carried = True
 
     def __init__(
-        self,
-        J: Callable[[Array], Local | None],
-        pieces: list[Local],
-        constraints: Constraints,
+        self, J: Callable[[Array], Local | None], pieces: list[Local], constraints: Constraints
     ) -> None:
         self.J, self.pieces, self.constraints = J, pieces, constraints
         self.low, self.high = np.zeros(pieces[0].z.size), np.ones(pieces[0].z.size)

@@ -20,8 +20,7 @@ HEIGHT = 3.0  # inches of a row
 
 
 def glance(
-    problem: CoDesignProblem, theta: Sequence[float], view: LoopView,
-    move: tuple[Lines, str, Table],
+    problem: CoDesignProblem, theta: Sequence[float], view: LoopView, move: tuple[Lines, str, Table]
 ) -> Section:
     """Of a design on the plants that it is made for."""
     error, caption, numbers = move

@@ -58,8 +58,10 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
     answers = [Words(text) for text in response_sentences(responses)]
     sections = (
         Section("Weight against bandwidth", (drawn, *front_walk(run, front))),
-        Section("What each parameter of the case would change",
-                (*answers, table_responses(problem, responses))),
+        Section(
+            "What each parameter of the case would change",
+            (*answers, table_responses(problem, responses)),
+        ),
         Section("What limits the bandwidth", _limits(run, rule)),
     )
     return Page(head, sections, index)

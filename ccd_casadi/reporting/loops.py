@@ -24,11 +24,7 @@ PEAK = 1.05  # |S| of a local maximum that is worth a word
 
 
 def synthesised_loop(
-    problem: CoDesignProblem,
-    theta: Sequence[float],
-    omega_S: float,
-    omega_T: float,
-    label: str,
+    problem: CoDesignProblem, theta: Sequence[float], omega_S: float, omega_T: float, label: str
 ) -> LoopView:
     """The loop of the design at (θ, ω_S, ω_T), rad/s, synthesised anew."""
     plant, inner = scaled_plant(problem, theta), problem.inner
@@ -60,9 +56,7 @@ def run_view(run: FinishedRun) -> LoopView:
     )  # fmt: skip
 
 
-def over_hz(
-    label: str, curves: Sequence[Curve], ends: tuple[float, float], **more: Any
-) -> Panel:
+def over_hz(label: str, curves: Sequence[Curve], ends: tuple[float, float], **more: Any) -> Panel:
     """Gains over frequency, both axes logarithmic."""
     kept = {"log_y": True, **more}
     return Panel("frequency (Hz)", label, tuple(curves), log_x=True, x_range=ends, **kept)

@@ -33,9 +33,7 @@ from ccd_casadi.support.units import HZ, number
 HEIGHT = 3.0  # inches of a row
 
 
-def measured_page(
-    case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]
-) -> Page:
+def measured_page(case: MeasuredCase, controller: StateSpace, answer: Mapping[str, Any]) -> Page:
     """report.html of a stable design; `answer` is what `inner` prints of it."""
     good = answer["status"] == "verified"
     lines = f"{len(case.responses[0].hz)} lines of {case.file}"

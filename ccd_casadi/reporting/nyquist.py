@@ -41,4 +41,3 @@ def loci_of(L: np.ndarray, far: float = FAR) -> np.ndarray:
             away = np.abs(values[i - 1][:, None] - values[i][None, :])
             values[i] = values[i][linear_sum_assignment(away)[1]]
     return np.where(np.abs(values) <= far, values, np.nan)
-

@@ -127,9 +127,7 @@ def solve_head(case: Case, result: Mapping[str, Any]) -> Head:
     return run_head(f"Co-design of {named}", result, meta, conclusion_of(result))
 
 
-def _parts(
-    folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution"
-) -> list[Part]:
+def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Solution") -> list[Part]:
     """What makes the sections, in their order."""
     verified, result = solution.verified, solution.result
     if verified is None:
@@ -175,9 +173,7 @@ def design_parts(
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
         "move": move_section,
-        "force": lambda: [
-            Section("A step of force", (force_step(loops(), view().bandwidth_hz),))
-        ],
+        "force": lambda: [Section("A step of force", (force_step(loops(), view().bandwidth_hz),))],
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_section(own, theta, K),
     }
@@ -185,9 +181,11 @@ def design_parts(
         return parts | {"loop": lambda: _loop(own, theta, K, view())}
     return parts | {
         "controller": lambda: [Section("The controller", controller_blocks(result))],
-        "limits": lambda: [
-            Section("What limits the bandwidth", limits_blocks(problem, result))
-        ] if "costs" in result else [],
+        "limits": lambda: (
+            [Section("What limits the bandwidth", limits_blocks(problem, result))]
+            if "costs" in result
+            else []
+        ),
         "loop": lambda: [Section("Closed loop on every plant", (gains(view()),))],
     }
 

@@ -50,9 +50,7 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     """`survives      warned   stable for ...`, wrapped under their words."""
     found = []
     for line in lines_of(result):
-        found.append(
-            wrapped(f"{line.name:14s}{line.state:9s}{line.words}", columns(sys.stdout))
-        )
+        found.append(wrapped(f"{line.name:14s}{line.state:9s}{line.words}", columns(sys.stdout)))
     return found
 
 

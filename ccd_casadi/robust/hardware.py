@@ -142,9 +142,7 @@ def _hardware(
         return None
 
 
-def _hardware_unit(
-    task: tuple[int, FinishedRun, tuple[float, ...]],
-) -> tuple[int, Judged | None]:
+def _hardware_unit(task: tuple[int, FinishedRun, tuple[float, ...]]) -> tuple[int, Judged | None]:
     index, run, theta = task
     return index, _hardware(run, theta)
 

@@ -55,11 +55,7 @@ def spent_entry(spent: Mapping[str, int], moved: bool = False) -> dict[str, Any]
     """
     total = sum(spent.values())
     beside = 0 if moved else spent.get("box_look", 0)
-    return {
-        "syntheses": total,
-        "syntheses_to_optimum": total - beside,
-        "spent": dict(spent),
-    }
+    return {"syntheses": total, "syntheses_to_optimum": total - beside, "spent": dict(spent)}
 
 
 def was_moved(result: Mapping[str, Any]) -> bool:

@@ -10,12 +10,7 @@ import numpy as np
 
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
 from ccd_casadi.inner_problem.kinds import bandwidth_gradient
-from ccd_casadi.inner_problem.problem import (
-    CoDesignProblem,
-    frequencies,
-    true_design,
-    true_inner,
-)
+from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design, true_inner
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import InnerProblem, InnerResult
@@ -26,9 +21,7 @@ from ccd_casadi.sampling.samples import sample_of
 Unit = tuple[list[Sample], tuple[str, tuple[float, ...], dict]]
 
 
-def inner_unit(
-    task: tuple[CoDesignProblem, str, str, tuple[float, ...]],
-) -> Unit:
+def inner_unit(task: tuple[CoDesignProblem, str, str, tuple[float, ...]]) -> Unit:
     """Solve the inner problem at one θ; every synthesis becomes a row."""
     problem, problem_key, key, theta = task
     return UNITS[type(problem.controller)](problem, problem_key, key, theta)

@@ -146,9 +146,7 @@ def _descents(
     return sorted(found, key=lambda d: (d.gradient, d.start, d.first_step))
 
 
-def _descend(
-    task: tuple[CoDesignProblem, tuple[float, ...], Gradient, float, int],
-) -> Descent:
+def _descend(task: tuple[CoDesignProblem, tuple[float, ...], Gradient, float, int]) -> Descent:
     problem, start, gradient, step, iterations = task
     began = perf_counter()
     descent = steepest_descent(

@@ -133,12 +133,7 @@ def steepest_descent(
 
 
 def _iterate(
-    problem: CoDesignProblem,
-    theta: Array,
-    answer: Answer,
-    gradient: Array,
-    step: float,
-    spent: int,
+    problem: CoDesignProblem, theta: Array, answer: Answer, gradient: Array, step: float, spent: int
 ) -> DescentIterate:
     return DescentIterate(
         theta=tuple(float(v) for v in theta),

@@ -95,17 +95,13 @@ def _peaks(
     poles = closed_loop(plant.system, StateSpace(Ak, Bk, Ck, Dk)).S.poles
     near = around(poles[poles.imag > 0.0], FLANKS)
     low, high = float(plant.grid[0]), float(plant.grid[-1])
-    grid = np.ascontiguousarray(
-        frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=APART)
-    )
+    grid = np.ascontiguousarray(frequency_grid(low, high, 2, plant.grid, BROAD, near, apart=APART))
     G, K = prepare(plant.A, plant.B, plant.C), prepare(Ak, Bk, Ck)
     gain = sensitivity_gains(G, K, Dk, grid)
     found = []
     for i in local_maxima(gain):
         if gain[i] >= 0.98 * least:
-            omega, top = climbed(
-                lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1]
-            )
+            omega, top = climbed(lambda w: sensitivity_gain(G, K, Dk, w), grid[i - 1], grid[i + 1])
             if top >= least:
                 found.append((omega, top))
     return found

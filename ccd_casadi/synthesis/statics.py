@@ -103,4 +103,3 @@ def compliance_words(most: float, at_rest: float, low: float, low_hz: float) -> 
     """
     rest = f"{1e6 * at_rest:.4g} um/N at rest" if at_rest else "none at rest (an integrator)"
     return f"{1e6 * most:.4g} um/N at most, {1e6 * low:.4g} um/N at {low_hz:.3g} Hz, {rest}"
-

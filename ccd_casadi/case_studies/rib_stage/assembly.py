@@ -187,8 +187,7 @@ def _sorted_by(key: np.ndarray, size: int) -> np.ndarray:
     """The stable order of whole numbers below `size`, in linear time: a transposed CSR matrix."""
     count = len(key)
     bins = sparse.csr_matrix(
-        (np.ones(count, dtype=bool), key, np.arange(count + 1, dtype=np.int32)),
-        shape=(count, size),
+        (np.ones(count, dtype=bool), key, np.arange(count + 1, dtype=np.int32)), shape=(count, size)
     )
     return bins.tocsc().indices
 

@@ -15,7 +15,7 @@ from ccd_casadi.case_studies.rib_stage.truncation import TWENTY, ModeCount
 from ccd_casadi.cases.checks import FRACTION, POSITIVE, choice, number, rows
 from ccd_casadi.drawing.content import Figure
 from ccd_casadi.plants.eigenpairs import StageError
-from ccd_casadi.plants.ordered import Ordered
+from ccd_casadi.plants.fixed import Ordered
 from ccd_casadi.plants.plant import Evaluate, Plant
 from ccd_casadi.plants.registry import Model
 from ccd_casadi.support.process_pool import Pool
@@ -100,9 +100,7 @@ def plant_of_stage(stage: RibStage, names: Sequence[str] = NAMES) -> Plant:
     )
 
 
-def _drawing(
-    stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]
-) -> Figure:
+def _drawing(stage: RibStage, order: Ordered, thetas: Mapping[str, Sequence[float]]) -> Figure:
     from ccd_casadi.case_studies.rib_stage.drawing import drawing  # matplotlib is slow to import
 
     return drawing(stage.geometry, {name: order.own(theta) for name, theta in thetas.items()})

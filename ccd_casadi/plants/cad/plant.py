@@ -12,7 +12,7 @@ from ccd_casadi.plants.cad.elements import Body, Material
 from ccd_casadi.plants.cad.modes import Reduced, mode_shapes, reduced
 from ccd_casadi.plants.cad.morph import Morph, read_morph
 from ccd_casadi.plants.cad.solid import volumes
-from ccd_casadi.plants.ordered import Ordered
+from ccd_casadi.plants.fixed import Ordered
 from ccd_casadi.plants.plant import Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback

@@ -6,6 +6,7 @@ harmonic extension and is put back on the face by the nearest point. Nodes withi
 harmonic extension too. So faces may grow, tilt and curve; their number and neighbours stay.
 """
 
+import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -14,9 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from ccd_casadi.plants.cad.boundary import Boundary, boundary_of, edge_points, paired
-from ccd_casadi.plants.cad.extension import extended
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError, require
 
@@ -167,3 +169,36 @@ def volumes(points: Array, tets: np.ndarray) -> Array:
     """(t,) signed volumes in m³."""
     corners = points[tets]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+
+
+def laplacian(points: Array, simplices: np.ndarray) -> sparse.csc_matrix:
+    """∫ ∇φ_a·∇φ_b of linear elements on triangles or tetrahedra in space, (n, n).
+
+    `points` (n, 3), `simplices` (e, 3) or (e, 4). With the edges E from a simplex' first corner
+    and G = E Eᵀ, gradients in its own plane are G⁻¹ E, so that a triangle needs no coordinates
+    of its surface.
+    """
+    corners, k = points[simplices], simplices.shape[1] - 1
+    edges = corners[:, 1:] - corners[:, :1]
+    metric = edges @ edges.transpose(0, 2, 1)
+    volume = np.sqrt(np.linalg.det(metric)) / math.factorial(k)
+    steps = np.vstack([-np.ones(k), np.eye(k)])  # of the corners' own functions along the edges
+    local = volume[:, None, None] * (steps @ np.linalg.inv(metric) @ steps.T)
+    rows = np.repeat(simplices, k + 1, axis=1).ravel()
+    columns = np.tile(simplices, k + 1).ravel()
+    size = len(points)
+    return sparse.coo_matrix((local.ravel(), (rows, columns)), shape=(size, size)).tocsc()
+
+
+def extended(points: Array, simplices: np.ndarray, known: np.ndarray, values: Array) -> Array:
+    """Values (n, d), those at the nodes `known` as given (k, d), harmonic at the mesh's others.
+
+    Nodes that the mesh does not touch are zero. A linear function of space is its own extension.
+    """
+    out = np.zeros((len(points), values.shape[1]))
+    out[known] = values
+    free = np.setdiff1d(simplices, known)
+    if free.size:
+        L = laplacian(points, simplices)[free]
+        out[free] = splu(L[:, free].tocsc()).solve(-(L[:, known] @ values))
+    return out

@@ -108,12 +108,7 @@ def _groups(omega: Array, rigid: int) -> Groups:
 
 
 def _frame(
-    name: str,
-    shapes: Array,
-    permutation: Index,
-    order: Index,
-    parents: Index,
-    groups: Groups,
+    name: str, shapes: Array, permutation: Index, order: Index, parents: Index, groups: Groups
 ) -> Frame:
     """Signs along the tree; then each group turned next to the reference sample's."""
     N, r = permutation.shape
