@@ -97,6 +97,23 @@ def test_rows_on_lines_have_their_derivatives() -> None:
     np.testing.assert_allclose(slope, difference, atol=1e-6)
 
 
+def test_a_resonance_narrower_than_the_lines_is_not_sure() -> None:
+    """It may encircle -1 between two lines; what the lines show of it is that the phase falls."""
+    whole = measured(None)
+    problem, kappa = loop(0, PID)
+    K = state_space(PID, PID.in_units(kappa, problem.plants.omega_0, problem.plants.force))
+    L = whole.G * K.response(HZ * whole.hz)[:, 0, 0]
+    i = int(np.flatnonzero(np.abs(L) > 0.3)[-1])
+    ends, omega = HZ * whole.hz[i : i + 2], HZ * whole.hz
+    at, half = float(ends.mean()), 0.5 * float(np.ptp(ends))
+    for width, sure in ((0.2, False), (20.0, True)):  # of the resonance, in half steps
+        zeta = width * half / at
+        mode = 6.0 * abs(whole.G[i]) * at * half / (at**2 - omega**2 + 2j * zeta * at * omega)
+        found = judge(MeasuredResponse(whole.hz, whole.G + mode), K, BOUNDS)
+        assert ("narrower than the lines" not in found.words) == sure, found.words
+        assert sure or not found.sure
+
+
 def test_what_the_data_do_not_show_is_said() -> None:
     whole = measured(None)
     problem, kappa = loop(0, PID)
