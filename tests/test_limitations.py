@@ -133,7 +133,7 @@ def test_the_command_prints_the_bounds(capsys: pytest.CaptureFixture[str]) -> No
     assert main([str(ROOT / "runs" / "two_mass_built.toml"), "--theta", "m1=60,m2=60"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["theta"] == {"m1": 60.0, "m2": 60.0}
-    assert 0.0 < answer["gap"]["inside_hz"] < answer["gap"]["outside_hz"]
+    assert 0.0 < answer["gap"]["inside_hz"] < answer["gap"]["bandwidth_bound_hz"]
     assert main([str(ROOT / "runs" / "two_mass.toml")]) == 2
     assert "sections" in capsys.readouterr().err
 

@@ -109,7 +109,7 @@ def test_no_controller_exceeds_what_the_run_says(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     result = json.loads((folder / "run" / "result.json").read_text())
-    bound = result["gap"]["outside_hz"]
+    bound = result["gap"]["bandwidth_bound_hz"]
     assert bound >= result["costs"]["on_model_hz"] >= result["bandwidth_hz"]
     assert f"no controller of any order exceeds {bound:.2f} Hz" in (
         result["verdict"]["optimal"]["words"]

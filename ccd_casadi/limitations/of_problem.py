@@ -43,9 +43,19 @@ class Gap:
         )
 
     def entry(self, bandwidth: float = np.nan) -> dict[str, Any]:
-        """Of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1; null: not known."""
-        hz = {"outside_hz": self.outside / HZ, "inside_hz": self.inside / HZ or np.nan}
-        return clean(hz | {"relative": self.outside / bandwidth - 1.0, "channel": self.channel})
+        """Of result.json: Hz, and the bound over a design's ω_b (rad/s) less 1; null: not known.
+
+        `objective_bound`, of J over θ, is not known yet.
+        """
+        found = {
+            "bandwidth_bound_hz": self.outside / HZ,
+            "inside_hz": self.inside / HZ or np.nan,
+            "relative": self.outside / bandwidth - 1.0,
+            "channel": self.channel,
+            "objective_bound": np.nan,
+            "words": self.words(bandwidth) if np.isfinite(bandwidth) else "",
+        }
+        return clean(found)
 
 
 def gap_of(problem: CoDesignProblem, theta: Sequence[float], within: bool = True) -> Gap:

@@ -98,7 +98,12 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
     loop = "sampled" if sampled else "continuous"
     whole = f"{counted(result['certificate']['plants'], 'plant')} of the set"
     rows = [
-        ("no controller of any order exceeds", "the model alone", loop, hz(gap.get("outside_hz"))),
+        (
+            "no controller of any order exceeds",
+            "the model alone",
+            loop,
+            hz(gap.get("bandwidth_bound_hz")),
+        ),
         ("sections", "the model alone", loop, hz(costs["on_model_hz"])),
         *([("sections", whole, "continuous", hz(costs["continuous_hz"]))] if sampled else []),
         ("sections: the design", whole, loop, hz(result["bandwidth_hz"])),
