@@ -41,9 +41,13 @@ def searched(
     """Formulation and polish, again with what the inner problem at the end has found better."""
     outer = outer.prepared(seed)
     rounds = 0
+    end: End | None = None
     while True:
         rounds += 1
-        outcome = outer.formulated(formulation, seed, given)
+        if end is None or not isinstance(formulation, Direct):
+            outcome = outer.formulated(formulation, seed, given)
+        else:  # which goes on from its end
+            outcome = replace(outcome, x=end.x)
         if outcome.x is None:
             outcome = outer.rescued(outcome, seed)
         if outcome.x is None:
