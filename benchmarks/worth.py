@@ -20,7 +20,8 @@ from ccd_casadi.worth import main as worth
 ROOT = Path(__file__).parent.parent
 CASES = ("runs/two_mass.toml", "runs/two_mass_paper.toml", "runs/two_mass_built.toml",
          *(f"examples/{name}/case.toml" for name in (
-             "guided_beam", "planar_stage", "three_mass_axis", "two_axes", "modal_table")))  # fmt: skip
+             "guided_beam", "planar_stage", "three_mass_axis", "two_axes",
+             "modal_table")))  # fmt: skip
 COLUMNS = ("case", "cost %", "solve", "Hz %", "solve ", "open %", "syntheses", "s", "solve's s")
 
 

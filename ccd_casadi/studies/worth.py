@@ -12,7 +12,7 @@ from ccd_casadi.codesign.outer_problem import OuterFailure, solve_program
 from ccd_casadi.codesign.run import outer_of
 from ccd_casadi.inner_problem.constraints import unmet
 from ccd_casadi.inner_problem.objective import objective
-from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.reporting.facts import cost_words, theta_words
 from ccd_casadi.reporting.landscape import predicted
@@ -25,8 +25,8 @@ from surrogates import design
 
 SECONDS = 20.0  # after which no further round begins
 STARTS = 8  # of IPOPT, on the hardware and on the surrogates
-PER_VARIABLE = 4  # designs that the surrogates begin with
-SETTLED = 1e-3  # of |J|: a round that gains less is the last
+LOOKS = 8  # true inner problems over the box for each parameter
+SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last
 LOOKED = 256  # θ at which the surrogates are asked what they leave open
 SIGMAS = 2.0  # above what they predict
 
@@ -43,25 +43,32 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
     )
     outer = outer_of(sampler).prepared(seed)
     sampler, problem = outer.sampler, outer.problem
+    count = len(problem.names)
+    spread = design("sobol", *box(problem), LOOKS * count, seed)
     known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
+    for i in range(0, len(spread), 2 * count):
+        if perf_counter() - began < 0.5 * SECONDS:
+            known += sampler.bandwidths(spread[i : i + 2 * count], "a look over the box")
     best = min(known, key=lambda sample: _value(problem, sample))
-    learner = outer.learner(PER_VARIABLE * len(outer.bounds[0]), seed)
+    learner = outer.learner(LOOKS // 2 * len(outer.bounds[0]), seed)
     learner.begin(None)
+    feasible = [sample for sample in known if sample.feasible]
+    learner.learn(np.array([learner.point(sample) for sample in feasible]), feasible)
     while True:
         before, starts = _value(problem, best), design("sobol", *learner.bounds, STARTS, seed)
         if np.isfinite(before):
             starts = np.vstack([starts, learner.point(best)])
         try:
-            x = solve_program(learner.program(), starts).best.x
+            expected = solve_program(learner.program(), starts).best
         except OuterFailure:  # the surrogates expect a feasible design nowhere
             break
-        new = sampler.bandwidths(outer.theta_of(x), "the best expected")[0]
+        new = sampler.bandwidths(outer.theta_of(expected.x), "the best expected")[0]
         best = min(best, new, key=lambda sample: _value(problem, sample))
-        if _value(problem, best) >= before - SETTLED * abs(before):
+        level = SETTLED * abs(_value(problem, best))
+        true = abs(_value(problem, new) - expected.objective) <= level
+        if (true and before - _value(problem, best) <= level) or perf_counter() - began > SECONDS:
             break
-        if perf_counter() - began > SECONDS:
-            break
-        rows = [x, learner.point(new)] if new.feasible else [x]
+        rows = [expected.x, learner.point(new)] if new.feasible else [expected.x]
         learner.learn(np.array(rows), [new] * len(rows))
     if not np.isfinite(_value(problem, best)):
         raise UserError(f"no feasible design was found: {known[0].shortfall}")
@@ -101,7 +108,7 @@ def _left_open_hz(problem: CoDesignProblem, learner: Learner, best: float, seed:
     Never less than their error at samples that were left out.
     """
     error = SIGMAS * learner.processes[0].loo.rms / HZ
-    thetas = design("sobol", np.array(problem.lower), np.array(problem.upper), LOOKED, seed)
+    thetas = design("sobol", *box(problem), LOOKED, seed)
     hz, deviation = predicted(problem, learner.processes, thetas, std=True)
     hopeful = zip(thetas, HZ * (hz + np.hypot(SIGMAS * deviation, error)), strict=True)
     values = [
