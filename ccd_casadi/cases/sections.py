@@ -5,25 +5,29 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.checks import (
     ABOVE_ONE,
     FRACTION,
+    NOT_NEGATIVE,
     POSITIVE,
     choice,
+    coordinates,
     count,
     factors,
     files,
     interval,
     key,
     number,
+    places,
     points,
     signed,
     tables,
     text,
+    text_or_rows,
 )
 from ccd_casadi.cases.controller_sections import (
     BaselineSection,
@@ -249,6 +253,41 @@ class RobustSection:
 
 
 @dataclass(frozen=True)
+class PlacesSection:
+    """[places]: forces and sensors between the nodes of a plant, see `plants.places`; m and kg.
+
+    A coordinate is a number, the name of a [theta], or that name after a minus sign.
+    """
+
+    nodes: str | tuple[tuple[float, ...], ...] = key(
+        text_or_rows,
+        (),
+        says="of the plant's inputs, each a unit force there, in their order: a CSV file of a row of "
+        "coordinates each, after a header, or the rows",
+        unit="m",
+    )
+    actuators: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each force: numbers, or names of [theta]", unit="m"
+    )
+    sensors: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each sensor; absent: the plant's own outputs", unit="m"
+    )
+    actuator_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each force", unit="kg")
+    sensor_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each sensor", unit="kg")
+    apart: float = key(
+        NOT_NEGATIVE, 0.0, says="least distance of two forces, and of two sensors", unit="m"
+    )
+    present: tuple[float | str, ...] = key(
+        coordinates,
+        (),
+        says="one for each force: 1 where it is there, 0 where not, or the name of a [theta] with "
+        "values = [0, 1]; absent: all are there",
+    )
+    at_most: int | None = key(count(1), None, says="so many of the forces are there at most")
+    actuator_cost: float = key(NOT_NEGATIVE, 0.0, says="what each force that is there adds to f")
+
+
+@dataclass(frozen=True)
 class BudgetSection:
     """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
 
@@ -287,6 +326,7 @@ class Case(Shown):
     outer: OuterSection
     baseline: BaselineSection
     limits: LimitsSection
+    places: PlacesSection = field(default_factory=PlacesSection)
     fixed: tuple[Parameter, ...] = ()
 
 
@@ -295,6 +335,7 @@ SECTIONS: dict[str, type] = {
     "weights": WeightsSection,
     "inner": InnerSection,
     "suspension": SuspensionSection,
+    "places": PlacesSection,
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,
