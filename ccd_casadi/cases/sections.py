@@ -262,8 +262,8 @@ class PlacesSection:
     nodes: str | tuple[tuple[float, ...], ...] = key(
         text_or_rows,
         (),
-        says="of the plant's inputs, each a unit force there, in their order: a CSV file of a row of "
-        "coordinates each, after a header, or the rows",
+        says="of the plant's inputs, each a unit force there, in their order: a CSV file with a "
+        "row of coordinates each after a header, or the rows",
         unit="m",
     )
     actuators: tuple[tuple[float | str, ...], ...] = key(

@@ -104,8 +104,8 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         error = between.left_out(_flexible(whole)[1].T @ whole.B)
         return (
             *plant.notes(below(theta)),
-            f"forces and sensors stand between {len(nodes)} nodes: left out, a node is predicted "
-            f"from the others to {100.0 * error:.2g} % of the mode's largest displacement",
+            f"forces and sensors stand between {len(nodes)} nodes: an inner one, left out, is "
+            f"predicted to {100.0 * error:.2g} % of a mode's largest displacement at worst",
         )
 
     whole = of(plant.evaluate)
@@ -156,10 +156,17 @@ class Between:
         return np.concatenate([kernel, power]) @ self._inverse, slopes / self.size
 
     def left_out(self, values: Array) -> float:
-        """How far any node of fields (n, N) is from what the others say, over a field's largest."""
-        count = len(self.nodes)
+        """How far fields (n, N) at an inner node are from what the others say, over their largest.
+
+        Nodes at the edge are not counted: beyond the others nothing is interpolated.
+        """
+        count, inner = (
+            len(self.nodes),
+            (np.abs(self._at) < np.abs(self._at).max(axis=0)).all(axis=1),
+        )
         gap = (self._inverse[:count] @ values.T) / np.diag(self._inverse[:count])[:, None]
-        return float((np.abs(gap).max(axis=0) / np.abs(values).max(axis=1)).max(initial=0.0))
+        share = np.abs(gap[inner]) / np.abs(values).max(axis=1, initial=1e-300)
+        return float(share.max(initial=0.0))
 
     def _row(self, at: Array) -> tuple[Array, Array, Array, Array]:
         """Kernel and polynomial at a scaled point, and their slopes (., d)."""
@@ -310,11 +317,14 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
 
 def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
     """λ by name: least distances, where θ moves them, and how many actuators there may be."""
-    found = {}
-    for word, group in (("actuators", of.actuators), ("sensors", of.sensors)):
+    found, seen = {}, set()
+    for word, points, group in (("actuators", places.actuators, of.actuators),
+                                ("sensors", places.sensors, of.sensors)):  # fmt: skip
         at = group.symbols(theta) if places.apart else []
         for i, j in combinations(range(len(at)), 2):
-            if (group.slope[i] != group.slope[j]).any():
+            pair = frozenset((points[i], points[j]))  # a force and its sensor are at one place
+            if (group.slope[i] != group.slope[j]).any() and pair not in seen:
+                seen.add(pair)
                 away = at[i] - at[j]
                 found[f"{word} {i + 1} and {j + 1} apart"] = 1.0 - ca.sumsqr(away) / places.apart**2
     if places.at_most is not None:
