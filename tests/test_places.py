@@ -1,6 +1,7 @@
 """Forces and sensors between nodes: exact on what it is exact on, slopes, masses, the case file."""
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -9,6 +10,7 @@ import pytest
 from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import eigh
 
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
@@ -76,13 +78,43 @@ def test_slopes_are_those_of_differences(at: tuple[float, float], z: float, seed
     places = Places(GRID, POINTS, POINTS[:2], 0.4, 0.1, present=("z", 1.0, 0.5))
     plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
     theta = np.array([at[0], 1.3, z, at[1]])
+    compare_slopes(plant, theta)
+
+
+def compare_slopes(plant: Plant, theta: np.ndarray) -> None:
     system = mechanics(plant, theta)
-    for i, unit in enumerate(np.eye(4)):
+    for i, unit in enumerate(np.eye(len(theta))):
         near = [mechanics(plant, theta + 1e-3 * k * unit) for k in (-2, -1, 1, 2)]
         for part, exact in zip("MDKBC", system.derivatives, strict=True):
             found = np.tensordot([1, -8, 8, -1], [getattr(one, part) for one in near], 1) / 12e-3
             size = max(1.0, float(np.abs(exact[i]).max()))
-            assert np.abs(found - exact[i]).max() < 1e-6 * size
+            assert np.abs(found - exact[i]).max() < 1e-6 * size, (part, i)
+
+
+SIX = (("x", "y"), ("-x", 0.13), (0.05, "-y"), (-0.2, -0.1), (0.22, 0.1), (-0.1, 0.02))
+
+
+@few(20)
+@given(inside, st.floats(0.3, 0.95), st.integers(0, 99))
+def test_axes_leave_quiet_modes_alone_and_have_slopes(
+    at: tuple[float, float], z: float, seed: int
+) -> None:
+    """Forces of length 1 along 1, x, y and a damped mode, none on the quiet one."""
+    present = ("z", *(1.0,) * 5)
+    places = Places(GRID, SIX, SIX, 0.4, 0.1, present=present, axes=True, quiet=(1,), damped=(3,))
+    free = placed(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "z", "y"))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
+    theta = np.array([at[0], 1.3, z, at[1]])
+    system, apart = mechanics(plant, theta), mechanics(free, theta)
+    assert (plant.inputs, plant.outputs, system.B.shape) == (4, 4, (7, 4))
+    lam, modes = eigh(system.K, system.M)
+    quiet = modes[:, 3]
+    assert np.abs(quiet @ system.B).max() < 1e-9 * np.abs(quiet @ apart.B).max()
+    assert np.abs(system.C @ quiet).max() < 1e-9 * np.abs(apart.C @ quiet).max()
+    V = np.linalg.lstsq(apart.B, system.B, rcond=None)[0]
+    assert pytest.approx(np.eye(4), abs=1e-8) == V.T @ V
+    if np.diff(lam[3:]).min() > 0.02 * lam[3]:  # where two modes come close slopes are steep
+        compare_slopes(plant, theta)
 
 
 @few(20)

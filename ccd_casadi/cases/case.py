@@ -138,6 +138,10 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
         plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
     sections["robust"] = replace(sections["robust"], plants=absolute)
     theta, fixed = theta_tables(data["theta"], plant.model, place_names(sections["places"]), fail)
+    for parameter in fixed:
+        if parameter.varies and controller.structure != "sections":
+            words = 'needs controller.structure = "sections"; choose that, or drop it'
+            raise fail(f"theta.{parameter.name}.varies", words)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
 
 
@@ -163,7 +167,7 @@ def section_of(
         value = table[key]
         if isinstance(value, list):
             numbers = all(isinstance(v, int | float) for v in value)
-            kept = item.type == tuple[int, int] or not numbers
+            kept = item.type in (tuple[int, int], tuple[int, ...]) or not numbers
             value = tuple(v if kept else float(v) for v in value)
         elif item.type in (float, float | None):
             value = float(value)

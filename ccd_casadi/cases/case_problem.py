@@ -74,7 +74,12 @@ def problem_of(case: Case) -> CoDesignProblem:
         method=inner.method,
         robust=None if structured else _robust(case.robust),
         controller=sections_problem(
-            case.controller, case.loop, case.robust, inner, _option_sets(case)
+            case.controller,
+            case.loop,
+            case.robust,
+            inner,
+            _option_sets(case),
+            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
         )
         if structured
         else MixedSensitivityProblem(),

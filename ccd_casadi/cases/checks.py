@@ -162,6 +162,13 @@ def places(value: Any) -> str | None:
     return f'is {shown(value)}; give rows of numbers and names of [theta], as [["x", 0.1]]'
 
 
+@_with(_list({"type": "integer", "minimum": 1}))
+def numbers_of_modes(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and all(count(1)(item) is None for item in value):
+        return None
+    return f"is {shown(value)}; give a list of whole numbers from 1"
+
+
 @_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
 def text_or_rows(value: Any) -> str | None:
     width = len(value[0]) if isinstance(value, list | tuple) and value and value[0] else 1

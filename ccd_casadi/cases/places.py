@@ -19,6 +19,8 @@ def checked_places(section: PlacesSection, folder: Path, fail: Fail) -> PlacesSe
     for name in ("nodes", "actuators"):
         if not getattr(section, name):
             raise fail(f"places.{name}", "is missing; add it")
+    if (section.quiet or section.damped) and not section.axes:
+        raise fail("places.axes", "is false, and quiet and damped modes are of axes; give true")
     rows = section.nodes
     if isinstance(rows, str):
         try:

@@ -19,9 +19,11 @@ from ccd_casadi.cases.checks import (
     count,
     factors,
     files,
+    flag,
     interval,
     key,
     number,
+    numbers_of_modes,
     places,
     points,
     signed,
@@ -55,7 +57,8 @@ class Parameter:
     """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter.
 
     `values`: those that it may have, in rising order, from `lower` to `upper`; none: all between
-    the bounds. With one value it is fixed, and no part of θ.
+    the bounds. With one value it is fixed, and no part of θ. One that `varies` is none either: what
+    is designed holds between its bounds.
     """
 
     name: str
@@ -64,6 +67,7 @@ class Parameter:
     start: float
     unit: str
     values: tuple[float, ...] = ()
+    varies: bool = False
 
     def fixed_at(self, value: float) -> "Parameter":
         """The same at one value."""
@@ -76,7 +80,8 @@ class Parameter:
             return {"fixed": self.start, "unit": self.unit}
         if self.values:
             return {"values": self.values, "start": self.start, "unit": self.unit}
-        return {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        found = {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        return found | {"varies": True} if self.varies else found
 
 
 @dataclass(frozen=True)
@@ -285,6 +290,18 @@ class PlacesSection:
     )
     at_most: int | None = key(count(1), None, says="so many of the forces are there at most")
     actuator_cost: float = key(NOT_NEGATIVE, 0.0, says="what each force that is there adds to f")
+    axes: bool = key(
+        flag,
+        False,
+        says="true: all forces and all sensors act together, an input and an output for each "
+        "motion of a rigid body normal to the nodes",
+    )
+    quiet: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, which these leave alone"
+    )
+    damped: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, each an axis of its own"
+    )
 
 
 @dataclass(frozen=True)

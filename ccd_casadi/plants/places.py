@@ -43,6 +43,11 @@ class Places:
     `nodes` (N, d): of the plant's inputs, in their order. `present`, one for each actuator: 1 where
     it is there, 0 where not, a θ where that is chosen; at most `at_most` are. `actuator_cost` is
     what each adds to f. Masses in kg. Actuators, and sensors, are at least `apart` from each other.
+
+    With `axes` all forces act, and all sensors read, together along the motions of a rigid body
+    normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
+    many actuators. `quiet` flexible modes, from 1 by frequency, are neither driven nor read by
+    them; each `damped` one is an axis of its own.
     """
 
     nodes: tuple[tuple[float, ...], ...]
@@ -54,6 +59,9 @@ class Places:
     present: tuple[Coordinate, ...] = ()
     at_most: int | None = None
     actuator_cost: float = 0.0
+    axes: bool = False
+    quiet: tuple[int, ...] = ()
+    damped: tuple[int, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,6 +95,11 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     if places.present and len(places.present) != len(places.actuators):
         words = f"{len(places.present)} numbers for {len(places.actuators)} actuators"
         raise PlantError(f"places.present has {words}; give one for each")
+    axes = places.axes * (1 + nodes.shape[1] + len(places.damped))
+    least = min(len(places.actuators), len(places.sensors))
+    if axes and least < axes + len(places.quiet):
+        words = f"need {axes + len(places.quiet)} actuators and sensors or more"
+        raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
     between, own = Between(nodes), [list(names).index(name) for name in plant.names]
 
     def of(evaluate: Evaluate) -> PlacedMechanics:
@@ -118,8 +131,8 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         constraint_names=(*plant.constraint_names, *_rules(places, whole, x)),
         evaluate=whole,
         hardware=ca.Function("hardware", [x], [f, lam]),
-        outputs=len(places.sensors) or plant.outputs,
-        inputs=len(places.actuators),
+        outputs=axes or len(places.sensors) or plant.outputs,
+        inputs=axes or len(places.actuators),
         references={name: of(closer) for name, closer in plant.references.items()},
         exact_hessian=plant.exact_hessian,
         values=None if plant.values is None else of(plant.values),
@@ -255,14 +268,45 @@ class PlacedMechanics:
         M = below.M + (F * kg * z) @ F.T + self.places.sensor_mass * R @ R.T
         half = dF @ (F * kg * z).T + self.places.sensor_mass * dR @ R.T
         dM = dM + half + half.transpose(0, 2, 1) + kg * np.einsum("xm,mt,ym->txy", F, dz, F)
-        read = bool(self.places.sensors)
-        return replace(
-            below, M=M, B=F * drive, C=R.T if read else below.C,
-            derivatives=(
-                dM, dD, dK, dF * drive + np.einsum("xm,mt->txm", F * ddrive, dz),
-                dR.transpose(0, 2, 1) if read else dC,
-            ),
-        )  # fmt: skip
+        B, dB = F * drive, dF * drive + np.einsum("xm,mt->txm", F * ddrive, dz)
+        if not self.places.axes:
+            read = bool(self.places.sensors)
+            C, dC = (R.T, dR.transpose(0, 2, 1)) if read else (below.C, dC)
+            return replace(below, M=M, B=B, C=C, derivatives=(dM, dD, dK, dB, dC))
+        modes = _followed(M, below.K, dM, dK, (*self.places.quiet, *self.places.damped))
+        B, dB = self._in_axes(self.actuators, values, (B, dB), (drive, ddrive[:, None] * dz), modes)
+        ones = np.ones(R.shape[1])
+        R, dR = self._in_axes(
+            self.sensors, values, (R, dR), (ones, np.zeros((len(ones), count))), modes
+        )
+        dC = dR.transpose(0, 2, 1)
+        return replace(below, M=M, B=B, C=R.T, derivatives=(dM, dD, dK, dB, dC))
+
+    def _in_axes(
+        self,
+        group: _Linear,
+        theta: Array,
+        fields: tuple[Array, Array],
+        share: tuple[Array, Array],
+        modes: tuple[Array, Array],
+    ) -> tuple[Array, Array]:
+        """b (n, m) and its slopes, combined by the directions of `Places.axes`.
+
+        The columns of [b'φ of quiet modes, 1, x, y, b'φ of damped ones] at the points, each brought
+        to length 1 beside those before it; without the quiet ones, which the rest does not see.
+        """
+        (b, db), (s, ds), (phi, dphi) = fields, share, modes
+        quiet, at = len(self.places.quiet), group.at(theta)
+        seen, dseen = b.T @ phi, db.transpose(0, 2, 1) @ phi + b.T @ dphi
+        rigid = s[:, None] * np.hstack([np.ones((len(s), 1)), at])
+        drigid = np.zeros((len(db), *rigid.shape))
+        drigid[:, :, 1:] = s[:, None] * group.slope[:, :, : len(db)].transpose(2, 0, 1)
+        drigid += ds.T[:, :, None] * np.hstack([np.ones((len(s), 1)), at])
+        A = np.hstack([seen[:, :quiet], rigid, seen[:, quiet:]])
+        dA = np.concatenate([dseen[:, :, :quiet], drigid, dseen[:, :, quiet:]], axis=2)
+        Q, dQ = _orthonormal(A, dA)
+        Q, dQ = Q[:, quiet:], dQ[:, :, quiet:]
+        return b @ Q, db @ Q + b @ dQ
 
     def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
         """The lowest flexible modes at the nodes, with all masses where they are."""
@@ -313,6 +357,43 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
     lam, modes = eigh(system.K, system.M)
     flexible = lam > RIGID_RATIO**2 * lam[-1]
     return np.sqrt(lam[flexible]), modes[:, flexible]
+
+
+def _followed(
+    M: Array, K: Array, dM: Array, dK: Array, numbers: Sequence[int]
+) -> tuple[Array, Array]:
+    """Shapes of flexible modes, from 1 by frequency, as columns, and their slopes.
+
+    φ' = Σ_j φ_j φ_jᵀ(K' - λ M')φ/(λ - λ_j) - φ φᵀM'φ/2,   j over all other modes
+    """
+    lam, modes = eigh(K, M)
+    flexible = np.flatnonzero(lam > RIGID_RATIO**2 * lam[-1])
+    if max(numbers, default=0) > len(flexible):
+        raise PlantError(f"places: mode {max(numbers)} is beyond the {len(flexible)} flexible ones")
+    at = flexible[[number - 1 for number in numbers]]
+    modes[:, at] *= np.where(modes[np.abs(modes[:, at]).argmax(axis=0), at] < 0.0, -1.0, 1.0)
+    slopes = np.zeros((len(dM), len(M), len(at)))
+    for k, i in enumerate(at):
+        gap = lam[i] - lam
+        gap[i] = np.inf
+        moved = (dK - lam[i] * dM) @ modes[:, i]
+        own = 0.5 * (dM @ modes[:, i]) @ modes[:, i]
+        slopes[:, :, k] = (moved @ modes / gap) @ modes.T - own[:, None] * modes[:, i]
+    return modes[:, at], slopes
+
+
+def _orthonormal(A: Array, dA: Array) -> tuple[Array, Array]:
+    """Q of A = Q R with a positive diagonal of R, and its slopes: dQ = Q Ω + (I - Q Qᵀ) dA R⁻¹."""
+    Q, R = np.linalg.qr(A)
+    if np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
+        words = "places: forces or sensors are on one line, or a quiet or damped mode is not seen"
+        raise PlantError(f"{words} where they are; move one, or drop the mode")
+    sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
+    Q, R = Q * sign, sign[:, None] * R
+    step = dA @ np.linalg.inv(R)
+    turn = Q.T @ step
+    lower = np.tril(turn, -1)
+    return Q, Q @ (lower - lower.transpose(0, 2, 1)) + step - Q @ turn
 
 
 def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
