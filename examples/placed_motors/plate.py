@@ -15,8 +15,8 @@ from ccd_casadi.plants.imported.modal_table import ModalTable, write_modal_table
 
 LENGTH, WIDTH = 0.36, 0.24  # m
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # aluminium
-PAYLOAD, AT = 0.6, (0.06, 0.03)  # kg, and where it is bolted on: off the centre
-DAMPING, MODES = 0.01, 20
+PAYLOAD, AT = 0.6, (0.0, 0.0)  # kg, and where it is bolted on
+DAMPING, MODES = 0.01, 16
 DEGREE = 12  # of the polynomials along either axis
 THICKNESS = np.linspace(6e-3, 12e-3, 5)
 NODES = [(x, y) for x in np.linspace(-0.18, 0.18, 11) for y in np.linspace(-0.12, 0.12, 9)]

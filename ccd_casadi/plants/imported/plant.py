@@ -48,6 +48,8 @@ def plant_of_table(
 
     Raises PlantError where the table's parameters are not those of the case.
     """
+    if names and not table.names:
+        raise PlantError(f"{source}: has no column of theta; add one for each parameter")
     if sorted(names) != sorted(table.names):
         raise PlantError(
             f"{source} has the parameters {', '.join(table.names)}, the case "
