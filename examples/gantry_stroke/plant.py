@@ -16,7 +16,7 @@ DEGREE = 8  # of the polynomials that the beam's deflection is made of
 
 
 def gantry(theta, damping=0.01):
-    """θ: `h` height of the beam's box along y, `wall` of it, `at` of the carriage from the middle, m.
+    """θ in m: `h` of the beam's box along y, its `wall`, and `at` of the carriage, 0 the middle.
 
     Both motors push alike; the tool on the carriage is measured. y(x) = Σ q_k P_k(2x/LENGTH).
     """
