@@ -398,7 +398,8 @@ def _orthonormal(A: Array, dA: Array) -> tuple[Array, Array]:
 
 def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
     """λ by name: least distances, where θ moves them, and how many actuators there may be."""
-    found, seen = {}, set()
+    found: dict[str, ca.MX] = {}
+    seen: set[frozenset[Point]] = set()
     for word, points, group in (("actuators", places.actuators, of.actuators),
                                 ("sensors", places.sensors, of.sensors)):  # fmt: skip
         at = group.symbols(theta) if places.apart else []
@@ -409,7 +410,7 @@ def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX
                 away = at[i] - at[j]
                 found[f"{word} {i + 1} and {j + 1} apart"] = 1.0 - ca.sumsqr(away) / places.apart**2
     if places.at_most is not None:
-        count = sum(of.there.symbols(theta))
+        count = ca.sum1(ca.vertcat(*of.there.symbols(theta)))
         found[f"at most {places.at_most} actuators"] = count / places.at_most - 1.0
     return found
 
