@@ -142,6 +142,39 @@ def direction(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers, one for each"
 
 
+@_with(_list({"type": ["number", "string"]}))
+def coordinates(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and all(
+        (isinstance(item, str) and item.removeprefix("-").isidentifier()) or ANY(item) is None
+        for item in value
+    ):
+        return None
+    return f'is {shown(value)}; give a list of numbers and names of [theta], as [0.1, "x", "-x"]'
+
+
+@_with(_list(_list({"type": ["number", "string"]}, 1, 3)))
+def places(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and all(
+        isinstance(row, list | tuple) and 0 < len(row) < 4 and coordinates(row) is None
+        for row in value
+    ):
+        return None
+    return f'is {shown(value)}; give rows of numbers and names of [theta], as [["x", 0.1]]'
+
+
+@_with(_list({"type": "integer", "minimum": 1}))
+def numbers_of_modes(value: Any) -> str | None:
+    if isinstance(value, list | tuple) and all(count(1)(item) is None for item in value):
+        return None
+    return f"is {shown(value)}; give a list of whole numbers from 1"
+
+
+@_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
+def text_or_rows(value: Any) -> str | None:
+    width = len(value[0]) if isinstance(value, list | tuple) and value and value[0] else 1
+    return text(value) if isinstance(value, str) else rows(width)(value)
+
+
 @_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
@@ -199,6 +232,7 @@ def shown(value: Any) -> str:
 
 ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
+NOT_NEGATIVE = number(0.0, math.inf, "give 0 or more", closed=True)
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
