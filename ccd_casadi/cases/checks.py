@@ -106,6 +106,12 @@ def interval(value: Any) -> str | None:
     return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
 
 
+@_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
+def text_or_rows(value: Any) -> str | None:
+    width = len(value[0]) if isinstance(value, list | tuple) and value and value[0] else 1
+    return text(value) if isinstance(value, str) else rows(width)(value)
+
+
 @_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
@@ -148,6 +154,7 @@ def shown(value: Any) -> str:
 
 ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
+NOT_NEGATIVE = number(0.0, math.inf, "give 0 or more", closed=True)
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
 
@@ -162,6 +169,17 @@ named = Check(
 )
 files = every(named, "give a list of file names in quotes")
 names = every(Check(text.test, named.schema), "give a list of texts in quotes", 1)
+coordinate = Check(
+    lambda value: (
+        None if isinstance(value, str) and value.removeprefix("-").isidentifier() else ANY(value)
+    ),
+    {"type": ["number", "string"]},
+)
+coordinates = every(coordinate, 'give a list of numbers and names of [theta], as [0.1, "x", "-x"]')
+places = every(
+    every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
+)
+numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
 
 
 @_with(numbers.schema)
