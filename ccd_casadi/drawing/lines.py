@@ -116,7 +116,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    named = [each.label for each in (*panel.bands, *panel.curves) if each.label]
+    labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]
+    named = [label for label in labelled if label]
     if named and panel.legend is not None:
         axes.legend(loc=labels.legend_at(named, panel.legend), borderaxespad=0.2)
 

@@ -72,7 +72,7 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
         learner.learn(np.array(rows), [new] * len(rows))
     if not np.isfinite(_value(problem, best)):
         raise UserError(f"no feasible design was found: {known[0].shortfall}")
-    old, co = (
+    entries: list[dict[str, Any]] = [
         {
             "theta": dict(zip(problem.names, sample.theta, strict=True)),
             "units": dict(zip(problem.names, problem.units, strict=True)),
@@ -81,7 +81,8 @@ def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
             "bandwidth_hz": sample.bandwidth / HZ,
         }
         for sample in (known[0], best)
-    )
+    ]
+    old, co = entries
     left = _left_open_hz(problem, learner, _value(problem, best), seed)
     return {
         "sequential": old,
