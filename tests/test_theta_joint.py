@@ -10,8 +10,7 @@ import pytest
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.theta_joint import family_of, proposed, together
-from ccd_casadi.fixed_structure.figures import assess
-from ccd_casadi.fixed_structure.joint_search import joint_hessians
+from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
 from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.objective import objective_of
@@ -64,9 +63,9 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     tau = float(np.log(STORED["bandwidth_hz"] * 2.0 * np.pi / loops.plants.omega_0))
     here = assess(loops, kappa, tau).peaks
     assert here is not None
-    others = [family(z + 1e-6 * unit) for unit in np.eye(2)]
+    others = [family(z + BESIDE * unit) for unit in np.eye(2)]
     chosen = here.only(here.value > -0.3)
-    H = joint_hessians(loops, others, kappa, tau, chosen)
+    H = hessians(loops, kappa, tau, chosen, others)
     assert np.abs(H).max(axis=(1, 2)).min() > 0.0
     d = np.random.default_rng(direction).normal(size=len(kappa) + 3)
     e = 1e-4

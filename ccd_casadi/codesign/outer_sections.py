@@ -8,7 +8,6 @@ The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,14 +21,13 @@ from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import End
-from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_joint import together
 from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.verified_sections import VerifiedSections
@@ -49,6 +47,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
 )
 from ccd_casadi.inner_problem.sections_search import ROUNDS, joined
 from ccd_casadi.limitations.of_problem import known_gap
+from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -212,8 +211,8 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more anchors, where the given ones lose it.
 
-    By the joint search where J counts the bandwidth; from there by pieces (`pieces`), which know
-    kinks; by IPOPT where J has one gradient and that is not yet zero to what it is known to.
+    By the joint search where J counts the bandwidth; from there, where J is not stationary, by
+    pieces (`pieces`), which know kinks.
     """
     if sampler.problem.figure is BANDWIDTH:
         sampler, best = carried(sampler, theta)
@@ -229,14 +228,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
         truth, best = by_pieces(truth, best)
-    sampler, problem = truth.sampler, truth.sampler.problem
-    if _stationary(sampler, best):
-        return sampler, best
-    program = nested_program(problem, truth)
-    program = replace(program, exact_hessian=False)
-    with suppress(OuterFailure):  # what it has asked for on its way counts
-        solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
-    return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))
+    return truth.sampler, best
 
 
 def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
@@ -246,7 +238,7 @@ def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
 
 
 def by_pieces(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL, first: float = FIRST
 ) -> tuple[TrueBandwidth, BandwidthSample]:
     """From a sample, and what was asked for near it, to where the pieces of J promise no more.
 
@@ -254,7 +246,7 @@ def by_pieces(
     one becomes an anchor, and the search goes on.
     """
     for _ in range(FOLLOWED):
-        best, jumped = pieces_from(truth, best, settled)
+        best, jumped = pieces_from(truth, best, settled, first)
         if not jumped:
             break
         problem = joined(truth.sampler.problem, np.array(best.kappa), ())

@@ -79,7 +79,8 @@ def theta_kkt(
     Z = _steepest_first(at.free(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
     if Z.shape[1] and truth is not None and kink is not None:
-        kink = Kink(kink.one_gradient, _slopes(problem, truth, sample, Z, at.size), kink.multipliers)
+        slopes = _slopes(problem, truth, sample, Z, at.size)
+        kink = Kink(kink.one_gradient, slopes, kink.multipliers)
     elif Z.shape[1] and truth is not None:
         second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
     return at.certificate(nu, residual, second, kink)

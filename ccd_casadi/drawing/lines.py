@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import Labels, inside
 from ccd_casadi.drawing.page import table_html
 from ccd_casadi.drawing.svg import WIDTH, log_axis, new_figure, place, style, to_svg
@@ -82,7 +82,7 @@ def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
 def _draw(axes: "Axes", panel: Panel) -> None:
     for band in panel.bands:
         axes.fill_between(
-            band.x, band.low, band.high, color=band.colour, alpha=0.18, linewidth=0.0,
+            band.x, band.low, band.high, color=band.colour, alpha=0.4, linewidth=0.6,
             label=band.label or None,
         )  # fmt: skip
     for area in panel.forbidden:
@@ -91,7 +91,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
-            markerfacecolor="white" if curve.line else curve.colour, clip_on=not curve.marker,
+            markerfacecolor="white" if curve.line else curve.colour,
+            clip_on=not curve.marker or _leaves(panel, curve),
             gid=f"curve{i}",
         )  # fmt: skip
     axes.set_xlabel(panel.x_label)
@@ -107,15 +108,23 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             [mark.x], [mark.y], mark.marker, color=mark.colour, markersize=5.0, zorder=5,
         )  # fmt: skip
     labels = Labels(axes)
+    for curve in panel.curves:
+        labels.avoid_curve(curve.x, curve.y)
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     for mark in panel.marks:
         labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    labelled = any([*(c.label for c in panel.curves), *(b.label for b in panel.bands)])
-    if labelled and panel.legend is not None:
-        axes.legend(loc=panel.legend)
+    labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]
+    named = [label for label in labelled if label]
+    if named and panel.legend is not None:
+        axes.legend(loc=labels.legend_at(named, panel.legend), borderaxespad=0.2)
+
+
+def _leaves(panel: Panel, curve: Curve) -> bool:
+    """Whether a curve goes on beyond the top of its panel."""
+    return panel.y_range is not None and bool(np.nanmax(curve.y, initial=0.0) > panel.y_range[1])
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAP_WIDTH = 8.4  # inches
+RING, GROUND = "#fdfdfd", "#121212"  # of markers on a map: in both themes, unlike the page's own
 
 
 def figure_landscape(land: Landscape, key: str) -> str:
@@ -45,14 +46,11 @@ def figure_landscape(land: Landscape, key: str) -> str:
         if land.forbidden is not None and land.forbidden.any():
             _shade(axes, land.first, land.second, land.forbidden.astype(float) - 0.5)
         if len(land.designs):
-            axes.plot(*land.designs.T, ".", color="white", markersize=3.5, markeredgecolor=GREY,
-                      markeredgewidth=0.4, label="sampled designs", linestyle="none")  # fmt: skip
+            axes.plot(*land.designs.T, ".", color=RING, markersize=5.0, markeredgecolor=GROUND,
+                      markeredgewidth=0.6, label="sampled designs", linestyle="none")  # fmt: skip
         if len(truths):
             known = truths[np.isfinite(truths[:, 2])]
-            dots = axes.scatter(
-                known[:, 0], known[:, 1], c=known[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
-                edgecolors="white", linewidths=0.9, label=land.truth_label, zorder=3, clip_on=False,
-            )  # fmt: skip
+            dots = _dots(axes, known, norm, land.truth_label)
             filled = filled or dots
             lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
@@ -67,7 +65,7 @@ def figure_landscape(land: Landscape, key: str) -> str:
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
-                      markeredgecolor="white", markeredgewidth=0.9, linestyle="none",
+                      markeredgecolor=RING, markeredgewidth=0.9, linestyle="none",
                       label="verified optimum")  # fmt: skip
         axes.set_xlim(land.first[0], land.first[-1])
         axes.set_ylim(land.second[0], land.second[-1])
@@ -94,14 +92,11 @@ def figure_sweep(sweep: SweepMap, key: str) -> str:
                                  colors=BLACK, linewidths=1.1, linestyles=line)  # fmt: skip
                     axes.plot([], [], color=BLACK, linestyle=line, linewidth=1.1, label=label)
         inside = sweep.rows[:, 5] > 0.5
-        colours = {"c": sweep.rows[inside, 2], "cmap": COLOUR_MAP, "norm": norm}
-        dots = axes.scatter(sweep.rows[inside, 0], sweep.rows[inside, 1], s=30, zorder=3,
-                            edgecolors="white", linewidths=0.9, clip_on=False,
-                            label="synthesis, feasible", **colours)  # fmt: skip
+        dots = _dots(axes, sweep.rows[inside], norm, "synthesis, feasible")
         axes.plot(sweep.rows[~inside, 0], sweep.rows[~inside, 1], "x", color=BLACK, markersize=5,
                   clip_on=False, linestyle="none", label="synthesis, infeasible")  # fmt: skip
         axes.plot([sweep.optimum[0]], [sweep.optimum[1]], "*", color=ORANGE, markersize=15,
-                  markeredgecolor="white", markeredgewidth=0.9, zorder=7, clip_on=False,
+                  markeredgecolor=RING, markeredgewidth=0.9, zorder=7, clip_on=False,
                   linestyle="none", label="verified optimum")  # fmt: skip
         log_axis(axes.xaxis, *_ends(sweep.omega_S, sweep.rows[:, 0]))
         log_axis(axes.yaxis, *_ends(sweep.omega_T, sweep.rows[:, 1]))
@@ -110,6 +105,14 @@ def figure_sweep(sweep: SweepMap, key: str) -> str:
         _colour_bar(figure, filled or dots, "bandwidth ω_b (Hz)")
         _legend(figure, axes)
         return to_svg(figure, key, "Bandwidth over the two break frequencies at the optimum")
+
+
+def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
+    """Dots (x, y, value) in the map's colours; light and dark rings tell them from any colour."""
+    axes.scatter(rows[:, 0], rows[:, 1], s=62, color=GROUND, zorder=2.9, clip_on=False)
+    return axes.scatter(rows[:, 0], rows[:, 1], c=rows[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
+                        edgecolors=RING, linewidths=1.1, label=label, zorder=3,
+                        clip_on=False)  # fmt: skip
 
 
 def _map_axes() -> tuple["Figure", "Axes"]:

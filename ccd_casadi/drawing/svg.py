@@ -123,7 +123,8 @@ def log_axis(axis: Any, low: float, high: float) -> None:
     decades = np.log10(high / low)
     subs = (1.0,) if decades > 2.2 else (1.0, 2.0, 5.0)
     axis.set_major_locator(LogLocator(subs=subs, numticks=max(3, int(min(decades, 8.0)) + 2)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    plain = low > 0.0009 and high < 20000.0  # one way of writing on one axis
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value, plain)))
     axis.set_minor_locator(NullLocator())
     if decades <= 5.0:
         _minor_ticks(axis, low, high)
@@ -150,15 +151,15 @@ def _minor_ticks(axis: Any, low: float, high: float) -> None:
     axes.add_artist(line)
 
 
-def power_of_ten(value: float) -> str:
-    """Tick label of a logarithmic axis: 0.001 to 10 000 as they are, the others as powers.
+def power_of_ten(value: float, plain: bool = False) -> str:
+    """Tick label of a logarithmic axis: a power of ten, or the number as it is.
 
-    >>> power_of_ten(100.0), power_of_ten(1e-7), power_of_ten(5e6)
-    ('100', '10⁻⁷', '5·10⁶')
+    >>> power_of_ten(100.0, plain=True), power_of_ten(1.0), power_of_ten(1e-7), power_of_ten(5e6)
+    ('100', '1', '10⁻⁷', '5·10⁶')
     """
     if value <= 0.0:
         return ""
-    if 0.0009 < value < 20000.0:
+    if plain or abs(value - 1.0) < 1e-6:
         return f"{value:g}"
     exponent = int(np.floor(np.log10(value) + 1e-9))
     lead = value / 10.0**exponent

@@ -4,26 +4,20 @@
 
 by `optim.trust_region`, with the rows of `local_search` and their slopes to z. Where c bends, it
 bends most where a resonance that moves with z meets a notch that moves with κ: its Hessian is that
-of (z, κ, τ), by differences of exact slopes along z.
+to all three.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import singledispatch
-from typing import cast
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.fixed_structure.composite import CompositeProblem
-from ccd_casadi.fixed_structure.figures import STEP, assess, evaluate_rows, hessians, to_theta
+from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians, to_theta
 from ccd_casadi.fixed_structure.local_search import all_rows
-from ccd_casadi.fixed_structure.loop_problem import Assessment, Constraints, LoopProblem
-from ccd_casadi.kernels.limits import Curve
+from ccd_casadi.fixed_structure.loop_problem import Assessment, LoopProblem
 from ccd_casadi.optim.trust_region import Iterate, Model, Rows
 from ccd_casadi.support.arrays import Array
 
-BESIDE = 1e-6  # of the box of θ: differences, much less than the half width of a resonance
-UNLIKE = 0.1  # relative: mixed differences that a smooth row has alike
 FAR = 3.0  # radii of κ and τ by which a row may lie below its bound and still be looked at
 
 ToFirstOrder = Callable[[Array], tuple[Array, Array]]
@@ -94,7 +88,7 @@ class JointModel(Model[Joint]):
 
         def second(index: np.ndarray) -> Array:
             others = [self.family(z + BESIDE * unit) for unit in np.eye(self.count)]
-            return joint_hessians(problem, others, kappa, tau, found.only(index))
+            return hessians(problem, kappa, tau, found.only(index), others)
 
         return Rows(
             np.concatenate([found.value, value]), slopes,
@@ -103,66 +97,3 @@ class JointModel(Model[Joint]):
 
     def _parts(self, x: Array) -> tuple[Array, Array, float]:
         return x[: self.count], x[self.count : -1], float(x[-1])
-
-
-@singledispatch
-def joint_hessians(
-    problem: LoopProblem, others: Sequence[LoopProblem], kappa: Array, tau: float, rows: Constraints
-) -> Array:
-    """(M, k + n + 1, k + n + 1): ∂²c_j to (z, κ, τ); `others` (k,) are the loops `BESIDE` along z.
-
-    At a fixed frequency by differences of exact slopes; a peak moves as z and κ do (`hessians`).
-    """
-    k, n, m = len(others), len(kappa), len(rows.v)
-    out = np.zeros((m, k + n + 1, k + n + 1))
-    if not m:
-        return out
-    out[:, k:, k:] = hessians(problem, kappa, tau, rows)
-
-    def at(place: LoopProblem, v: Array) -> tuple[Array, Array]:
-        return evaluate_rows(place, kappa, tau, rows.curve, rows.plant, v)[1:3]
-
-    slope, to_kappa = at(problem, rows.v)
-    (up, kappa_up), (down, kappa_down) = (at(problem, rows.v * np.exp(s)) for s in (STEP, -STEP))
-    c_xx, c_xk = (up - down) / (2.0 * STEP), (kappa_up - kappa_down) / (2.0 * STEP)
-    to_z, c_xz = to_theta(problem, kappa, rows), np.zeros((m, k))
-    for i, other in enumerate(others):
-        moved, kappa_moved = at(other, rows.v)
-        c_xz[:, i] = (moved - slope) / BESIDE
-        out[:, i, k:-1] = out[:, k:-1, i] = (kappa_moved - to_kappa) / BESIDE
-        out[:, i, :k] = (to_theta(other, kappa, rows) - to_z) / BESIDE
-    out[:, :k, :k] = 0.5 * (out[:, :k, :k] + out[:, :k, :k].transpose(0, 2, 1))
-    end = rows.curve == Curve.CROSSING
-    fixed = end | (rows.curve == Curve.S_LOW)
-    top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
-    shift = c_xz / np.where(top, -c_xx, np.inf)[:, None]
-    cross = shift[:, :, None] * c_xk[:, None, :]
-    out[:, :k, :k] += shift[:, :, None] * c_xz[:, None, :]
-    out[:, :k, k:-1] += cross
-    out[:, k:-1, :k] += cross.transpose(0, 2, 1)
-    # Where singular values cross no difference means anything: the two orders of it disagree.
-    aside = [to_theta(problem, kappa, replace(rows, v=rows.v * np.exp(s))) for s in (STEP, -STEP)]
-    c_zx = (aside[0] - aside[1]) / (2.0 * STEP)
-    out[np.abs(c_xz - c_zx).max(axis=1) > UNLIKE * (1.0 + np.abs(c_zx).max(axis=1))] = 0.0
-    if end.any():
-        chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
-        out[end, :k, -1] = out[end, -1, :k] = chain[:, None] * c_xz[end]
-    return out
-
-
-@joint_hessians.register
-def _(
-    problem: CompositeProblem, others: Sequence[LoopProblem], kappa: Array, tau: float,
-    rows: Constraints,
-) -> Array:  # fmt: skip
-    k, n = len(others), len(kappa)
-    out = np.zeros((len(rows.v), k + n + 1, k + n + 1))
-    beside = [cast(CompositeProblem, other).parts for other in others]
-    for number, (part, at, own) in enumerate(problem.split(rows)):
-        place = np.concatenate([np.arange(k), k + part.place, [k + n]])
-        near = [parts[number].problem for parts in beside]
-        inner = joint_hessians(part.problem, near, kappa[part.place], tau + part.lead, own)
-        spread = np.zeros((len(place), k + n + 1))
-        spread[range(len(place)), place] = 1.0
-        out[at] = spread.T @ inner @ spread
-    return out

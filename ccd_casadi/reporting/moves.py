@@ -125,7 +125,7 @@ def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
         ms = 1e3 * m.time[at]
         error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
         force.append(Curve(ms, m.force[at, 0], "", colour))
-    end = Level(1e3 * found.profile.duration, "end of the setpoint", vertical=True)
+    end = Level(1e3 * found.profile.duration, "setpoint ends", vertical=True)
     lines = Lines(
         ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
          (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),

@@ -137,7 +137,7 @@ def move(found: Move, caption: str) -> Figure:
     shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
     t = 1e3 * found.time[pick]
-    end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)
+    end = Level(1e3 * found.duration, "setpoint ends", vertical=True)
     unit, scale = shown_unit("m", found.peak_error)
     window = (
         Level(scale * found.window, "window", colour=GREY),
