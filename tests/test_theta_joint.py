@@ -9,16 +9,16 @@ import pytest
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.codesign.theta_joint import family_of, proposed, together
+from ccd_casadi.codesign.theta_joint import JointModel, proposed, together
 from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
 from ccd_casadi.fixed_structure.loop_problem import Constraints
-from ccd_casadi.fixed_structure.sections_design import in_problem_units
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant, with_sections
 from ccd_casadi.inner_problem.sections_search import with_range
 from ccd_casadi.plants.plant import mechanics, to_first_order
 from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
@@ -26,13 +26,13 @@ ROOT = Path(__file__).parent.parent
 STORED = json.loads((ROOT / "benchmarks" / "shipped_designs.json").read_text())["two_mass_built"]
 
 
-def built(**changes: float) -> CoDesignProblem:
+def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:
     """runs/two_mass_built.toml from the controller that is stored, on the corners of its set."""
     problem = with_range(problem_of(load_case(ROOT / "runs" / "two_mass_built.toml")))
     corners = uncertain_plant(problem, problem.start).corners()
     members = tuple((option, tuple(map(float, point))) for option, point in corners)
     kappa = tuple(STORED["sections"]["kappa"])
-    return replace(with_sections(problem, anchors=(kappa,), members=members), **changes)
+    return replace(with_sections(problem, anchors=(kappa,), members=members), start=start)
 
 
 def test_what_the_first_order_leaves_out_is_of_second_order() -> None:
@@ -54,13 +54,13 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     direction: int,
 ) -> None:
     """Of peaks that move, along random directions, the frequency of each found anew."""
-    problem = built()
-    family = family_of(problem, (60.0, 60.0))
-    lower, upper = box(problem)
-    z = (np.array([60.0, 60.0]) - lower) / (upper - lower)
+    omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
+    nan = float("nan")
+    sample = BandwidthSample((60.0, 60.0), omega, (nan, nan), nan, nan, (), "", 0.0, 1, stored)
+    model = JointModel(built(), sample, 0.1)
+    family, start = model.loops, model.start
+    z, kappa, tau = model.parts(start)
     loops = family(z)
-    kappa = in_problem_units(loops, np.array(STORED["sections"]["kappa"]))
-    tau = float(np.log(STORED["bandwidth_hz"] * 2.0 * np.pi / loops.plants.omega_0))
     here = assess(loops, kappa, tau).peaks
     assert here is not None
     others = [family(z + BESIDE * unit) for unit in np.eye(2)]
@@ -71,7 +71,7 @@ def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
     e = 1e-4
 
     def there(sign: float) -> Constraints:
-        at = np.concatenate([z, kappa, [tau]]) + sign * e * d
+        at = start + sign * e * d
         found = assess(family(at[:2]), at[2:-1], float(at[-1])).peaks
         assert found is not None
         return found
