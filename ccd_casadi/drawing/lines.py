@@ -9,7 +9,7 @@ import numpy as np
 from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import Labels, inside
 from ccd_casadi.drawing.page import table_html
-from ccd_casadi.drawing.svg import WIDTH, log_axis, new_figure, place, style, to_svg
+from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
@@ -38,6 +38,10 @@ def figure_lines(figure: Lines, key: str) -> str:
 
 def _placed(what: Place, width: float, height: float, key: str, title: str) -> str:
     match what:
+        case Panel() if width == WIDTH:
+            return at_both_widths(
+                lambda own, inches: _picture(what, inches, height, own, title), key, width
+            )
         case Panel():
             return _picture(what, width, height, key, title)
         case Modes():
