@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEAST_POINTS = 8  # of a curve that values are read off
-LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
+LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
 def figure_lines(figure: Lines, key: str) -> str:
@@ -113,11 +113,11 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         )  # fmt: skip
     labels = Labels(axes)
     for curve in panel.curves:
-        labels.avoid_curve(curve.x, curve.y)
+        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     for mark in panel.marks:
-        labels.beside(mark.x, mark.y, mark.text, mark.offset)
+        labels.beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
     labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]
