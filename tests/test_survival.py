@@ -195,9 +195,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
         A = np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]])
         B, C = np.vstack([empty, modal.B]), np.hstack([modal.C, empty.T])
         G = StateSpace(A, B, C, np.zeros((1, 1)))
-        figures = sampled_figures(
-            closed_loop(sampled(G, sampling.period, sampling.delay), K).S
-        )
+        figures = sampled_figures(closed_loop(sampled(G, sampling.period, sampling.delay), K).S)
         return figures.stable, figures.sensitivity_peak
 
     low, high = found.S_max_shift
