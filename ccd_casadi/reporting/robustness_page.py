@@ -16,14 +16,20 @@ from ccd_casadi.support.units import HZ, metres, number, shown
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
-def robustness_page(run: FinishedRun, found: Study, seed: int, index: str = "") -> Page:
-    """robustness.html; `index`: the page that links all of the run."""
+def robustness_page(
+    run: FinishedRun, found: Study, seed: int, index: str = "", *, own: bool = True
+) -> Page:
+    """robustness.html; `index`: the page that links all of the run.
+
+    `own`: of the run's own controller, so that the run's decision and verdict stand on it.
+    """
     lead, *others = conclusion(run, found)
     head = head_of(
         f"Robustness: {run.case.path.parent.name}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; nothing is said of others",
-        f"{theta_words(run.result)} · seed {seed}", lead, run.result,
+        f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
+        "" if own else given_decision(found),
     )  # fmt: skip
     sections = (
         Section("In short", tuple(map(Words, others))),
@@ -35,6 +41,13 @@ def robustness_page(run: FinishedRun, found: Study, seed: int, index: str = "") 
         *([_move(found)] if found.moves else []),
     )
     return Page(head, sections, index)
+
+
+def given_decision(found: Study) -> str:
+    """Whether to use a controller that is not the run's own."""
+    if found.survives:
+        return "This controller is stable on every plant that was tried."
+    return "Do not use this controller: it is not stable on every plant that was tried."
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:
@@ -174,11 +187,12 @@ def _margins(found: Study) -> Section:
 
 
 def _gains(run: FinishedRun, found: Study) -> Section:
-    names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
+    shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
-        (name, number((1e6 if "µm" in name else 1.0) * peak), _place(omega))
-        for name, (peak, omega) in zip(names, found.peaks, strict=True)
-    ]
+        (figures.named(run, name),
+         shown(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
+        for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
+    ]  # fmt: skip
     n, d = found.noise, found.demands
     # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
     share = 1e-9 if d.sensor == 1.0 else 1.0
@@ -193,8 +207,8 @@ def _gains(run: FinishedRun, found: Study) -> Section:
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
     drawn = figures.gains(
-        found, "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), "
-        "and force by sensor noise (KS).",
+        run, found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
+        "(GS), and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
     body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)
