@@ -12,8 +12,6 @@ from ccd_casadi.kernels.limits import Curve
 
 STEP = np.log(10.0) / PER_DECADE
 HALF = 0.09  # of the distance of the maxima in ln v: one in five shows on no grid
-    0.09  # of the distance of the maxima in ln v: with steps of 0.096 one in five shows on no grid
-)
 
 
 def two_maxima(x: np.ndarray, height: float, tilt: float) -> np.ndarray:
