@@ -32,6 +32,14 @@ def test_every_public_name_is_on_the_reference_page(package: str) -> None:
                 assert f"::: {node.module}.{name.name}" in page
 
 
+def test_a_page_has_one_name_in_the_navigation_and_on_itself() -> None:
+    nav = re.findall(r"^ +- (.+): (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    for name, page in nav[1:]:  # but Home
+        title = re.search(r"^# (.+)$", (DOCS / page).read_text(), re.MULTILINE)
+        assert title is not None
+        assert title[1].strip() == name.strip('"')
+
+
 def test_every_page_that_is_named_elsewhere_is_there() -> None:
     for pattern in MENTIONS:
         for file in ROOT.glob(pattern):
