@@ -55,13 +55,13 @@ class Labels:
         a, b = self._at(x, y)
         self._taken.append((a - POINT, b - POINT, a + POINT, b + POINT))
 
-    def avoid_curve(self, x: Any, y: Any) -> None:
-        """Labels keep off this curve where they can."""
+    def avoid_curve(self, x: Any, y: Any, joined: bool = True) -> None:
+        """Labels keep off this curve, or its points alone, where they can."""
         points = self._axes.transData.transform(np.column_stack([x, y])) * self._scale
         left, bottom, right, top = self._inside
         shown = np.isfinite(points).all(axis=1)
         points = np.clip(points[shown], (left - 99.0, bottom - 99.0), (right + 99.0, top + 99.0))
-        if len(points) > 1:  # as many points as are this far apart, along its length
+        if joined and len(points) > 1:  # as many points as are this far apart, along its length
             along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
             at = np.arange(0.0, along[-1], APART)
             points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
@@ -84,7 +84,7 @@ class Labels:
                 best, least = place, covered
         return best
 
-    def beside(self, x: float, y: float, text: str, wish: tuple[float, float]) -> None:
+    def beside(self, x: float, y: float, text: str, wish: tuple[float, float], colour: str) -> None:
         """A label beside a point, at the offset `wish` in pt if that is free."""
         a, b = self._at(x, y)
         wide = LETTER * len(text)
@@ -97,7 +97,8 @@ class Labels:
         if found is not None:
             dx, dy = places[found][1]
             side = "center" if dx == 0 else "left" if dx > 0 else "right"
-            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND)
+            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND,
+                        color=colour)  # fmt: skip
 
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes, upright beside a vertical one."""

@@ -9,14 +9,14 @@ import numpy as np
 from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import Labels, inside
 from ccd_casadi.drawing.page import table_html
-from ccd_casadi.drawing.svg import WIDTH, log_axis, new_figure, place, style, to_svg
+from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEAST_POINTS = 8  # of a curve that values are read off
-LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
+LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
 def figure_lines(figure: Lines, key: str) -> str:
@@ -38,6 +38,10 @@ def figure_lines(figure: Lines, key: str) -> str:
 
 def _placed(what: Place, width: float, height: float, key: str, title: str) -> str:
     match what:
+        case Panel() if width == WIDTH:
+            return at_both_widths(
+                lambda own, inches: _picture(what, inches, height, own, title), key, width
+            )
         case Panel():
             return _picture(what, width, height, key, title)
         case Modes():
@@ -109,11 +113,11 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         )  # fmt: skip
     labels = Labels(axes)
     for curve in panel.curves:
-        labels.avoid_curve(curve.x, curve.y)
+        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     for mark in panel.marks:
-        labels.beside(mark.x, mark.y, mark.text, mark.offset)
+        labels.beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
     labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]

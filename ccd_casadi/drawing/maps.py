@@ -10,7 +10,9 @@ from ccd_casadi.drawing.svg import (
     COLOUR_MAP,
     CYCLE,
     GREY,
+    NARROW,
     ORANGE,
+    at_both_widths,
     axis_label,
     log_axis,
     new_figure,
@@ -30,10 +32,14 @@ RING, GROUND = "#fdfdfd", "#121212"  # of markers on a map: in both themes, unli
 
 def figure_landscape(land: Landscape, key: str) -> str:
     """Filled contours of ω_b*(θ) with true samples, paths and the optimum."""
+    return at_both_widths(lambda own, inches: _landscape(land, own, inches), key, MAP_WIDTH)
+
+
+def _landscape(land: Landscape, key: str, width: float) -> str:
     from matplotlib.patches import Rectangle
 
     with style():
-        figure, axes = _map_axes()
+        figure, axes = _map_axes(width)
         axes.grid(False)
         axes.set_facecolor("#eeeeee")
         truths = land.truths.reshape(-1, 3)
@@ -74,13 +80,18 @@ def figure_landscape(land: Landscape, key: str) -> str:
         which = "largest bandwidth ω_b*" if land.bandwidth_hz.size else "bandwidth ω_b"
         _colour_bar(figure, filled, axis_label(which, "Hz"))
         _legend(figure, axes)
-        return to_svg(figure, key, "Landscape of the largest bandwidth over the two parameters")
+        title = "Landscape of the largest bandwidth over the two parameters"
+        return to_svg(figure, key, title, share=_share(width))
 
 
 def figure_sweep(sweep: SweepMap, key: str) -> str:
     """ω_b over (ω_S, ω_T) at one θ; what S_max and S_low forbid is hatched."""
+    return at_both_widths(lambda own, inches: _sweep(sweep, own, inches), key, MAP_WIDTH)
+
+
+def _sweep(sweep: SweepMap, key: str, width: float) -> str:
     with style():
-        figure, axes = _map_axes()
+        figure, axes = _map_axes(width)
         axes.grid(False)
         shown = sweep.bandwidth_hz if sweep.bandwidth_hz.size else sweep.rows[:, 2]
         filled, norm = _contours(axes, sweep.omega_S, sweep.omega_T, sweep.bandwidth_hz, shown)
@@ -104,7 +115,13 @@ def figure_sweep(sweep: SweepMap, key: str) -> str:
         axes.set_ylabel(axis_label("ω_T of the weight on T", "Hz"))
         _colour_bar(figure, filled or dots, "bandwidth ω_b (Hz)")
         _legend(figure, axes)
-        return to_svg(figure, key, "Bandwidth over the two break frequencies at the optimum")
+        title = "Bandwidth over the two break frequencies at the optimum"
+        return to_svg(figure, key, title, share=_share(width))
+
+
+def _share(width: float) -> float:
+    """Of the column, in %."""
+    return 100.0 if width == NARROW else 0.0
 
 
 def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
@@ -115,10 +132,11 @@ def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
                         clip_on=False)  # fmt: skip
 
 
-def _map_axes() -> tuple["Figure", "Axes"]:
+def _map_axes(width: float) -> tuple["Figure", "Axes"]:
     """A map's axes, with room for the colour bar on the right and the legend below."""
-    figure = new_figure(5.4, MAP_WIDTH)
-    return figure, place(figure, 0.75, 1.1, MAP_WIDTH - 2.05, 4.15)
+    figure = new_figure(5.4, width)
+    low = 1.1 if width == MAP_WIDTH else 1.5
+    return figure, place(figure, 0.75, low, width - 2.05, 5.25 - low)
 
 
 def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> tuple[Any, Any]:
@@ -175,7 +193,9 @@ def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
 
 def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
     if filled is not None:
-        beside = place(figure, MAP_WIDTH - 1.15, 1.1, 0.17, 4.15)
+        width, height = figure.get_size_inches()
+        low, tall = (height * v for v in figure.axes[0].get_position().bounds[1::2])
+        beside = place(figure, width - 1.15, low, 0.17, tall)
         bar = figure.colorbar(filled, cax=beside)
         bar.set_label(label)
         bar.outline.set_linewidth(0.5)
@@ -184,7 +204,7 @@ def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
 
 def _legend(figure: "Figure", axes: "Axes") -> None:
     handles, labels = axes.get_legend_handles_labels()
-    columns = 3 if len(labels) > 4 else 4
+    columns = 2 if figure.get_figwidth() == NARROW else 3 if len(labels) > 4 else 4
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
 
 

@@ -6,7 +6,7 @@ figures live in one document; nothing in it depends on the day it was made.
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from html import escape
 from io import StringIO
@@ -38,6 +38,7 @@ VARIABLES = {light: f"var(--{name})" for name, (light, _) in THEME.items()}
 VARIABLES["#000000"] = "var(--ink)"
 COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
+NARROW = 4.6  # inches of the same figure on a screen of a telephone
 LONGEST_LABEL = 40
 
 
@@ -58,6 +59,15 @@ def new_figure(height: float, width: float = WIDTH) -> "Figure":
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
+
+
+def at_both_widths(draw: Callable[[str, float], str], key: str, width: float) -> str:
+    """A figure of a whole column as drawn at this width, and beside it for a narrow screen.
+
+    `draw(key, inches)`; the page's rules show one of both.
+    """
+    wide, narrow = draw(key, width), draw(f"{key}-n", NARROW)
+    return f'<div class="whole">{wide}</div><div class="narrow">{narrow}</div>'
 
 
 def place(figure: "Figure", left: float, bottom: float, width: float, height: float) -> "Axes":

@@ -33,6 +33,7 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
+from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.sections_page import sections_table
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import head_of
@@ -129,8 +130,8 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,))
-    bottom = over_hz("σ_max(K) (N/m)", drawn, (low, nyquist))
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
+    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist))
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
     table = over_frequency(
         ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
