@@ -18,7 +18,7 @@ from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.robustness_figures import shown_peak, shown_until
 from ccd_casadi.reporting.robustness_page import _cut
 from ccd_casadi.reporting.verdict import LINES, advice
-from ccd_casadi.studies.conclusions import worth_sentence
+from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ
 
 
@@ -110,10 +110,20 @@ def test_insight_and_compare_begin_with_their_answer() -> None:
         "Bandwidth costs hardware: from 100 kg with 50 Hz to 110 kg with 70 Hz, on average 2 Hz "
         "for every kg."
     )
-    best = {"objective": -2.0, "hardware_cost": 80.0, "bandwidth_hz": 60.0}
-    other = {"objective": -1.0, "hardware_cost": 100.0, "bandwidth_hz": 50.0}
-    (said,) = worth_sentence({"lifted": best, "sequential": other}, "lifted")
-    assert said.endswith("hardware cost -20.0 %, bandwidth +20.0 %.")
-    (said,) = worth_sentence({"lifted": other, "sequential": other}, "lifted")
-    assert "gains nothing" in said
-    assert worth_sentence({"lifted": best}, "lifted") == []
+    best = {
+        "syntheses_to_optimum": 5,
+        "syntheses": 5,
+        "objective": -2.0,
+        "hardware_cost": 80.0,
+        "bandwidth_hz": 60.0,
+    }
+    other = {
+        "syntheses_to_optimum": 5,
+        "syntheses": 5,
+        "objective": -1.0,
+        "hardware_cost": 100.0,
+        "bandwidth_hz": 50.0,
+    }
+    said = conclusions(problem, {"lifted": best, "sequential": other})["sentences"]
+    assert said[0].endswith("changes the hardware cost by -20.0 % and the bandwidth by +20.0 %.")
+    assert conclusions(problem, {"lifted": best})["sentences"][0].startswith("The best J")

@@ -1,5 +1,7 @@
 """A deployment's verdict in words: what is kept, by how much, and on which plant."""
 
+from math import isfinite
+
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deployment.outcome import Deployment
@@ -42,6 +44,23 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
     if reason:
         return Line(State.WARNED, f"{kept}; {reason}", figures)
     return Line(State.PASSED, kept, figures)
+
+
+def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
+    """Bandwidth and peak of S of every loop on the way: name, value and remark."""
+    loops = [
+        ("Full", run.figures), ("Reduced", found.reduced_figures), ("Sampled", found.sampled),
+        ("Simulated", found.measured),
+    ]  # fmt: skip
+    rows = []
+    for name, figures in loops:
+        if figures is not None and isfinite(figures.bandwidth):
+            change = 100.0 * (figures.bandwidth / run.figures.bandwidth - 1.0)
+            peak = against(figures.sensitivity_peak, run.problem.inner.S_max)
+            words = f"peak {figures.sensitivity_peak:.6g} ({peak})"
+            words += "" if name == "Full" else f", bandwidth {round(change, 2) + 0.0:+.2f} %"
+            rows.append((name, f"{figures.bandwidth / HZ:.6g} Hz", words))
+    return rows
 
 
 def against(peak: float, S_max: float) -> str:

@@ -9,7 +9,7 @@ from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
-from ccd_casadi.deployment.words import against, reason_words, short_status
+from ccd_casadi.deployment.words import against, figure_rows, reason_words, short_status
 from ccd_casadi.drawing.content import (
     Block,
     Curve,
@@ -147,32 +147,12 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
 
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
-    full, small, sampled = run.figures, found.reduced_figures, found.sampled
-    S_max = run.problem.inner.S_max
-
-    def remark(peak: float, bandwidth: float) -> str:
-        return (
-            f"peak {number(peak, 6)} ({against(peak, S_max)}); bandwidth "
-            f"{_percent(bandwidth, full.bandwidth)}"
-        )
-
-    def hz(omega: float) -> str:
-        return f"{number(omega / HZ, 6)} Hz"
-
-    rows = [
-        ("Full", hz(full.bandwidth), remark(full.sensitivity_peak, full.bandwidth)),
-        ("Reduced", hz(small.bandwidth), remark(small.sensitivity_peak, small.bandwidth)),
-        ("Sampled, exact", hz(sampled.bandwidth),
-         remark(sampled.sensitivity_peak, sampled.bandwidth)),
-    ]  # fmt: skip
+    rows = figure_rows(run, found)
     if found.measured is not None:
         m = found.measured
-        rows.append((
-            "Sampled, simulated", hz(m.bandwidth),
-            f"{remark(m.sensitivity_peak, m.bandwidth)}; multisine, {m.periods} periods, changing "
-            f"by {number(m.leftover, 2)} from one to the next",
-        ))  # fmt: skip
-    rows.append(("Slowest sampled mode", number(sampled.spectral_radius, 8), "must be below 1"))
+        words = f"multisine, {m.periods} periods, the last two differ by {number(m.leftover, 2)}"
+        rows.append(("Simulation", words, ""))
+    rows.append(("Slowest sampled mode", number(found.sampled.spectral_radius, 8), "below 1"))
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
     words = (
         "The controller is unstable by itself (its loop is not): close the loop at rest, and open "

@@ -145,7 +145,7 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
     found = [
         ("Margins", f"phase {shown('phase_margin_deg', '°')}",
          f"{gain}, {rest}; the least of the plants that the controller is made for"),
-        ("Crossover |L| = 1", shown("crossover_hz", " Hz"),
+        ("Crossover", shown("crossover_hz", " Hz"),
          "of the model" if "step_overshoot" in r else "of the first plant"),
     ]  # fmt: skip
     if "step_overshoot" in r:
@@ -153,10 +153,17 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
             f"within 2 % after {number(r['settling_ms'], 3)} ms"
         )  # fmt: skip
         found += [
-            ("Step of the reference", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
-            ("Step of force, 1 N", shown("force_step_max", " µm", 1e6), "largest displacement"),
+            ("Step response", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
+            ("Force step", shown("force_step_max", " µm", 1e6), "largest displacement by 1 N"),
         ]
     return found + [("Warning", "narrow", words) for words in r.get("loop_warnings", ())]
+
+
+def loop_lines(r: Mapping[str, Any]) -> list[str]:
+    """The same for the terminal."""
+    plain = {"µ": "u", "°": " deg", "×": "x", "÷": "/"}
+    lines = (f"{name.lower():14s}{value}, {remark}" for name, value, remark in loop_facts(r))
+    return [line.translate(str.maketrans(plain)) for line in lines]
 
 
 def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
