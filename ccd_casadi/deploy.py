@@ -110,18 +110,14 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import figure_rows, status_words
-    from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
 
-    orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    if kind_of(run.problem).as_designed:
-        orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
         *([("decision", advice(run.result))] if advice(run.result) else []),
-        ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
+        ("order", order_words(run, found)),
         ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
                  f"{found.conversion.label}; needed {needed}"),
         *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),

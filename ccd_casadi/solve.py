@@ -22,9 +22,9 @@ def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
     from ccd_casadi.codesign.design_entries import budget_lines
     from ccd_casadi.inner_problem.sections_words import channel_words
-    from ccd_casadi.reporting.facts import loop_lines
+    from ccd_casadi.reporting.facts import cost_words, loop_lines, theta_words
     from ccd_casadi.reporting.verdict import advice, terminal_lines
-    from ccd_casadi.sampling.spent import cost_words
+    from ccd_casadi.sampling.spent import cost_words as spent_words
 
     result = solution.result
     if result["status"] == "infeasible":
@@ -35,8 +35,8 @@ def summary(solution: "Solution") -> str:
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *(f"decision      {words}" for words in (advice(result),) if words),
         *terminal_lines(result),
-        f"theta         {_theta(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
+        f"theta         {theta_words(result)}",
+        f"objective     {result['objective']:.4f}   hardware cost {cost_words(result, 6)}",
         *inner_value_lines(result),
         *_weights_lines(result),
         *([] if controller is None else controller_lines(controller)),
@@ -47,7 +47,7 @@ def summary(solution: "Solution") -> str:
         *budget_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
-        f"cost          {cost_words(result)}",
+        f"cost          {spent_words(result)}",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
@@ -68,15 +68,6 @@ def _weights_lines(result: Mapping[str, Any]) -> list[str]:
         return []
     at = (f"omega_{name} = {result[f'omega_{name}_hz']:.5g} Hz" for name in "ST")
     return [f"weights       {', '.join(at)}"]
-
-
-def _cost(result: Mapping[str, Any]) -> str:
-    return f"{result['hardware_cost']:.6g} {result['cost_unit']}".strip()
-
-
-def _theta(result: Mapping[str, Any]) -> str:
-    values = {**result["theta"], **result.get("fixed", {})}
-    return ", ".join(f"{k} = {v:.6g} {result['units'][k]}".strip() for k, v in values.items())
 
 
 def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.support.units import HZ
 
 
@@ -44,6 +45,19 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
     if reason:
         return Line(State.WARNED, f"{kept}; {reason}", figures)
     return Line(State.PASSED, kept, figures)
+
+
+def order_words(run: FinishedRun, found: Deployment) -> str:
+    """`4 of 6 states (7 synthesised), and 1 of the lead`."""
+    orders = [item.chosen.order for item in found.orders]
+    if kind_of(run.problem).as_designed:
+        return f"{' + '.join(map(str, orders))} states, as designed"
+    words = " + ".join(
+        f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
+    )
+    more = len(found.realisation.system.A) - found.order if found.conversion.lead else 0
+    lead = f", and {more} of the lead" if more else ""
+    return f"{words} states ({len(run.controller.A)} synthesised){lead}"
 
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
