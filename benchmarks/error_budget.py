@@ -36,7 +36,7 @@ def main() -> None:
         source = (*SHAPED, *SHAPED)[number]
         made, _, _ = built(sampling, number, structures[number % 2])
         exact = variances(made, source, None).error
-        model = process(made.plant, made.controller, source, made.sampling)
+        model = process(made, source)
         mean, error = simulated(model, samples, number, 100)
         scores.append((mean - exact) / error)
         print(f"{sampling.rate_hz:6.0f} Hz {sampling.delay_us:4.0f} us  {source.name:20s} "

@@ -101,6 +101,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
+    if not options.quiet and page.head.decision:
+        say(f"decision      {page.head.decision}")
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")
     if found.passed:

@@ -58,6 +58,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     page = insight_page(done, front, responses, index_of(folder))
     publish(folder, folder / "insight.html", page)
     if not options.quiet:
+        say(f"answer        {page.head.decision}")
         say(f"page          {folder / 'insight.html'}")
     return ExitCode.DONE if len(verified) == len(front.points) else ExitCode.NOT_VERIFIED
 

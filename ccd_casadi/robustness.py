@@ -70,12 +70,13 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
 
-    if options.controller is None:
+    own = options.controller is None
+    if own:
         finished = told(finished, folder, "survives", survival_line(finished, found))
-    page = robustness_page(finished, found, options.seed, index_of(folder))
+    page = robustness_page(finished, found, options.seed, index_of(folder), own=own)
     publish(folder, folder / "robustness.html", page)
     if not options.quiet:
-        say("\n".join(conclusion(finished, found)))
+        say("\n".join(filter(None, (page.head.decision, *conclusion(finished, found)))))
         say(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
 

@@ -294,7 +294,7 @@ class Verdict:
 class Head:
     """Title, status with its reason, a line of circumstances, the conclusion, the verdict.
 
-    `badge`: "good", "warn" or "bad".
+    `badge`: "good", "warn" or "bad". `decision`: what to do, or the answer, in a sentence or two.
     """
 
     title: str
@@ -304,6 +304,7 @@ class Head:
     meta: str
     lead: str
     verdict: tuple[VerdictLine, ...] = ()
+    decision: str = ""
 
 
 Text = Words | Heading | Bullets | Links | Source | Facts | Verdict

@@ -111,8 +111,9 @@ def _steps(found: c.Steps, key: str) -> str:
 def head_html(head: c.Head) -> str:
     """Of a page, or of a cell of a notebook."""
     badge = f'<span class="badge {head.badge}">{STANDINGS[head.badge]} {escape(head.status)}</span>'
+    decision = f'<p class="decision">{escape(typeset(head.decision))}</p>\n'
     return (
-        f"<h1>{escape(head.title)}</h1>\n"
+        f"<h1>{escape(head.title)}</h1>\n{decision if head.decision else ''}"
         f"<p class='standing'>{badge} {escape(typeset(head.reason))}</p>\n"
         f'<p class="meta">{escape(head.meta)}</p>\n'
         f'<p class="lead">{escape(typeset(head.lead))}</p>\n{verdict_html(head.verdict)}'

@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
-from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.given_controller import in_discrete_time
@@ -105,7 +105,7 @@ def curves_of(look: Look) -> Curves | None:
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness, its rigid bodies free where that loop is stable."""
     modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
-    free = replace(loop, plant=free_plant(modal))
+    free = replace(loop, plant=modal.state_space)
     ((made,),) = moves(
         [loop], [free], [mass_feedforward(modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
         bandwidth_hz=bandwidth_hz, doublings=1,

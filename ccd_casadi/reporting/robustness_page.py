@@ -16,14 +16,20 @@ from ccd_casadi.support.units import HZ, metres, number, shown
 LOSS = 0.05  # of ω_b: what hardware within its tolerances may cost without being mentioned
 
 
-def robustness_page(run: FinishedRun, found: Study, seed: int, index: str = "") -> Page:
-    """robustness.html; `index`: the page that links all of the run."""
+def robustness_page(
+    run: FinishedRun, found: Study, seed: int, index: str = "", *, own: bool = True
+) -> Page:
+    """robustness.html; `index`: the page that links all of the run.
+
+    `own`: of the run's own controller, so that the run's decision and verdict stand on it.
+    """
     lead, *others = conclusion(run, found)
     head = head_of(
         f"Robustness: {run.case.path.parent.name}", found.survives,
         "stable on all plants" if found.survives else "not stable on all plants",
         "that were tried; nothing is said of others",
-        f"{theta_words(run.result)} · seed {seed}", lead, run.result,
+        f"{theta_words(run.result)} · seed {seed}", lead, run.result if own else {},
+        "" if own else given_decision(found),
     )  # fmt: skip
     sections = (
         Section("In short", tuple(map(Words, others))),
@@ -35,6 +41,13 @@ def robustness_page(run: FinishedRun, found: Study, seed: int, index: str = "") 
         *([_move(found)] if found.moves else []),
     )
     return Page(head, sections, index)
+
+
+def given_decision(found: Study) -> str:
+    """Whether to use a controller that is not the run's own."""
+    if found.survives:
+        return "This controller is stable on every plant that was tried."
+    return "Do not use this controller: it is not stable on every plant that was tried."
 
 
 def conclusion(run: FinishedRun, found: Study) -> list[str]:

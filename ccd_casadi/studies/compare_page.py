@@ -30,13 +30,8 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     problem, found = comparison.problem, answer["conclusions"]
     best = found["best"]
     sections = [
-        Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
-        for method in comparison.methods
-        if lines_of(method.figures)
-    ]
-    sections += [
-        Section("What it shows", tuple(map(Words, found["sentences"]))),
         Section("The methods", _methods(problem, answer)),
+        Section("What it shows", tuple(map(Words, found["sentences"]))),
         Section("Cost", (cost_figure(comparison.methods),)),
     ]
     if len(problem.names) == 2:
@@ -57,6 +52,11 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         Section(f"History: {name}", (descent_figure(problem, descent),))
         for name, descent in histories(comparison).items()
     ]
+    sections += [
+        Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
+        for method in comparison.methods
+        if lines_of(method.figures)
+    ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     sections += [
         Section("The case", (Source(case_to_toml(comparison.case)),)),
@@ -70,7 +70,7 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         "bad" if not verified else "warn" if warned else "good",
         "verified" if verified else "not verified", "",
         f"{len(comparison.methods)} methods, {number(comparison.seconds, 3)} s in all",
-        found["sentences"][0],
+        " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
     return Page(head, tuple(sections), index="")
 

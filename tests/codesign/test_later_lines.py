@@ -55,7 +55,7 @@ def test_after_deploy_and_robustness_no_page_says_what_the_run_no_longer_does(co
         assert "run deploy" not in text, name
         assert "at 10000 Hz with a delay of 100" in text, name
         assert f"{study['unstable']} of 20 plants" in text, name
-    for name in ("index.html", "report.html"):
+    for name in ("index.html", "report.html", "robustness.html", "deploy/report.html"):
         said = "Do not build this: it does not survive small errors of its model. Next: a [robust]"
         assert said in (copied / name).read_text()
     # given again, what it adds is not added twice

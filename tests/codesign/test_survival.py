@@ -10,7 +10,7 @@ from helpers import problem
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ccd_casadi.codesign.loops_off_model import Controller, LoopsOffModel, loops_off_model
+from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
 from ccd_casadi.codesign.verdict import State, survives
@@ -128,14 +128,14 @@ def drawn(seed: int) -> Drawn:
 def loops_and_bound(
     case: Drawn, seed: int, sampling: Sampling | None = None
 ) -> tuple[LoopsOffModel, float]:
-    loops = loops_off_model(case.system(), SUSPENSION, Controller(case.controller(), sampling))
+    loops = loops_off_model(case.system(), SUSPENSION, case.controller(), sampling)
     model = loops.at(Perturbation())
     assume(model.stable and model.peak < 5.0)
     return loops, model.peak * float(np.random.default_rng(seed + 1).choice([1.0, 1.001, 1.1, 1.5]))
 
 
 def found_of(loops: LoopsOffModel, S_max: float) -> Survival:
-    return survival(loops, S_max=S_max, bandwidth=CROSSOVER, omega_low=1.0, M_K=1e4)
+    return survival(loops, S_max=S_max, bandwidth=CROSSOVER, omega_low=1.0)
 
 
 @given(seed=st.integers(0, 10**6))
@@ -186,8 +186,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
     sampling = Sampling(rate_hz=2000.0, delay_us=delay * 500.0)
     loops, S_max = loops_and_bound(case, seed, sampling)
     found = found_of(loops, S_max)
-    k = loops.controller.state
-    K = StateSpace(k.A, k.B, k.C, k.D, period=sampling.period)
+    K = loops.run
 
     def judged(shift: float) -> tuple[bool, float]:
         modal = modal_plant(case.system(), SUSPENSION, Perturbation(shift))
@@ -195,9 +194,7 @@ def test_sampled_loops_are_judged_as_deploy_does(seed: int, delay: float) -> Non
         A = np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]])
         B, C = np.vstack([empty, modal.B]), np.hstack([modal.C, empty.T])
         G = StateSpace(A, B, C, np.zeros((1, 1)))
-        figures = sampled_figures(
-            closed_loop(sampled(G, sampling.period, sampling.delay), K).S
-        )
+        figures = sampled_figures(closed_loop(sampled(G, sampling.period, sampling.delay), K).S)
         return figures.stable, figures.sensitivity_peak
 
     low, high = found.S_max_shift
@@ -247,7 +244,7 @@ def test_other_damping_is_that_of_the_plant_given_the_other_way(
     """One damping ratio, as a matrix and as a ratio: each one's other is the other's own."""
     case = drawn(seed)
     case = replace(case, zeta=np.full_like(case.zeta, case.zeta[0]))
-    K, off = Controller(case.controller()), Perturbation(shift, factor)
+    K, off = case.controller(), Perturbation(shift, factor)
     ways = [
         loops_off_model(replace(case, given=given).system(), SUSPENSION, K)
         for given in (True, False)
@@ -297,7 +294,7 @@ def test_the_lines_of_robustness_end_where_the_verdict_ends(seed: int, held: boo
         problem=replace(
             problem(), inner=replace(problem().inner, S_max=S_max), suspension=SUSPENSION
         ),
-        controller=loops.controller.state,
+        controller=loops.run,
         sampled=sampling,
     )
     good = perturbed.Judged((0.0,), True, 1.0, 1.0, -1.0)

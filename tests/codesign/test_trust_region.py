@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ccd_casadi.optim.quadratic import damped_bfgs, symmetric_rank_one
-from ccd_casadi.optim.trust_region import End, Iterate, Model, Radius, Rows, Step, minimise
+from ccd_casadi.optim.trust_region import (
+    ROWS,
+    End,
+    Iterate,
+    Model,
+    Radius,
+    Rows,
+    Step,
+    best_step,
+    minimise,
+)
 from ccd_casadi.support.arrays import Array
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -168,3 +178,16 @@ def test_the_radius_follows_the_gain() -> None:
     middling = radius.after(0.5, step(0.1))
     assert middling.value == 0.1
     assert middling.after(0.5, step(0.1)).after(0.5, step(0.1)).value == 0.5  # the largest
+
+
+def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None:
+    """min ½ (x - 3)² within x <= 1, beside more steep rows than a programme takes."""
+    far = 2 * ROWS
+    A = np.concatenate([np.full((far, 1), 100.0), np.ones((1, 1))])
+    b = np.append(np.full(far, -150.0), -1.0)
+    model = Smooth(np.eye(1), np.full(1, 3.0), b, A, np.zeros((far + 1, 1, 1)))
+    start = model.at(np.zeros(1))
+    assert start is not None
+    found = best_step(model, start, model.Q, 4.0, 100.0)
+    assert found is not None
+    assert found.change[0] == pytest.approx(1.0, abs=1e-6)

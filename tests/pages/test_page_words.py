@@ -13,10 +13,12 @@ from ccd_casadi.fixed_structure import ShapeEnd
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.reporting.facts import conclusion
+from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
 from ccd_casadi.reporting.robustness_figures import shown_peak, shown_until
 from ccd_casadi.reporting.robustness_page import _cut
 from ccd_casadi.reporting.verdict import LINES, advice
+from ccd_casadi.studies.conclusions import worth_sentence
 from ccd_casadi.support.units import HZ
 
 
@@ -91,3 +93,27 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     assert "The figure ends before, at 540 ms: after that the error is up to" in _cut(move)
     move.settling = 0.0
     assert _cut(move) == ""
+
+
+def test_insight_and_compare_begin_with_their_answer() -> None:
+    problem = SimpleNamespace(cost_unit="kg")
+
+    def point(cost: float, hz: float, efficient: bool = True) -> SimpleNamespace:
+        return SimpleNamespace(
+            hardware_cost=cost, bandwidth=HZ * hz, efficient=efficient, verified=True
+        )
+
+    one = SimpleNamespace(points=(point(110.0, 72.0), point(120.0, 60.0, efficient=False)))
+    assert front_answer(problem, one).startswith("There is nothing to trade")
+    two = SimpleNamespace(points=(point(100.0, 50.0), point(110.0, 70.0)))
+    assert front_answer(problem, two) == (
+        "Bandwidth costs hardware: from 100 kg with 50 Hz to 110 kg with 70 Hz, on average 2 Hz "
+        "for every kg."
+    )
+    best = {"objective": -2.0, "hardware_cost": 80.0, "bandwidth_hz": 60.0}
+    other = {"objective": -1.0, "hardware_cost": 100.0, "bandwidth_hz": 50.0}
+    (said,) = worth_sentence({"lifted": best, "sequential": other}, "lifted")
+    assert said.endswith("hardware cost -20.0 %, bandwidth +20.0 %.")
+    (said,) = worth_sentence({"lifted": other, "sequential": other}, "lifted")
+    assert "gains nothing" in said
+    assert worth_sentence({"lifted": best}, "lifted") == []

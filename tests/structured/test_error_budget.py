@@ -21,8 +21,7 @@ from ccd_casadi.budget import (
 from ccd_casadi.budget.derivatives import Change, variance_slopes
 from ccd_casadi.budget.evaluation import variances
 from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.holding import noise_of_a_period
-from ccd_casadi.budget.loops import Process, process
+from ccd_casadi.budget.loops import Process, noise_of_a_period, process
 from ccd_casadi.budget.moving_average import average_gain, average_matrix
 from ccd_casadi.fixed_structure import Sampling, Structure
 from ccd_casadi.fixed_structure.structure import state_space, state_spaces
@@ -146,7 +145,7 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
     T, steps = sampling.period, 20
     whole, rest = parts(T, made.sampling.delay)
     for source in (SHAPED[0], SHAPED[1]):
-        model = process(made.plant, made.controller, source, made.sampling)
+        model = process(made, source)
         moved = model.A + np.eye(len(model.A))
         P = _settled(moved, model.noise)
         found = variances(made, source, None)
@@ -164,7 +163,7 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
         rng = np.random.default_rng(0)
         state = rng.normal(size=len(model.A))
         n, nk = len(A), len(made.controller.A)
-        x, k, old = state[:n], state[n : n + nk], list(state[n + nk :])
+        x, k, old = state[:n], state[-nk:], list(state[n:-nk])
         half = np.eye(nk) - 0.5 * T * made.controller.A
         e = float(-(made.plant.C @ x[:4])[0])
         # (k_n + k_{n+1})/2
@@ -176,9 +175,9 @@ def test_the_sampled_loop_equals_one_that_is_run_in_fine_steps(sampling: Samplin
             if length > 0.0:
                 drive = np.linalg.solve(A, (expm(A * length) - np.eye(n)) @ B)
                 x = expm(A * length) @ x + drive * queue[force]
-        after = np.concatenate([x, 2.0 * middle - k, queue[: len(old)]])
-        # The controller's state is scaled by Tustin's T/2: compare its output and the rest.
-        np.testing.assert_allclose((moved @ state)[:n], after[:n], rtol=1e-9)
+        after = np.concatenate([x, queue[: len(old)]])
+        # the controller's state is scaled by Tustin's T/2
+        np.testing.assert_allclose((moved @ state)[:-nk], after, rtol=1e-9)
 
 
 def _settled(A: Array, Q: Array) -> Array:
@@ -196,7 +195,7 @@ def test_rms_equals_a_simulation_within_its_statistical_error(sampling: Sampling
     """10⁵ samples; six standard errors by the correlation of e², a Gaussian process."""
     made, _, _ = built(sampling, structure=Structure(biquads=0))
     for seed, source in enumerate((SHAPED[0], SHAPED[4], SHAPED[6])):
-        model = process(made.plant, made.controller, source, made.sampling)
+        model = process(made, source)
         mean, error = simulated(model, 100_000, seed)
         found = variances(made, source, None)
         assert abs(mean - found.error) < 6.0 * error
@@ -245,9 +244,8 @@ def test_the_matrix_of_the_moving_average_is_its_sum() -> None:
     expected = N * np.eye(2)
     for j in range(1, N):
         expected += 2.0 * (N - j) * np.linalg.matrix_power(A, j)
-    np.testing.assert_allclose(
-        average_matrix(A - np.eye(2), 0.07, 0.01), expected / N**2, rtol=1e-13
-    )
+    found = average_matrix(A - np.eye(2), 0.07, 0.01)
+    np.testing.assert_allclose(found, expected / N**2, rtol=1e-13)
 
 
 def test_sources_add_in_squares_and_scale() -> None:
