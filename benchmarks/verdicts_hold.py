@@ -27,7 +27,7 @@ from verdicts_judge import HZ, Chain, Loop, wrong
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests/support"))
 from contradictions import contradictions
 
 SAME = 1e-6  # relative: two values of J that are one optimum

@@ -21,6 +21,7 @@ COMMANDS = {
     "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that exists"),
     "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
     "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
+    "worth": ("ccd_casadi.worth", "what co-design gains over hardware first, in seconds"),
     "retrain": ("ccd_casadi.retrain", "adds true samples to a run where they help most"),
     "insight": ("ccd_casadi.insight", "weight against bandwidth; what the optimum answers to"),
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),

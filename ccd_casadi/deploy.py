@@ -91,6 +91,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             folder / FMU_FILE, found.realisation, texts, str(naming["title"])
         ):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
+    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     if not options.quiet:
         say(_summary(finished, found))
         if moved is not None:
@@ -98,11 +99,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
 
-    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
-    if not options.quiet and page.head.decision:
-        say(f"decision      {page.head.decision}")
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")
     if found.passed:
@@ -115,6 +113,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.words import against, status_words
     from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.verdict import advice
 
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
@@ -125,6 +124,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
         orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
+        *([("decision", advice(run.result))] if advice(run.result) else []),
         ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
         ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
         ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),

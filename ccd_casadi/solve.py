@@ -10,7 +10,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.units import counted, shown
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -129,8 +129,8 @@ def _gains(controller: Mapping[str, Any]) -> str:
     """`4.7e+05 N/m`, of several channels `z: 4.7e+05 N/m, tip: …`."""
     channels = controller.get("channels")
     if channels is None:
-        return f"{controller['gain']:.4g} N/m"
-    return ", ".join(f"{item['name']}: {item['gain']:.4g} N/m" for item in channels)
+        return shown(controller["gain"], "N/m", 4)
+    return ", ".join(f"{item['name']}: {shown(item['gain'], 'N/m', 4)}" for item in channels)
 
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:

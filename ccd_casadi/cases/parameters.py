@@ -18,6 +18,11 @@ KEYS: dict[str, tuple[Check, str]] = {
     "values": (listed, "instead of bounds: the values that it may have, as in a catalogue"),
     "integer": (flag, "whether it is a whole number between the bounds; default false"),
     "fixed": (ANY, "instead of all these but unit: its value, which is not searched"),
+    "varies": (
+        flag,
+        "with sections: true where it is not chosen but takes all values in between, as "
+        "a stroke does; `start` is the model",
+    ),
 }
 Fail = Callable[[str, str], Exception]
 
@@ -25,16 +30,17 @@ Fail = Callable[[str, str], Exception]
 def parameters_of(
     table: Mapping[str, Any], fail: Fail
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
-    """The parameters that are searched, and the fixed ones."""
+    """The parameters that are searched, and the fixed ones, with those that vary."""
     if not table:
         raise fail("theta", "names no parameter; add a table [theta.NAME]")
     found = [_parameter(name, entry, fail) for name, entry in table.items()]
-    if not any(not parameter.values for parameter in found):
+    if not any(not (parameter.values or parameter.varies) for parameter in found):
         words = "has no parameter with a range: give one lower and upper, or ask inner for each"
         raise fail("theta", words)
+    kept = [len(parameter.values) != 1 and not parameter.varies for parameter in found]
     return (
-        tuple(parameter for parameter in found if len(parameter.values) != 1),
-        tuple(parameter for parameter in found if len(parameter.values) == 1),
+        tuple(parameter for parameter, free in zip(found, kept, strict=True) if free),
+        tuple(parameter for parameter, free in zip(found, kept, strict=True) if not free),
     )
 
 
@@ -51,8 +57,9 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         if wrong is not None:
             raise fail(f"{place}.{key}", wrong)
     unit = entry.get("unit", "")
-    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer")),
-                        ("values", ("lower", "upper", "integer"))):  # fmt: skip
+    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
+                        ("values", ("lower", "upper", "integer", "varies")),
+                        ("integer", ("varies",))):  # fmt: skip
         beside = [other for other in others if key in entry and other in entry]
         if beside:
             raise fail(f"{place}.{beside[0]}", f"has no place beside {key}; drop it")
@@ -86,4 +93,4 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         start = min(max(start, lower), upper)
     if len(values) > MOST_VALUES:
         raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
-    return Parameter(name, lower, upper, start, unit, values)
+    return Parameter(name, lower, upper, start, unit, values, entry.get("varies", False))

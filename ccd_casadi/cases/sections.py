@@ -5,25 +5,31 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.checks import (
     ABOVE_ONE,
     FRACTION,
+    NOT_NEGATIVE,
     POSITIVE,
     choice,
+    coordinates,
     count,
     factors,
     files,
+    flag,
     interval,
     key,
     number,
+    numbers_of_modes,
+    places,
     points,
     signed,
     tables,
     text,
+    text_or_rows,
 )
 from ccd_casadi.cases.controller_sections import (
     BaselineSection,
@@ -51,7 +57,8 @@ class Parameter:
     """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter.
 
     `values`: those that it may have, in rising order, from `lower` to `upper`; none: all between
-    the bounds. With one value it is fixed, and no part of θ.
+    the bounds. With one value it is fixed, and no part of θ. One that `varies` is none either: what
+    is designed holds between its bounds.
     """
 
     name: str
@@ -60,6 +67,7 @@ class Parameter:
     start: float
     unit: str
     values: tuple[float, ...] = ()
+    varies: bool = False
 
     def fixed_at(self, value: float) -> "Parameter":
         """The same at one value."""
@@ -72,7 +80,8 @@ class Parameter:
             return {"fixed": self.start, "unit": self.unit}
         if self.values:
             return {"values": self.values, "start": self.start, "unit": self.unit}
-        return {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        found = {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        return found | {"varies": True} if self.varies else found
 
 
 @dataclass(frozen=True)
@@ -249,6 +258,53 @@ class RobustSection:
 
 
 @dataclass(frozen=True)
+class PlacesSection:
+    """[places]: forces and sensors between the nodes of a plant, see `plants.places`; m and kg.
+
+    A coordinate is a number, the name of a [theta], or that name after a minus sign.
+    """
+
+    nodes: str | tuple[tuple[float, ...], ...] = key(
+        text_or_rows,
+        (),
+        says="of the plant's inputs, each a unit force there, in their order: a CSV file with a "
+        "row of coordinates each after a header, or the rows",
+        unit="m",
+    )
+    actuators: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each force: numbers, or names of [theta]", unit="m"
+    )
+    sensors: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each sensor; absent: the plant's own outputs", unit="m"
+    )
+    actuator_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each force", unit="kg")
+    sensor_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each sensor", unit="kg")
+    apart: float = key(
+        NOT_NEGATIVE, 0.0, says="least distance of two forces, and of two sensors", unit="m"
+    )
+    present: tuple[float | str, ...] = key(
+        coordinates,
+        (),
+        says="one for each force: 1 where it is there, 0 where not, or the name of a [theta] with "
+        "values = [0, 1]; absent: all are there",
+    )
+    at_most: int | None = key(count(1), None, says="so many of the forces are there at most")
+    actuator_cost: float = key(NOT_NEGATIVE, 0.0, says="what each force that is there adds to f")
+    axes: bool = key(
+        flag,
+        False,
+        says="true: all forces and all sensors act together, an input and an output for each "
+        "motion of a rigid body normal to the nodes",
+    )
+    quiet: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, which these leave alone"
+    )
+    damped: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, each an axis of its own"
+    )
+
+
+@dataclass(frozen=True)
 class BudgetSection:
     """[budget]: what moves the stage, by where it enters, and the window of MA and MSD in ms.
 
@@ -287,6 +343,7 @@ class Case(Shown):
     outer: OuterSection
     baseline: BaselineSection
     limits: LimitsSection
+    places: PlacesSection = field(default_factory=PlacesSection)
     fixed: tuple[Parameter, ...] = ()
 
 
@@ -295,6 +352,7 @@ SECTIONS: dict[str, type] = {
     "weights": WeightsSection,
     "inner": InnerSection,
     "suspension": SuspensionSection,
+    "places": PlacesSection,
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,

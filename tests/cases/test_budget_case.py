@@ -132,10 +132,7 @@ def test_the_budget_of_a_design_in_result_terminal_and_page(tmp_path: Path) -> N
 def test_the_rms_of_a_spectrum_is_its_integrals_root() -> None:
     table = TabulatedSpectrum((0.5, 5.0, 50.0, 60.0), (1e-3, 1e-4, 1e-4, 1e-9))  # slopes -1, 0
     shaped = ShapedSpectrum(2.0, ((3.0,),), ((5.0, 0.2), (40.0,)))
-    for spectrum, ends in (
-        (table, np.array(table.hz)),
-        (shaped, np.geomspace(1e-6, 1e8, 150)),
-    ):
+    for spectrum, ends in ((table, np.array(table.hz)), (shaped, np.geomspace(1e-6, 1e8, 150))):
         whole = integrate(lambda hz, S=spectrum: S.at(hz)[None], ends)
         assert spectrum.rms() == pytest.approx(float(np.sqrt(whole.value[0])), rel=1e-6)
     assert ShapedSpectrum(1.0).rms() is None

@@ -144,7 +144,7 @@ def test_command_writes_numbers_and_a_page(two_mass_run: Path, tmp_path: Path) -
     assert found["optimum"]["responses"]["S_max"]["objective"] == pytest.approx(-64.154, rel=1e-4)
     assert found["first_resonance_over_bandwidth"] == pytest.approx(183.56 / 72.045, rel=1e-3)
     page = (folder / "insight.html").read_text()
-    assert "the lightest design is also the fastest" in page
+    assert "is also the fastest" in page
     assert "2.55 times the bandwidth" in page
 
 

@@ -275,9 +275,7 @@ class TwoControllers(SimpleNamespace):
         value = 300.0 + self.slope * z - 40.0 * z**2 if better else 250.0 + 10.0 * z
         bent = self.slope - 80.0 * z if better else 10.0
         at, kappa, nan = tuple(map(float, theta)), (1.0 if better else 2.0,), float("nan")
-        return [
-            BandwidthSample(at, value, (bent / 15.0, 0.0), nan, nan, (), "", 0.0, 1, kappa),
-        ]
+        return [BandwidthSample(at, value, (bent / 15.0, 0.0), nan, nan, (), "", 0.0, 1, kappa)]
 
 
 @few(max_examples=20)

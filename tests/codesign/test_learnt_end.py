@@ -61,4 +61,3 @@ def test_what_is_missed_at_the_end_is_learnt(monkeypatch: pytest.MonkeyPatch, ro
     found = search._looked(search.Searched(outer, outcome, end, 1), options, (), 0)
     assert search._missed(outcome, end) > 0.1
     assert (search._missed(found.outcome, end) < 1e-3) is (rounds > 0)
-

@@ -81,7 +81,7 @@ def test_a_polish_from_near_by_finds_the_same_design(
 ) -> None:
     case, sampler, x, _ = inside_the_box
     start = away(inside_the_box, sign * 10.0**power)
-    end, found, _ = polish(sampler, start)
+    end, found = polish(sampler, start)
     assert acceptable(case, end, found)
     assert kkt_certificate(case, end, found).stationarity < 1e-8
     assert distance(inside_the_box, end) < 1e-8

@@ -59,9 +59,11 @@ def test_an_option_in_the_help_is_read(word: str, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(module, "run", note)
     module.main([])
-    told = {
-        action.dest for action in asked[0]._actions if action.help != argparse.SUPPRESS
-    } - {"help", "workers", "no_user_code"}
+    told = {action.dest for action in asked[0]._actions if action.help != argparse.SUPPRESS} - {
+        "help",
+        "workers",
+        "no_user_code",
+    }
     assert told - options_read(module) == set()
 
 

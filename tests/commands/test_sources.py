@@ -11,10 +11,7 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted(p for name in ("ccd_casadi", "surrogates") for p in (ROOT / name).rglob("*.py"))
 # Pipes between the processes of one run.
-LIVE = {
-    "ccd_casadi/support/worker_process.py",
-    "ccd_casadi/sampling/cluster.py",
-}
+LIVE = {"ccd_casadi/support/worker_process.py", "ccd_casadi/sampling/cluster.py"}
 # They import by names that sources spell out: optional packages, what a command needs, names.
 # Processes of this Python with a module of the package; the person's C compiler on our own C code.
 PROCESSES = {

@@ -145,7 +145,7 @@ def test_the_whole_loop_is_judged_on_the_whole_set(
             assert figures.stable
             assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
     page = painted(deploy_page(run, found))
-    assert "Channel sum: gain 3000 N/m" in page
+    assert "Channel sum: gain 3000\xa0N/m" in page
     assert "Channel difference: 3 states, as designed" in page
 
 

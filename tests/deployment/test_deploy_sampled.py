@@ -182,8 +182,7 @@ def test_the_needed_rate_lies_above_every_failure(edge: float, hole: float) -> N
 
 
 @pytest.mark.parametrize(
-    ("met", "found"),
-    [(lambda rate: False, None), (lambda rate: rate >= 1234.0, 1234.0)],
+    ("met", "found"), [(lambda rate: False, None), (lambda rate: rate >= 1234.0, 1234.0)]
 )
 def test_needed_rate(met: Callable[[float], bool], found: float | None) -> None:
     assert needed_rate(met, 10.0) == (None if found is None else pytest.approx(found, rel=1e-3))

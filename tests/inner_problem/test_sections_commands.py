@@ -111,8 +111,9 @@ def test_no_controller_exceeds_what_the_run_says(
     result = json.loads((folder / "run" / "result.json").read_text())
     bound = result["gap"]["bandwidth_bound_hz"]
     assert bound >= result["costs"]["on_model_hz"] >= result["bandwidth_hz"]
-    assert f"no controller of any order exceeds {bound:.2f} Hz" in (
-        result["verdict"]["optimal"]["words"]
+    assert (
+        f"no controller of any order exceeds {bound:.2f} Hz"
+        in (result["verdict"]["optimal"]["words"])
     )
     assert gap_main([str(folder / "run")]) == 0
     answer = json.loads(capsys.readouterr().out)

@@ -32,10 +32,7 @@ def test_the_bound_is_the_same_in_any_coordinates(seed: int, log_S: float, log_T
     w = weights(plant, log_S, log_T)
     Q = np.linalg.qr(np.random.default_rng(seed).normal(size=plant.A.shape))[0]
     found, told = [], 1e-11
-    for A, B, C in (
-        (plant.A, plant.B, plant.C),
-        (Q.T @ plant.A @ Q, Q.T @ plant.B, plant.C @ Q),
-    ):
+    for A, B, C in ((plant.A, plant.B, plant.C), (Q.T @ plant.A @ Q, Q.T @ plant.B, plant.C @ Q)):
         bound, at = gamma_lower_bound(prepare(A, B, C), w, plant.grid, plant.gain)
         found.append(bound)
         told += bound_error(A, B, C, w, at)

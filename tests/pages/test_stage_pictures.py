@@ -167,7 +167,7 @@ def test_lopsided_stage_has_pictures_without_symmetry() -> None:
 
 
 def test_mode_figure_is_sound_small_and_holds_the_script_s_data() -> None:
-    html = modes_figure()
+    html = modes_figure().replace("\xa0", " ")
     pictures = svgs(html)
     assert len(pictures) == 7  # six modes and the scale
     assert "4 and 5: bent tilt, a pair, 950.6" in html

@@ -39,7 +39,7 @@ def test_both_sides_are_the_true_inner_problems() -> None:
     expected = [true_inner(case, theta).bandwidth / HZ for theta in (case.start, (55.0, 55.0))]
     assert shown == pytest.approx(expected, rel=1e-4)
     gained = 100.0 * (expected[1] / expected[0] - 1.0)
-    assert f"changes by {gained:+.3g} %" in html(section)
+    assert f"changes by {gained:+.3g}\xa0%" in html(section)
 
 
 def test_poles_are_shown_once_a_pair_and_all_damped() -> None:

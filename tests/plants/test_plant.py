@@ -137,11 +137,7 @@ def test_the_grid_has_nine_points_about_each_root(damping_ratio: float) -> None:
 
 @pytest.mark.parametrize(
     ("theta", "zero_hz", "pole_hz"),
-    [
-        ((60.0, 60.0), 147.9, 209.2),
-        ((67.56, 67.56), None, 250.0),
-        ((58.33, 55.0), None, 192.6),
-    ],
+    [((60.0, 60.0), 147.9, 209.2), ((67.56, 67.56), None, 250.0), ((58.33, 55.0), None, 192.6)],
 )
 def test_resonances_of_the_paper(theta, zero_hz: float | None, pole_hz: float) -> None:
     system = mechanics(two_mass_model(), theta)

@@ -37,9 +37,7 @@ def test_the_shipped_design_holds_on_the_ends_of_its_models_box() -> None:
                          mode_shift=0.02, damping=(0.5, 2.0))  # fmt: skip
     K = built.controller(built.DESIGN)
     for _, point in box.corners()[1:]:
-        loop = closed_loop(
-            sampled(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K
-        ).S
+        loop = closed_loop(sampled(box.plant(point).plant_si(), 1.0 / built.RATE, built.DELAY), K).S
         figures = sampled_figures(loop)
         assert figures.stable
         assert figures.sensitivity_peak <= built.S_MAX * (1.0 + 1e-4)

@@ -58,8 +58,7 @@ def test_slopes_are_differences(theta: tuple[float, ...], index: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(s, marks=pytest.mark.slow) if s == "lopsided" else s for s in STAGES],
+    "name", [pytest.param(s, marks=pytest.mark.slow) if s == "lopsided" else s for s in STAGES]
 )
 def test_slopes_along_a_mixed_direction(name: str) -> None:
     stage = STAGES[name]

@@ -243,7 +243,7 @@ def test_the_command_writes_figures_and_a_page(two_mass_run: Path, tmp_path: Pat
     assert len(tags.ids) == len(set(tags.ids))
     assert page.count("<figure>") == 6
     assert "not stable on all plants" in page
-    assert "-0.76 %" in page
+    assert "-0.76\xa0%" in page
     left = ["report.json", "robustness.html", "robustness.json"]
     assert sorted(p.name for p in out.iterdir()) == left
 
@@ -282,7 +282,7 @@ def test_a_structured_bound_that_takes_too_long_is_said_not_to_be_there(run: Fin
     assert study_dict(run, found)["structured"] is None
     assert study_dict(run, found)["structured_not_computed_within_s"] == 1e-4
     assert any("not computed within 0.0001 s" in words for words in conclusion(run, found))
-    assert "Not computed within 0.0001 s" in painted(robustness_page(run, found, 0))
+    assert "Not computed within 0.0001\xa0s" in painted(robustness_page(run, found, 0))
 
 
 def test_in_a_process_of_its_own_the_structured_bound_is_the_same(run: FinishedRun) -> None:

@@ -93,8 +93,7 @@ def interrupted_runs(
 
 
 @pytest.mark.parametrize(
-    ("kills", "seed", "span"),
-    [(2, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)],
+    ("kills", "seed", "span"), [(2, 1, 1.0), pytest.param(20, 2, 1.5, marks=pytest.mark.slow)]
 )
 def test_killed_and_resumed_ends_as_if_undisturbed(
     undisturbed: tuple[Callable[..., list[str]], Path],
@@ -163,8 +162,7 @@ def test_a_killed_pool_resumes_to_the_same_samples(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "formulation",
-    ["nested", pytest.param("lifted", marks=pytest.mark.slow), "direct"],
+    "formulation", ["nested", pytest.param("lifted", marks=pytest.mark.slow), "direct"]
 )
 def test_ctrl_c_is_resumable(
     undisturbed: tuple[Callable[..., list[str]], Path], tmp_path: Path, formulation: str

@@ -249,10 +249,7 @@ def test_a_store_that_is_none_is_refused(
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ["ccd_casadi.inner", "bad.toml", "--theta", "m1=60,m2=60"],
-        ["ccd_casadi.solve", "own.toml"],
-    ],
+    [["ccd_casadi.inner", "bad.toml", "--theta", "m1=60,m2=60"], ["ccd_casadi.solve", "own.toml"]],
 )
 def test_the_real_command_refuses_in_one_line(tmp_path: Path, words: list[str]) -> None:
     changed(tmp_path, ("S_max = 1.75", "S_max = 1.0")).rename(tmp_path / "bad.toml")

@@ -116,9 +116,7 @@ def test_a_narrow_peak_at_3_db_is_seen_by_the_judge_and_by_the_search(gain: floa
     structure, sampling = Structure(biquads=1, roll_off=0), Sampling(3814.4)
     kappa = np.log([71379.0, 2.3485, 5.8627, 175.47, 173.77, 0.12104, 601.8, 0.52486])
     kappa[0] += np.log(gain * 0.92418)
-    bounds = Bounds(
-        S_max=4.7, S_low=0.1, omega_low=2.6, shape=1.2286, shape_ends=ShapeEnd.CROSSING
-    )
+    bounds = Bounds(S_max=4.7, S_low=0.1, omega_low=2.6, shape=1.2286, shape_ends=ShapeEnd.CROSSING)
     problem = problem_for([rigid(12.743)], structure, bounds, sampling)
     scaled, own = in_problem_units(problem, kappa), problem.plants
     omega = np.geomspace(20.0, 1100.0, 200_000)
@@ -346,9 +344,7 @@ def test_a_mode_without_damping_that_no_force_drives_is_never_stable(
         assert not judged([other], K, bounds, sampling, False)[0].stable
 
 
-def test_plants_judged_together_are_each_as_alone(
-    design, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plants_judged_together_are_each_as_alone(design, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of several sizes and in batches, an unstable one among them, with one grid for each."""
     louder = replace(design.controller, C=3.0 * design.controller.C)
     plants = [plant(0.01 * i, 0.5 + 0.1 * i) for i in range(4)]

@@ -119,8 +119,9 @@ class Block:
         elif dimension == 1:
             axis, corner = self.piece(1, tag)
             steps = np.arange(1, CELLS)
-            points, parameters = CELLS * corner + np.outer(steps, np.eye(3, dtype=int)[axis]), (
-                steps / CELLS
+            points, parameters = (
+                CELLS * corner + np.outer(steps, np.eye(3, dtype=int)[axis]),
+                (steps / CELLS),
             )
         return self.labels(points), self.place(points / CELLS).ravel(), parameters
 

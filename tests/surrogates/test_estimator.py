@@ -10,11 +10,7 @@ from surrogates import Kind, SurrogateRegressor, to_casadi
 
 @pytest.mark.filterwarnings("ignore")  # what the checks provoke
 @pytest.mark.parametrize(
-    "kind",
-    [
-        Kind.POLYNOMIAL,
-        pytest.param(Kind.GAUSSIAN_PROCESS, marks=pytest.mark.slow),
-    ],
+    "kind", [Kind.POLYNOMIAL, pytest.param(Kind.GAUSSIAN_PROCESS, marks=pytest.mark.slow)]
 )
 def test_every_kind_passes_the_checks(kind: Kind) -> None:
     results = check_estimator(SurrogateRegressor(kind.value), on_fail=None, on_skip=None)

@@ -145,10 +145,7 @@ def test_a_run_holds_its_quality(two_mass_run: Path) -> None:
 def test_auto_takes_the_kernel_that_predicts_left_out_samples_best() -> None:
     u = (X - 50.0) / 20.0
     kinds = {}
-    for name, Y in (
-        ("analytic", np.exp(-u.sum(1))),
-        ("rough", np.abs(u @ [1.0, -0.7] - 0.2)),
-    ):
+    for name, Y in (("analytic", np.exp(-u.sum(1))), ("rough", np.abs(u @ [1.0, -0.7] - 0.2))):
         found = [fit(X, Y, **BOX, noise=1e-7, starts=1, kernel=k) for k in kernels_of("auto")]
         best = best_left_out(found)
         assert best.loo.rms == min(p.loo.rms for p in found)

@@ -47,12 +47,7 @@ def logarithms(figures: DesignFigures) -> np.ndarray:
     """ln of ω_b, ‖S‖∞, σ_max(S(jω_low)), γ_opt; its derivatives to ln p are elasticities."""
     assert figures.certified
     return np.log(
-        [
-            figures.bandwidth,
-            figures.sensitivity_peak,
-            figures.sensitivity_low,
-            figures.gamma_opt,
-        ]
+        [figures.bandwidth, figures.sensitivity_peak, figures.sensitivity_low, figures.gamma_opt]
     )
 
 

@@ -70,10 +70,7 @@ def test_many_channels_survive_too(seed: int, tmp_path: Path) -> None:
     case: FlexibleCase = flexible_case(seed)
     made = synthesise(case.plant, case.weights, omega_low=OMEGA_LOW)
     assert made.figures.certified
-    systems = {
-        "G": named_plant(case.plant.plant_si()),
-        "K": named_controller(made.controller),
-    }
+    systems = {"G": named_plant(case.plant.plant_si()), "K": named_controller(made.controller)}
     write_mat(tmp_path / "x.mat", DesignFile(systems))
     found = read_mat(tmp_path / "x.mat").systems
     plant = plant_from_control(to_control(found["G"]), case.plant.force)
