@@ -65,7 +65,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.compare", "Every method on one case.")
+    arguments = parser("ccd_casadi.compare", "Run every method on one case, side by side.")
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.studies.comparison"])
 

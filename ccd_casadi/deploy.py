@@ -187,15 +187,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     arguments.add_argument(
         "--rate-hz", metavar="X", type=positive,
-        help="sampling rate (default: the next round one above what is needed)",
+        help="sampling rate (default: the next round rate above what is needed)",
     )  # fmt: skip
     delay = arguments.add_mutually_exclusive_group()
     delay.add_argument(
-        "--delay", metavar="SECONDS", type=number(), help="from reading y to the new u, in s"
+        "--delay", metavar="SECONDS", type=number(), help="time from reading y to the new u, in s"
     )
     delay.add_argument(
         "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
-        help="the same in sampling periods (default: 1)",
+        help="the same time in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
         "--method", choices=["auto", *Discretisation], default="auto",
@@ -203,11 +203,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     arguments.add_argument(
         "--lead", choices=list(LEADS), default="auto",
-        help="a lead that makes up for hold and delay (default: where it lowers the rate)",
+        help="a lead that compensates hold and delay (default: if it lowers the rate)",
     )  # fmt: skip
     arguments.add_argument(
         "--unverified", action="store_true",
-        help="go on with a run that is not verified; its controller is never called so",
+        help="deploy a run that is not verified; the result is not verified either",
     )  # fmt: skip
     arguments.add_argument(
         "--saturation", metavar="NEWTON", type=positive,

@@ -245,16 +245,16 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.solve", "Co-design a stage and its controller; see the README.")
+    arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
     arguments.add_argument(
         "--formulation",
         choices=FORMULATIONS,
-        help="default: nested; direct where that is slow, as with many parameters",
+        help="default: nested, or direct with many parameters or lists",
     )
     arguments.add_argument(
         "--resume",
         action="store_true",
-        help="say what the run folder holds already; every run goes on from that",
+        help="print what the run folder holds; every run continues from it",
     )
     arguments.add_argument(
         "--surrogate",
@@ -264,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--no-report",
         action="store_true",
-        help="write no report: for jobs whose result.json is read by a program",
+        help="write no pages, for jobs that only need result.json",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

@@ -47,7 +47,7 @@ def move_parts(
     panels, words, columns, heads = [], [], [1e3 * time], ["ms"]
     for name, made in zip(ways, found, strict=True):
         error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
-        panels.append(_over_plants(
+        panels.append(over_plants(
             1e3 * time, error, f"error, {name} (µm)", legend="upper right",
             levels=(Level(1e3 * end, "end of the move", True, GREY),),
         ))  # fmt: skip
@@ -73,7 +73,7 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
-    panel = _over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
+    panel = over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
     head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
@@ -83,7 +83,7 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
 
 
-def _over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
+def over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
     """The model's in a band of all."""
     several = len(values) > 1
     curve = Curve(ms, values[0], "the model" if several else "")

@@ -83,7 +83,7 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert 55.0 < theta[0] < 67.0
     page.get_by_text("certified, keeps its bounds").wait_for()
     hz, gain = page.evaluate(
-        "(d => [[...d.hz], [...d.S]])(Bokeh.documents[0].get_model_by_name('gains').data)"
+        "(d => [[...d.xs[0]], [...d.ys[0]]])(Bokeh.documents[0].get_model_by_name('own_S').data)"
     )
     assert hz == sorted(hz)
     assert len(hz) == len(gain)
@@ -98,6 +98,35 @@ def test_it_is_dragged_answers_and_says_when_its_server_is_gone(browser, server,
     assert "does not answer" in page.get_by_role("alert").inner_text()
     with SampleStore(Path(tmp_path) / "samples.sqlite") as store:
         assert tuple(theta) in {sample.theta for sample in store.select()}
+
+
+@pytest.mark.slow
+def test_pins_outlive_a_reload_and_a_change_to_dark(browser, server):
+    page, heard = opened(browser, server[1])
+    pinned = "Bokeh.documents[0].get_model_by_name('pins').source.data"
+    slider = page.get_by_role("slider", name="m1 (kg)")
+    slider.press("PageDown")
+    page.get_by_role("button", name="Pin this design").click()
+    page.wait_for_function(f"{pinned}.design.length == 1")
+    before = page.evaluate(f"(d => [[...d.design], [...d.theta_m1]])({pinned})")
+    light = page.evaluate(f"{pinned}.colour[0]")
+    page.reload()
+    page.wait_for_function(f"window.{READY}")
+    assert page.evaluate(f"(d => [[...d.design], [...d.theta_m1]])({pinned})") == before
+    assert slider.get_attribute("aria-valuetext") == f"{before[1][0]:.3f}"
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_url("**dark=1**")
+    page.wait_for_function(f"window.{READY}")
+    assert page.evaluate(f"(d => [[...d.design], [...d.theta_m1]])({pinned})") == before
+    assert page.evaluate(f"{pinned}.colour[0]") != light  # told apart on a dark ground too
+    assert (
+        page.get_by_role("slider", name="ω_S (Hz), range searched, upper").get_attribute(
+            "aria-valuetext"
+        )
+        == "1800"
+    )
+    assert page.get_by_role("img", name="Sensitivity S").is_visible()
+    assert not heard
 
 
 @pytest.mark.slow
@@ -142,7 +171,7 @@ def test_a_circle_is_round_without_a_browser_too(width):
     """The page's own arithmetic, in the JavaScript that playwright brings: CI has no Chromium."""
     api = pytest.importorskip("playwright", reason="playwright is not installed")
     pytest.importorskip("bokeh", reason="bokeh is not installed")
-    from ccd_casadi.explorer.figures import CENTRE, HALF
+    from ccd_casadi.explorer.painter import CENTRE, HALF
 
     size = {"inner_width": width - 70, "inner_height": 180}
     fit = package_text("explorer/assets/round.js")
@@ -164,10 +193,11 @@ def test_a_circle_of_the_nyquist_plot_is_one_in_pixels(browser, tmp_path):
     embed = pytest.importorskip("bokeh.embed", reason="bokeh is not installed")
     from bokeh.resources import INLINE
 
-    from ccd_casadi.explorer.figures import Figures
+    from ccd_casadi.explorer.painter import PanelFigure
 
     place = tmp_path / "nyquist.html"
-    place.write_text(embed.file_html(Figures(False).nyquist, INLINE), encoding="utf-8")
+    made = PanelFigure("nyquist", "", False, whole_circles=True)
+    place.write_text(embed.file_html(made.figure, INLINE), encoding="utf-8")
     page = browser.new_page()
     page.goto(place.as_uri())
     for width in (1920, 1400, 800, 390):

@@ -15,8 +15,9 @@ from ccd_casadi.explorer.background import Solve
 from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
 from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
-from ccd_casadi.explorer.landscape import field_of
+from ccd_casadi.explorer.landscape import landscape_of
 from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
+from ccd_casadi.explorer.panels import drawn
 from ccd_casadi.explorer.session import Session
 from ccd_casadi.explorer.words import (
     end_words,
@@ -27,6 +28,7 @@ from ccd_casadi.explorer.words import (
 )
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.reporting.bode import loop_panels
 from ccd_casadi.reporting.machine import lumped, lumped_svg
 from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.support.units import HZ
@@ -116,7 +118,7 @@ def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
     assert c.view.gains[0][c.view.hz == look.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
     assert c.poles.real.max() < 0.0
     # the distance of L from -1 is 1/|S|
-    near = np.abs(1.0 + c.loci[:, 0])
+    near = np.abs(1.0 + c.view.open[0, :, 0, 0])
     known = np.isfinite(near)
     assert near[known] * c.view.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
     assert abs(c.step[-1] - 1.0) < 0.05
@@ -197,13 +199,40 @@ def test_the_margins_told_are_where_stability_ends(session, searched_look):
         loop = closed_loop(G, replace(K, C=factor * K.C, D=factor * K.D))
         return np.linalg.eigvals(loop.A).real.max() < 0.0
 
-    for gain, inwards in ((c.margins.gain_down, 1.0 + 1e-6), (c.margins.gain_up, 1.0 - 1e-6)):
+    for gain, inwards in (
+        (c.view.margins.gain_down, 1.0 + 1e-6),
+        (c.view.margins.gain_up, 1.0 - 1e-6),
+    ):
         assert stable(gain * inwards)
         assert not stable(gain / inwards)
     assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
     assert "feedforward" in move_words(c)
     alone = replace(c, move=replace(c.move, feedforward=False))
     assert "without feedforward" in move_words(alone)
+
+
+def test_margins_are_drawn_where_the_loop_has_them(session):
+    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # with a margin downwards too
+    view = curves_of(look).view
+    size, phase = loop_panels(view)
+
+    def L(hz):
+        G, K = view.loop.responses(HZ * np.array([hz]))
+        return complex((G @ K)[0, 0, 0])
+
+    (crossover,) = (level.value for level in phase.levels if level.vertical)
+    assert abs(L(crossover)) == pytest.approx(1.0, rel=1e-9)
+    assert len(size.marks) == 2
+    for mark in size.marks:
+        assert L(mark.x) == pytest.approx(-mark.y, rel=1e-6)  # where the gain alone decides
+    (mark,) = phase.marks
+    assert abs(L(mark.x)) == pytest.approx(1.0, rel=1e-9)
+    turned = (mark.y - np.degrees(np.angle(L(mark.x)))) % 360.0
+    assert min(turned, 360.0 - turned) < 1.0  # read off the grid's straight pieces
+    gap = phase.curves[-1].y
+    assert abs(gap[0] - gap[1]) == pytest.approx(view.margins.phase_deg, abs=1.0)
+    drawn_too = drawn(look, curves_of(look), None).panels
+    assert drawn_too["L"].marks == size.marks  # what a page shows is what the explorer shows
 
 
 def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):
@@ -216,8 +245,8 @@ def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searc
     known = dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
     assert known[searched_look.theta] == pytest.approx(searched_look.bandwidth_hz, rel=EQUAL)
     assert np.isnan(known.get(live.theta, np.nan))  # one synthesis is no ω_b*(θ)
-    drawn = field_of(problem, searched_look.theta, None, (), session.store.path, (0, 1))
-    assert searched_look.theta in {(x, y) for x, y, _ in drawn.samples.tolist()}
+    drawn, _ = landscape_of(problem, searched_look.theta, None, (), session.store.path, (0, 1))
+    assert searched_look.theta in {(x, y) for x, y, _ in drawn.truths.tolist()}
 
 
 def test_a_saved_case_is_the_one_on_the_sliders(session):

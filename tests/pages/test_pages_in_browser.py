@@ -83,8 +83,8 @@ def test_the_pages_of_a_run_are_read_on_any_screen_and_on_paper(browser, solved)
     page.get_by_role("link", name="Co-design of").click()
     assert page.url == (folder / "report.html").as_uri()
     assert (folder / "report.html").stat().st_size < HEAVIEST
-    page.get_by_role("link", name="Plant and controller").click()  # of the contents list
-    top = page.get_by_role("heading", name="Plant and controller").bounding_box()["y"]
+    page.get_by_role("link", name="Loop, plant and controller").click()  # of the contents list
+    top = page.get_by_role("heading", name="Loop, plant and controller").bounding_box()["y"]
     assert -1.0 <= top < 200.0
     looked_at(browser, [folder / "report.html"], ["dark"])  # the rest is behind slow
 

@@ -339,7 +339,13 @@ def test_a_run_without_one_gets_a_report_of_its_design(
     assert report_command([str(folder), "--quiet"]) == 0
     text = (folder / "report.html").read_text(encoding="utf-8")
     Document(text)
-    for heading in ("At a glance", "The design", "Plant and controller", "A move", "Provenance"):
+    for heading in (
+        "At a glance",
+        "The design",
+        "Loop, plant and controller",
+        "A move",
+        "Provenance",
+    ):
         assert f"<h2>{heading}</h2>" in text
     assert "how the design was found was not kept" in text
     assert report_command([str(folder), "--quiet"]) == 0

@@ -15,7 +15,8 @@ from scipy.linalg import eigh
 from ccd_casadi.cases.case import CaseError, load_case, parse_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
-from ccd_casadi.inner_problem.problem import plant_of
+from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
 from ccd_casadi.plants.places import Between, Places, placed
 from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
@@ -195,3 +196,48 @@ def test_the_case_moves_with_its_places(tmp_path: Path) -> None:
 
 def load_case_of(text: str):  # what is written is read as it was
     return parse_case(tomllib.loads(text)).places
+
+
+STROKE = CASE.parent.parent / "gantry_stroke" / "case.toml"
+
+
+def test_a_parameter_that_varies_is_one_of_the_box() -> None:
+    """Not in θ, with slopes of its own, and at its start the model itself."""
+    problem = problem_of(load_case(STROKE))
+    assert problem.names == ("h", "wall")
+    assert problem.source.held == {"at": 0.1}
+    uncertain = uncertain_plant(problem, problem.start)
+    assert uncertain.names == ("resonance_shift", "theta.at")
+    assert uncertain.nominal.tolist() == [0.0, 0.1]
+    assert uncertain.box.tolist() == [[-0.02, -0.3], [0.02, 0.3]]
+    model, moved = uncertain.plant(uncertain.nominal), uncertain.plant(np.array([0.01, -0.2]))
+    omega = np.array([0.1, 0.7, 2.0])
+    assert model.system.response(omega) == pytest.approx(
+        scaled_plant(problem, problem.start).system.response(omega), rel=1e-9
+    )
+    assert moved.natural[1:] != pytest.approx(1.01 * model.natural[1:], rel=1e-3)
+    assert len(model.dA) == 2
+    point, step = np.array([0.01, 0.15]), 1e-4
+    near = [uncertain.plant(point + k * step * np.eye(2)[1]).plant_si() for k in (-2, -1, 1, 2)]
+    omega = 2.0 * np.pi * np.array([3.0, 40.0, 150.0, 330.0])
+    found = np.tensordot([1, -8, 8, -1], [one.response(omega) for one in near], 1) / (12 * step)
+    sloped = uncertain.sloped(point)
+    dA, dB, dC = (part[1] for part in (sloped.dA, sloped.dB, sloped.dC))
+    for i, w in enumerate(omega / sloped.omega_0):
+        R = np.linalg.inv(1j * w * np.eye(len(sloped.A)) - sloped.A)
+        slope = dC @ R @ sloped.B + sloped.C @ R @ (dA @ R @ sloped.B + dB)
+        scale = (sloped.C @ R @ sloped.B) / sloped.plant_si().response(omega[[i]])[0]
+        assert slope / scale == pytest.approx(found[i], rel=1e-5)
+
+
+def test_what_varies_needs_sections_and_bounds() -> None:
+    data = tomllib.loads(STROKE.read_text())
+    whole = parse_case(data, STROKE)
+    text = case_to_toml(whole)
+    assert parse_case(tomllib.loads(text), STROKE).fixed == whole.fixed
+    data["theta"]["at"]["integer"] = True
+    with pytest.raises(CaseError, match=r"theta\.at\.varies: has no place beside integer"):
+        parse_case(data, STROKE)
+    del data["theta"]["at"]["integer"], data["controller"], data["loop"], data["robust"]
+    with pytest.raises(CaseError, match=r"theta\.at\.varies: needs controller\.structure"):
+        parse_case(data, STROKE)
