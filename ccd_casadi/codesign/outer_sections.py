@@ -40,6 +40,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
 )
 from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.limitations.of_problem import known_gap
+from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -180,7 +181,7 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
 
 
 def by_pieces(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL, first: float = FIRST
 ) -> tuple[TrueBandwidth, BandwidthSample]:
     """From a sample, and what was asked for near it, to where the pieces of J promise no more.
 
@@ -188,7 +189,7 @@ def by_pieces(
     one becomes an anchor, and the search goes on.
     """
     for _ in range(FOLLOWED):
-        best, jumped = pieces_from(truth, best, settled)
+        best, jumped = pieces_from(truth, best, settled, first)
         if not jumped:
             break
         problem = joined(truth.sampler.problem, np.array(best.kappa), ())
