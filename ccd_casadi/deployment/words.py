@@ -1,6 +1,7 @@
 """A deployment's verdict in words: what is kept, by how much, and on which plant."""
 
 from math import isfinite
+from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import Line, State
@@ -62,7 +63,7 @@ def order_words(run: FinishedRun, found: Deployment) -> str:
 
 def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
     """Bandwidth and peak of S of every loop on the way: name, value and remark."""
-    loops = [
+    loops: list[tuple[str, Any]] = [
         ("Full", run.figures), ("Reduced", found.reduced_figures), ("Sampled", found.sampled),
         ("Simulated", found.measured),
     ]  # fmt: skip

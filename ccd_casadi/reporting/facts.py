@@ -175,9 +175,9 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
 
 def loop_lines(r: Mapping[str, Any]) -> list[str]:
     """The same for the terminal."""
-    plain = {"µ": "u", "°": " deg", "×": "x", "÷": "/"}
+    plain = str.maketrans({"µ": "u", "°": " deg", "×": "x", "÷": "/"})
     lines = (f"{name.lower():14s}{value}, {remark}" for name, value, remark in loop_facts(r))
-    return [line.translate(str.maketrans(plain)) for line in lines]
+    return [line.translate(plain) for line in lines]
 
 
 def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
