@@ -22,7 +22,7 @@ from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.support.process_pool import Workers
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 STORED = json.loads((ROOT / "benchmarks" / "shipped_designs.json").read_text())["two_mass_built"]
 
 
