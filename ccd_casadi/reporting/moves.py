@@ -149,7 +149,7 @@ def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
 def way_words(way: Way) -> str:
     """How a move ends."""
     m = way.move
-    when = "does not settle" if np.isinf(m.settled) else f"settles {shown(m.settled, 's')} in"
+    when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
     return f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}"
 
 

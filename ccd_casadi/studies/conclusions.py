@@ -76,8 +76,8 @@ def _descent(
     }
     words = [
         f"{LABELS[name].capitalize()} (best of {run['runs']} runs) ends at J = "
-        f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, {ratio:.0f} times as many; "
-        f"all its runs together took {run['syntheses_of_all_runs']}."
+        f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
+        f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
     if gap > EQUAL * abs(best["objective"]) and not baseline.swept:
         words.append(
