@@ -17,7 +17,8 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
-from ccd_casadi.plants.places import Between, Places, placed
+from ccd_casadi.plants.nodes import Between
+from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
 from ccd_casadi.support.errors import PlantError
 
@@ -61,14 +62,12 @@ def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed
     def field(p: np.ndarray) -> float:
         return float(a + b @ p + p @ c @ p)
 
-    weights, slopes = between.weights(point)
+    weights, slopes = between.at(point)
     values = np.array([field(np.array(node)) for node in GRID])
     assert weights @ values == pytest.approx(field(point), abs=1e-9)
     assert slopes @ values == pytest.approx(b + (c + c.T) @ point, abs=1e-8)
     node = int(rng.integers(len(GRID)))
-    assert between.weights(np.array(GRID[node]))[0] == pytest.approx(
-        np.eye(len(GRID))[node], abs=1e-9
-    )
+    assert between.at(np.array(GRID[node]))[0] == pytest.approx(np.eye(len(GRID))[node], abs=1e-9)
     assert between.left_out(values[None]) < 1e-8
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ccd_casadi.cases.checks import shown
 from ccd_casadi.cases.sections import PlacesSection
-from ccd_casadi.plants.places import Places, names_in
+from ccd_casadi.plants.nodes import names_in
+from ccd_casadi.plants.places import Places
 
 Fail = Callable[[str, str], Exception]
 
