@@ -12,7 +12,6 @@ from ccd_casadi.support.errors import UserError, require
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
@@ -111,37 +110,20 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import against, status_words
-    from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
 
-    full, small, sampled, measured = (
-        run.figures, found.reduced_figures, found.sampled, found.measured,
-    )  # fmt: skip
-    orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    if kind_of(run.problem).as_designed:
-        orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
         *([("decision", advice(run.result))] if advice(run.result) else []),
-        ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
-        ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
-        ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),
-        ("sampled", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
-                    f"{found.conversion.label}; needed {needed}"),
+        ("order", order_words(run, found)),
+        ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
+                 f"{found.conversion.label}; needed {needed}"),
+        *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
     ]  # fmt: skip
-    if measured is None:
+    if found.measured is None:
         lines.append(("", found.shortfalls[0]))
-    else:
-        for name, figures in (("", sampled), ("simulated", measured)):
-            lines.append((
-                name,
-                f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
-                f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
-                f"{figures.sensitivity_peak:.6g} "
-                f"({against(figures.sensitivity_peak, run.problem.inner.S_max)})",
-            ))  # fmt: skip
     if found.members:
         worst, count = found.worst, 1 + len(found.measured_members)
         peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"

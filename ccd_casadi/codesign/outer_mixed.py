@@ -22,7 +22,7 @@ from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
@@ -30,10 +30,8 @@ from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -226,7 +224,6 @@ class MixedOuter(Outer):
             value=final.figures.bandwidth,
             objective=objective(problem, theta, final.figures.bandwidth),
             hardware_cost=hardware_cost(plant_of(problem), theta),
-            binding=self._binding(x, final.figures),
             kkt=kkt_certificate(problem, x, end.design, sampler.truth.at),
             inner_gap=end.gap,
             feasible=final.figures.certified and acceptable(problem, x, end.design),
@@ -247,13 +244,6 @@ class MixedOuter(Outer):
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)
-
-    def _binding(self, x: Array, figures: DesignFigures) -> tuple[str, ...]:
-        problem = self.problem
-        program = lifted_program(problem, self.sampler.truth, exact_hessian=False)
-        bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
-        extra = touched(problem, tuple(self.theta_of(x)))
-        return (*bounds, *active_constraints(problem.inner, figures), *extra)
 
 
 def _final(problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures) -> Design:

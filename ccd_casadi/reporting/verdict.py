@@ -126,5 +126,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        return "no line of the verdict is against it"
+        return "all checks passed"
     return f"with warnings: {', '.join(warned)}"

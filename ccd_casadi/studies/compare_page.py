@@ -21,7 +21,6 @@ from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
 from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
-from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import number
 
 
@@ -49,8 +48,9 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
             },
         )
     sections += [
-        Section(f"History: {name}", (descent_figure(problem, descent),))
-        for name, descent in histories(comparison).items()
+        Section(f"History: {LABELS[item.name]}", (descent_figure(problem, item.descent),))
+        for item in comparison.methods
+        if item.descent is not None and item.descent.iterates
     ]
     sections += [
         Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
@@ -73,25 +73,6 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
     return Page(head, tuple(sections), index="")
-
-
-def histories(comparison: Comparison) -> dict[str, Descent]:
-    """The best descent of each gradient, and the best one from the case's own start."""
-    found: dict[str, Descent] = {}
-    for method in comparison.methods:
-        if method.descent is None or not method.descent.iterates:
-            continue
-        label = LABELS[method.name]
-        own = [
-            d for d in comparison.descents
-            if d.gradient is method.descent.gradient and d.iterates
-            and d.start == comparison.problem.start
-        ]  # fmt: skip
-        if own:
-            found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
-        if method.descent.start != comparison.problem.start:
-            found[f"{label}, best of all runs"] = method.descent
-    return found
 
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:

@@ -19,37 +19,21 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     near = [n for n in ranked if solved[n]["objective"] <= best + EQUAL * abs(best)]
     cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
     answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
-    sentences = [*worth_sentence(solved, cheapest)]
-    sentences.append(
+    sentences = [
         f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
         f"{cheapest} with {solved[cheapest]['syntheses_to_optimum']} true syntheses to the optimum"
         f"{_beside(solved[cheapest])}."
-    )
+    ]
     for name in ("steepest_descent", "steepest_descent_total"):
         if name in solved:
             found, words = _descent(problem, solved[name], solved[cheapest], name)
             answer[name] = found
             sentences += words
-    for name in ("sequential", "sequential_global"):
-        if name in solved:
-            found, sentence = _sequential(solved[name], solved[cheapest], name)
-            answer[name] = found
-            sentences.append(sentence)
+    against = [name for name in ranked if name in ("sequential", "sequential_global")]
+    for i, name in enumerate(against):  # the best of them stands first: it is the answer
+        answer[name], sentence = _sequential(solved[name], solved[cheapest], name)
+        sentences.insert(len(sentences) if i else 0, sentence)
     return answer | {"sentences": sentences}
-
-
-def worth_sentence(solved: dict[str, dict[str, Any]], best: str) -> list[str]:
-    """The answer: what co-design changes against the best sequential design."""
-    known = [solved[n] for n in ("sequential", "sequential_global") if n in solved]
-    if not known:
-        return []
-    other, mine = min(known, key=lambda f: f["objective"]), solved[best]
-    if mine["objective"] >= other["objective"] - EQUAL * abs(other["objective"]):
-        return ["Co-design gains nothing here: the sequential design is as good."]
-    cost = 100.0 * (mine["hardware_cost"] / other["hardware_cost"] - 1.0)
-    speed = 100.0 * (mine["bandwidth_hz"] / other["bandwidth_hz"] - 1.0)
-    words = "Co-design improves on the best sequential design"
-    return [f"{words}: hardware cost {cost:+.1f} %, bandwidth {speed:+.1f} %."]
 
 
 def _beside(figures: dict[str, Any]) -> str:
