@@ -38,7 +38,7 @@ def checked_places(section: PlacesSection, folder: Path, fail: Fail) -> PlacesSe
 
 def place_names(section: PlacesSection) -> tuple[str, ...]:
     """The parameters that it names."""
-    return names_in((*section.actuators, *section.sensors, section.present))
+    return names_in((*section.actuators, *section.sensors))
 
 
 def places_of(section: PlacesSection) -> Places | None:

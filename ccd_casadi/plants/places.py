@@ -20,23 +20,20 @@ from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
 from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
 from ccd_casadi.plants.axes import followed_modes, in_axes
 from ccd_casadi.plants.modal import RIGID_RATIO
-from ccd_casadi.plants.nodes import Between, Coordinate, Point, Points, names_in
+from ccd_casadi.plants.nodes import Between, Point, Points, names_in
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
-HALF = 1e-2  # a presence z counts as √z from about here on, so that its slope at 0 is finite
-
 
 @dataclass(frozen=True)
 class Places:
     """Where forces act and sensors read, m; without `sensors` the plant's own outputs are read.
 
-    `nodes` (N, d): of the plant's inputs, in their order. `present`, one for each actuator: 1 where
-    it is there, 0 where not, a θ where that is chosen; at most `at_most` are. `actuator_cost` is
-    what each adds to f. Masses in kg. Actuators, and sensors, are at least `apart` from each other.
+    `nodes` (N, d): of the plant's inputs, in their order. Masses in kg. Actuators, and sensors, are
+    at least `apart` from each other.
 
     With `axes` all forces act, and all sensors read, together along the motions of a rigid body
     normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
@@ -50,9 +47,6 @@ class Places:
     actuator_mass: float = 0.0
     sensor_mass: float = 0.0
     apart: float = 0.0
-    present: tuple[Coordinate, ...] = ()
-    at_most: int | None = None
-    actuator_cost: float = 0.0
     axes: bool = False
     quiet: tuple[int, ...] = ()
     damped: tuple[int, ...] = ()
@@ -60,7 +54,7 @@ class Places:
     @property
     def names(self) -> tuple[str, ...]:
         """The parameters that it takes, each once."""
-        return names_in((*self.actuators, *self.sensors, self.present))
+        return names_in((*self.actuators, *self.sensors))
 
 
 def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
@@ -76,9 +70,6 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         if len(point) != nodes.shape[1]:
             words = f"has {len(point)} coordinates, a node {nodes.shape[1]}"
             raise PlantError(f"places: {list(point)} {words}; make them agree")
-    if places.present and len(places.present) != len(places.actuators):
-        words = f"{len(places.present)} numbers for {len(places.actuators)} actuators"
-        raise PlantError(f"places.present has {words}; give one for each")
     axes = places.axes * (1 + nodes.shape[1] + len(places.damped))
     least = min(len(places.actuators), len(places.sensors))
     if axes and least < axes + len(places.quiet):
@@ -108,7 +99,6 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     whole = of(plant.evaluate)
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
-    f += places.actuator_cost * sum(whole.there.symbols(x))
     lam = ca.vertcat(lam, *_rules(places, whole, x).values())
     return Plant(
         names=tuple(names),
@@ -149,12 +139,6 @@ class PlacedMechanics:
         """Where they are."""
         return Points(self.places.sensors, self.names)
 
-    @property
-    def there(self) -> Points:
-        """Whether each actuator is there."""
-        present = self.places.present or (1.0,) * len(self.places.actuators)
-        return Points([(value,) for value in present], self.names)
-
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         values = np.asarray(theta, float)
         below = self.evaluate(tuple(values[self.own].tolist()))
@@ -173,19 +157,11 @@ class PlacedMechanics:
             self.between.weights(points, values) for points in (self.actuators, self.sensors)
         )
         dW, dR = dW[:count], dR[:count]
-        z, dz = self.there.at(values)[:, 0], self.there.slope[:, 0, :count]
         M = below.M
-        for F, dF, kg, slope in (
-            (B0 @ W, dB0 @ W + B0 @ dW, places.actuator_mass * z, places.actuator_mass * dz),
-            (B0 @ R, dB0 @ R + B0 @ dR, places.sensor_mass * np.ones(R.shape[1]), None),
-        ):
-            half = dF @ (F * kg).T
-            M, dM = M + (F * kg) @ F.T, dM + half + half.transpose(0, 2, 1)
-            if slope is not None:
-                dM = dM + np.einsum("xm,mt,ym->txy", F, slope, F)
-        root = np.sqrt((1.0 + HALF) / (z + HALF))  # drive of z: 0 at 0, 1 at 1
-        dW = dW * z * root + np.einsum("xm,mt->txm", W * root * (1.0 - 0.5 * z / (z + HALF)), dz)
-        W = W * z * root
+        for w, dw, kg in ((W, dW, places.actuator_mass), (R, dR, places.sensor_mass)):
+            F = B0 @ w
+            half = kg * (dB0 @ w + B0 @ dw) @ F.T
+            M, dM = M + kg * F @ F.T, dM + half + half.transpose(0, 2, 1)
         if places.axes:
             phi, dphi = followed_modes(M, below.K, dM, dK, (*places.quiet, *places.damped))
             quiet, nodes = len(places.quiet), self.between.nodes
@@ -219,9 +195,8 @@ class PlacedMechanics:
         for title, theta in thetas.items():
             values = np.asarray(theta, float)
             curves = [_dots(self.between.nodes, "node", GREY, ".")]
-            there = self.there.at(values)[:, 0] > 0.5
             kinds = (("sensor", self.sensors.at(values), GREEN, "o"),
-                     ("force", self.actuators.at(values)[there], ORANGE, "x"))  # fmt: skip
+                     ("force", self.actuators.at(values), ORANGE, "x"))  # fmt: skip
             for label, at, colour, marker in kinds:
                 curves += [_dots(at, label, colour, marker)] if len(at) else []
                 rows += [(title, label, *(1e3 * p for p in point)) for point in at]
@@ -242,7 +217,7 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
 
 
 def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
-    """λ by name: least distances, where θ moves them, and how many actuators there may be."""
+    """λ by name: least distances, where θ moves them."""
     found: dict[str, ca.MX] = {}
     seen: set[frozenset[Point]] = set()
     for word, points, group in (("actuators", places.actuators, of.actuators),
@@ -254,9 +229,6 @@ def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX
                 seen.add(pair)
                 away = at[i] - at[j]
                 found[f"{word} {i + 1} and {j + 1} apart"] = 1.0 - ca.sumsqr(away) / places.apart**2
-    if places.at_most is not None:
-        count = ca.sum1(ca.vertcat(*of.there.symbols(theta)))
-        found[f"at most {places.at_most} actuators"] = count / places.at_most - 1.0
     return found
 
 
