@@ -15,7 +15,6 @@ from ccd_casadi.support.terminal import say
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
-    from ccd_casadi.deployment.on_hardware import OnHardware
     from ccd_casadi.deployment.outcome import Deployment
 
 LEADS = {"auto": None, "on": True, "off": False}
@@ -93,10 +92,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
     if not options.quiet:
         say(_summary(finished, found))
-        if moved is not None:
-            say(f"{'a move':13s} {_move_words(moved)}")
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
+    from ccd_casadi.reporting.moves import way_words
+
+    if moved is not None and not options.quiet:
+        say(f"{'a move':13s} {way_words(moved.ways[-1])}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
@@ -132,19 +133,6 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     if found.statics is not None:
         lines.append(("at rest", found.statics.words))
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
-
-
-def _move_words(moved: "OnHardware") -> str:
-    last = moved.ways[-1]
-    ends = (
-        f"in its window after {last.move.settled:.4g} s"
-        if last.move.settled < float("inf")
-        else f"not in its window of {1e6 * moved.window:g} um"
-    )
-    return (
-        f"{moved.profile.duration:.4g} s, {last.words}: {ends}, "
-        f"peak error {1e6 * last.move.peak_error:.4g} um"
-    )
 
 
 def _shortfall(run: "FinishedRun", found: "Deployment") -> str:

@@ -8,7 +8,7 @@ from ccd_casadi.analysis import loop_figures
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
+from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware, Way
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table, Words
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
@@ -138,17 +138,19 @@ def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
          1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
         for way in found.ways for m in (way.move,)
     )  # fmt: skip
-    ends = []
-    for way in found.ways:
-        m = way.move
-        when = "does not settle" if np.isinf(m.settled) else f"settles {shown(m.settled, 's')} in"
-        ends.append(f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}")
     caption = (
-        f"{'; '.join(ends)}. Settled is what stays within {shown(found.window, 'm')}; the last "
-        "error of the table is the largest over the last quarter, the amplitude of a limit cycle "
-        "if there is one. The plant has its soft suspension, hold and delay are exact."
+        f"{'; '.join(map(way_words, found.ways))}. Settled is what stays within "
+        f"{shown(found.window, 'm')}; the last error of the table is the largest over the last "
+        "quarter. The plant has its soft suspension, hold and delay are exact."
     )
     return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
+
+
+def way_words(way: Way) -> str:
+    """How a move ends."""
+    m = way.move
+    when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
+    return f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}"
 
 
 def _limit_words(found: OnHardware) -> str:

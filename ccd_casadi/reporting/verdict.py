@@ -55,15 +55,6 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def short(result: Mapping[str, Any]) -> str:
-    """What did not pass, in a few words: `survives warned`."""
-    return ", ".join(
-        f"{line.name} {line.state}"
-        for line in lines_of(result)
-        if line.state in (State.FAILED, State.WARNED)
-    )
-
-
 def head_of(
     title: str, good: bool, status: str, reason: str, meta: str, lead: str,
     result: Mapping[str, Any], decision: str = "",

@@ -20,7 +20,8 @@ from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
+from ccd_casadi.studies.conclusions import LABELS
+from ccd_casadi.studies.methods import cost_figure, descent_figure, theta_paths
 from ccd_casadi.support.units import number
 
 
@@ -140,14 +141,9 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     if best is not None:
         theta = comparison.method(best).figures["theta"]
         optimum = (theta[problem.names[0]], theta[problem.names[1]])
-    ends = []
-    for method in walked:
-        if len(method.path):
-            last = ", ".join(number(v, 5) for v in method.path[-1])
-            ends.append(f"{LABELS[method.name]} ends at ({last})")
     caption = (
         "Colours: ω_b*(θ) predicted by the lifted surrogates; dots: the nested formulation's true "
-        "samples in the same colours. " + "; ".join(ends) + "."
+        "samples in the same colours."
     )
     land = replace(land, paths=theta_paths(walked), optimum=optimum)
     return Figure(land, caption, tables_landscape(land))

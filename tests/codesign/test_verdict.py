@@ -324,7 +324,7 @@ def test_every_place_shows_the_same_lines() -> None:
         assert f"{name} words" in terminal
         assert f"{name} words" in page
     assert shown.worst(result) is v.State.WARNED
-    assert shown.short(result) == "survives warned"
+    assert shown.head_words(result) == "with warnings: survives"
     assert "all checks passed" not in shown.head_words(result)
     assert "survives" in shown.head_words(result)
     assert "all checks passed" in shown.head_words(result_of())
