@@ -176,7 +176,6 @@ coordinate = Check(
     ),
     {"type": ["number", "string"]},
 )
-coordinates = every(coordinate, 'give a list of numbers and names of [theta], as [0.1, "x", "-x"]')
 places = every(
     every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
 )

@@ -32,15 +32,16 @@ from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
+from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.closed_loop import handed_out, measure
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
 from surrogates import GaussianProcess, design, quality_of
 
 POLISH_ROUNDS = 3
@@ -205,7 +206,8 @@ class MixedOuter(Outer):
         end = cast(MixedEnd, end)
         problem, sampler, x = self.problem, self.sampler, end.x
         theta = tuple(float(v) for v in self.theta_of(x))
-        make = partial(_final, problem, theta, end.design.figures)
+        figures = end.design.figures
+        make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
         final = sampler.kept("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
         unsuspended = measure(
@@ -244,17 +246,6 @@ class MixedOuter(Outer):
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)
-
-
-def _final(problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures) -> Design:
-    """The synthesis that is handed out, in SI and certified again there."""
-    plant = scaled_plant(problem, theta)
-    made = synthesise(
-        plant, problem.weights.at(figures.omega_S, figures.omega_T),
-        omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
-        compliance=True,
-    )  # fmt: skip
-    return handed_out(plant, made, problem.inner.omega_low)
 
 
 def _snapped(problem: CoDesignProblem, x: Array) -> Array:

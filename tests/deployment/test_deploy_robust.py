@@ -23,7 +23,7 @@ from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.compliance import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of
 
 RUNS = Path(__file__).parents[2] / "runs"
 ONE_WAY = Timing(method=Discretisation.RAMP, lead=True)
