@@ -125,10 +125,6 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
     rows = figure_rows(run, found)
-    if found.measured is not None:
-        m = found.measured
-        words = f"multisine, {m.periods} periods, the last two differ by {number(m.leftover, 2)}"
-        rows.append(("Simulation", words, ""))
     rows.append(("Slowest sampled mode", number(found.sampled.spectral_radius, 8), "below 1"))
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
     words = (
