@@ -62,10 +62,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     moved = None
     if kind_of(finished.problem).as_designed:  # one way where a rate was given
         channels, count = 0, 1 if finished.problem.sampling else count
-    steps = channels + count + 2 + (options.saturation is not None)
+    steps = channels + count + 1 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
-            finished, timing, saturation=options.saturation, seed=options.seed,
+            finished, timing, saturation=options.saturation,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
         if found.stable:
@@ -115,9 +115,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.inner_problem.kinds import kind_of
     from ccd_casadi.reporting.verdict import advice
 
-    full, small, sampled, measured = (
-        run.figures, found.reduced_figures, found.sampled, found.measured,
-    )  # fmt: skip
+    full, small, sampled = run.figures, found.reduced_figures, found.sampled
     orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
     if kind_of(run.problem).as_designed:
@@ -131,21 +129,17 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
         ("sampled", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
                     f"{found.conversion.label}; needed {needed}"),
     ]  # fmt: skip
-    if measured is None:
-        lines.append(("", found.shortfalls[0]))
-    else:
-        for name, figures in (("", sampled), ("simulated", measured)):
-            lines.append((
-                name,
-                f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
-                f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
-                f"{figures.sensitivity_peak:.6g} "
-                f"({against(figures.sensitivity_peak, run.problem.inner.S_max)})",
-            ))  # fmt: skip
+    kept = found.shortfalls[0] if not found.stable else (
+        f"bandwidth {sampled.bandwidth / HZ:.6g} Hz "
+        f"({100 * (sampled.bandwidth / full.bandwidth - 1):+.2f} %), peak "
+        f"{sampled.sensitivity_peak:.6g} "
+        f"({against(sampled.sensitivity_peak, run.problem.inner.S_max)})"
+    )  # fmt: skip
+    lines.append(("", kept))
     if found.members:
-        worst, count = found.worst, 1 + len(found.measured_members)
+        worst = found.worst
         peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
-        words = f"{1 + len(found.members)} plants, {count} simulated: {peak}"
+        words = f"{1 + len(found.members)} plants: {peak}"
         lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
     if found.statics is not None:
         lines.append(("at rest", found.statics.words))
