@@ -82,8 +82,6 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
             f"{100 * bound.stiffness:.3g} % (every frequency by {100 * bound.shift:.3g} %), "
             "each mode by itself; proven on a grid of frequencies."
         )
-    if found.overrun is not None:
-        words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
     words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
     if run.sampled is not None:
@@ -257,9 +255,6 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
 
 def _structured(found: Study) -> list[Section]:
     bound = found.structured
-    if found.overrun is not None:
-        words = f"Not computed within {found.overrun:g} s. Give it longer with --limit."
-        return [Section("Structured singular value", (Words(words),))]
     if bound is None:
         return []
     caption = (
