@@ -12,7 +12,6 @@ from ccd_casadi.cases.run_folder import FinishedRun, read_run
 from ccd_casadi.deploy import main
 from ccd_casadi.deployment.outcome import SAMPLED_EXCESS, Deployment
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -20,6 +19,7 @@ from ccd_casadi.lti.hold import sampled
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.robustness import main as robustness
 from ccd_casadi.solve import main as solve
 from ccd_casadi.support.units import HZ

@@ -7,9 +7,9 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
-from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions

@@ -10,11 +10,11 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
-from ccd_casadi.deployment.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.synthesis.statics import Statics, statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 

@@ -7,11 +7,11 @@ from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.reduction import Limits, Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
-from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics

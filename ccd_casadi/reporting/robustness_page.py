@@ -84,8 +84,8 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
         )
     words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
-    if run.sampled is not None:
-        step = f"{1e6 * run.sampled.period:.5g} µs"
+    if run.sampling is not None:
+        step = f"{1e6 * run.sampling.period:.5g} µs"
         words.append(
             f"A controller in discrete time, a step every {step}, hold and "
             "delay exact at the instants; noise and the structured singular value are of "

@@ -117,7 +117,7 @@ def _statics(run: FinishedRun) -> Statics:
     return statics(
         run.plant.plant_si(), run.controller, bandwidth=run.figures.bandwidth,
         omega_low=run.problem.inner.omega_low,
-        period=0.0 if run.sampled is None else run.sampled.period,
+        period=0.0 if run.sampling is None else run.sampling.period,
     )  # fmt: skip
 
 
@@ -136,9 +136,7 @@ def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move,
 
 def loop_of(run: FinishedRun) -> Loop:
     """The run's loop on its plant, as it runs."""
-    if run.sampled is not None:
-        return run.sampled.loop(run.plant)
-    return Loop(run.plant.plant_si(), run.controller)
+    return run.loop_on(run.plant.plant_si())
 
 
 def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
@@ -172,7 +170,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         "static_stiffness": at.stiffness,
         "static_compliance": at.compliance,
         "static_share": at.share,
-        "period": None if run.sampled is None else run.sampled.period,
+        "period": None if run.sampling is None else run.sampling.period,
         "noise": noise,
         "resonance_shift": _line(found.shift, "shift"),
         "damping": _line(found.damping, "factor"),
