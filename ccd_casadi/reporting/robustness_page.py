@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.moves import ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
@@ -129,16 +129,6 @@ def _place(omega: float) -> str:
     if omega in (0.0, np.inf):
         return "at rest" if omega == 0.0 else "towards infinite frequency"
     return f"at {number(omega / HZ, 4)} Hz"
-
-
-def _cut(move: Move) -> str:
-    """What the figure does not show of a move that settles after its end."""
-    until = figures.shown_until(move)
-    later = np.abs(move.error[move.time > until])
-    if move.duration + move.settling <= until or not later.size:
-        return ""
-    most = metres(float(later.max()))
-    return f" The figure ends before, at {shown(until, 's')}: after that the error is up to {most}."
 
 
 def _share(value: float, reach: float) -> str:
@@ -272,12 +262,11 @@ def _move(found: Study) -> Section:
         if found.moves[0].free
         else "on its soft suspension, without which the loop is not stable"
     )
-    moves = [
-        figures.move(move, f"{_moved(found, i)}{_cut(move)}") for i, move in enumerate(found.moves)
-    ]
+    ways = {"with mass feedforward" if m.feedforward else "without feedforward": m
+            for m in found.moves}  # fmt: skip
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "
         f"plant {plant}. It reaches {number(found.setpoint.velocity)} m/s, "
         f"{number(found.setpoint.acceleration)} m/s² and {number(found.setpoint.jerk)} m/s³."
     )
-    return Section("A move", (Words(words), *moves))
+    return Section("A move", (Words(words), ways_figure(ways, "The loop is simulated exactly.")))
