@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path += [str(folder) for folder in (Path(__file__).parents[1] / "tests").iterdir()]
 
 from fixed_structure_loops import FAST, LATE, SLOW
 from test_error_budget import SHAPED, built, simulated

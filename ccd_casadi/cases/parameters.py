@@ -11,13 +11,13 @@ MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 
 # Every key of a [theta.NAME], what is asked of it, and what it says.
 KEYS: dict[str, tuple[Check, str]] = {
-    "lower": (ANY, "the least that may be chosen, in `unit`"),
-    "upper": (ANY, "the most that may be chosen"),
-    "start": (ANY, "where descents start; default: the middle"),
-    "unit": (text, "for tables and pages; what the plant function takes"),
-    "values": (listed, "instead of bounds: the values that it may have, as in a catalogue"),
-    "integer": (flag, "whether it is a whole number between the bounds; default false"),
-    "fixed": (ANY, "instead of all these but unit: its value, which is not searched"),
+    "lower": (ANY, "least value, in `unit`"),
+    "upper": (ANY, "largest value"),
+    "start": (ANY, "start of searches; default: the middle"),
+    "unit": (text, "unit, as the plant function takes it; shown in tables and on pages"),
+    "values": (listed, "instead of bounds: a list of values, as in a catalogue"),
+    "integer": (flag, "whole numbers between the bounds only; default false"),
+    "fixed": (ANY, "instead of bounds: its value, which is not searched"),
     "varies": (
         flag,
         "with sections: true where it is not chosen but takes all values in between, as "

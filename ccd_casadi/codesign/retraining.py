@@ -25,9 +25,8 @@ from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.search import concluded_at
-from ccd_casadi.codesign.stored import Surrogates, stored_designs, stored_thetas
+from ccd_casadi.codesign.stored import Surrogates, keep_version, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.codesign.versions import keep_version
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample

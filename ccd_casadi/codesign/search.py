@@ -64,7 +64,8 @@ def searched(
         more = None if rounds == AGAIN else outer.joined(end)
         if more is None:
             return _looked(Searched(outer, outcome, end, rounds), formulation, sampled, seed)
-        outer, known = more, None if known is None else end.x
+        goes_on = known is not None or isinstance(formulation, Direct)
+        outer, known = more, end.x if goes_on else None
 
 
 def _looked(

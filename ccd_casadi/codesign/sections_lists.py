@@ -169,10 +169,7 @@ def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
     lam = plant.hardware(x)[1]
     theta = np.clip(theta, lower, upper)
     f = ca.sumsqr((x - theta) / (upper - lower))
-    program = NonlinearProgram(
-        x, f, lam + INSIDE, lower, upper, problem.names, plant.constraint_names,
-        exact_hessian=plant.exact_hessian,
-    )  # fmt: skip
+    program = NonlinearProgram(x, f, lam + INSIDE, lower, upper, plant.exact_hessian)
     try:
         return np.clip(solve_program(program, theta).best.x, lower, upper) if lam.numel() else theta
     except OuterFailure:

@@ -31,10 +31,16 @@ class TrueBandwidth(VectorCallback):
 
     def at(self, theta: Array) -> BandwidthSample:
         """The sample at θ; repeated points cost nothing."""
-        key = np.asarray(theta, float).tobytes()
-        if key not in self.known:
-            self.known[key] = self.sampler.bandwidths(theta, self.label)[0]
-        return self.known[key]
+        return self.all_at(np.atleast_2d(theta))[0]
+
+    def all_at(self, thetas: Array) -> list[BandwidthSample]:
+        """Those at several θ (k, n), over the workers."""
+        keys = [np.asarray(theta, float).tobytes() for theta in thetas]
+        new = [i for i, key in enumerate(keys) if key not in self.known]
+        if new:
+            samples = self.sampler.bandwidths(np.asarray(thetas)[new], self.label)
+            self.known |= {keys[i]: sample for i, sample in zip(new, samples, strict=True)}
+        return [self.known[key] for key in keys]
 
     def _value(self, theta: Array) -> Array:
         sample = self.at(theta)

@@ -13,6 +13,8 @@ from ccd_casadi.codesign.design_entries import (
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
 from ccd_casadi.codesign.verdict import CloserModel, Line, State, survives
 from ccd_casadi.codesign.verified import Verified
+from ccd_casadi.inner_problem.constraints import touched
+from ccd_casadi.inner_problem.sweep import active_constraints
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
@@ -29,7 +31,6 @@ class VerifiedDesign(Verified):
 
     x: Array
     design: Design
-    binding: tuple[str, ...]
     unsuspended: DesignFigures
     references: tuple[ReferenceCheck, ...] = ()
     robust: RobustCheck | None = None
@@ -54,7 +55,10 @@ class VerifiedDesign(Verified):
 
     @property
     def active(self) -> tuple[str, ...]:
-        return self.binding
+        problem = self.problem
+        ends = {f"{name} {end}" for name in problem.names for end in ("lower", "upper")}
+        inner = active_constraints(problem.inner, self.design.figures)
+        return (*filter(ends.__contains__, self.kkt.active), *inner, *touched(problem, self.theta))
 
     def figures(self) -> dict[str, Any]:
         found = figures_dict(self.design.figures)

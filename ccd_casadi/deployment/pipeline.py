@@ -23,7 +23,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.compliance import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 # A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,

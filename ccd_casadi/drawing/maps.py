@@ -172,23 +172,6 @@ def _shade(axes: "Axes", x: Array, y: Array, excess: Array) -> None:
 def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
     axes.plot(*path.theta.T, "-o", color=colour, linewidth=1.2, markersize=6, clip_on=False,
               markerfacecolor="white", markeredgewidth=1.3, label=path.label, zorder=5)  # fmt: skip
-    if not path.numbered:
-        return
-    span = [np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())]
-    groups: list[tuple[Array, list[int]]] = []
-    for i, theta in enumerate(path.theta):
-        for spot, members in groups:
-            if (np.abs(theta - spot) <= 0.02 * np.array(span)).all():
-                members.append(i + 1)
-                break
-        else:
-            groups.append((theta, [i + 1]))
-    for spot, members in groups:
-        text = f"{members[0]}–{members[-1]}" if len(members) > 2 else ", ".join(map(str, members))
-        axes.annotate(text, (float(spot[0]), float(spot[1])), xytext=(9, 9),
-                      textcoords="offset points", fontsize=9, zorder=8, annotation_clip=False,
-                      bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none",
-                            "alpha": 0.85})  # fmt: skip
 
 
 def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:

@@ -130,29 +130,22 @@ def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
     kept = [(name, m, colour) for (name, m), colour in zip(ways.items(), COLOURS, strict=False)
             if m.peak_error < 1e3 * first.peak_error]  # fmt: skip
     top = max(m.peak_error for _, m, _ in kept)
-    error: dict[bool, list[Curve]] = {}  # of the large ones, and of those that are flat beside them
-    force, ends = [], []
-    units = {large: shown_unit("m", max(m.peak_error for _, m, _ in kept
-                                        if (FLAT * m.peak_error > top) == large))
-             for large in {FLAT * m.peak_error > top for _, m, _ in kept}}  # fmt: skip
-    for name, m, colour in kept:
-        at = np.flatnonzero(m.time <= until)
-        at = at[np.unique(np.linspace(0, at.size - 1, DRAWN).astype(int))]
-        large = FLAT * m.peak_error > top
-        curve = Curve(1e3 * m.time[at], units[large][1] * _error(m)[at], name, colour)
-        error.setdefault(large, []).append(curve)
-        force.append(Curve(1e3 * m.time[at], m.force[at, 0], "", colour))
-    for name, m in ways.items():
-        when = "does not settle" if np.isinf(m.settled) else f"settles {shown(m.settled, 's')} in"
-        after = np.abs(_error(m)[m.time > until])
-        later = f", up to {shown(float(after.max()), 'm')} after the figure's end" if (
-            m.settled > until and after.size
-        ) else ""  # fmt: skip
-        ends.append(f"{name}: {when}, error of at most {shown(m.peak_error, 'm')}{later}")
-    panels = [Panel("time (ms)", f"error ({units[large][0]})", tuple(curves), levels=(end,),
-                    legend="upper right") for large, curves in error.items()]  # fmt: skip
+    panels, force = [], []
+    for large in (True, False):  # those that are flat beside the large ones by themselves
+        same = [way for way in kept if (FLAT * way[1].peak_error > top) == large]
+        unit, scale = shown_unit("m", max((m.peak_error for _, m, _ in same), default=0.0))
+        curves = []
+        for name, m, colour in same:
+            at = np.flatnonzero(m.time <= until)
+            at = at[np.unique(np.linspace(0, at.size - 1, DRAWN).astype(int))]
+            ms = 1e3 * m.time[at]
+            curves.append(Curve(ms, scale * _error(m)[at], name, colour))
+            force.append(Curve(ms, m.force[at, 0], "", colour))
+        if curves:
+            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), levels=(end,),
+                                legend="upper right"))  # fmt: skip
+    heights = (*[2.6] * len(panels), 2.2)
     panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
-    heights = (*[2.6] * len(error), 2.2)
     lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
     head = ("way", "settled after, ms", "RMS error, µm", "peak error, µm", "last error, µm",
             "peak force, N", "at the limit")  # fmt: skip
@@ -162,10 +155,10 @@ def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
          f"{100.0 * m.saturated:.3g} %")
         for name, m in ways.items()
     )  # fmt: skip
+    ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{'; '.join(ends)}. Settled is what stays within {shown(first.window, 'm')}; the last "
-        "error of the table is the largest over the last quarter, the amplitude of a limit cycle "
-        f"if there is one. {words}"
+        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error of the "
+        f"table is the largest over the last quarter. {words}"
     )
     return Figure(lines, caption, (Table(head, rows),))
 
@@ -178,6 +171,16 @@ def _error(m: Move) -> Array:
 def shown_until(found: Move) -> float:
     """Where the figure of a move ends, s."""
     return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+
+
+def way_words(name: str, m: Move, until: float = np.inf) -> str:
+    """How a move ends, and what is left of its error after `until` s, where a figure ends."""
+    when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
+    words = f"{name}: {when}, error of at most {shown(m.peak_error, 'm')}"
+    after = np.abs(_error(m)[m.time > until])
+    if not after.size or m.settled <= until:
+        return words
+    return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
 
 
 def _limit_words(found: OnHardware) -> str:
