@@ -17,22 +17,26 @@ from there.
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.signal import cont2discrete
 
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
+
+from sampled_simulation import measure_set
+
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
-from ccd_casadi.robust.sampled import sampled_figures
-from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.robust.sampled import sampled_figures
 
 RESULTS = Path(__file__).with_suffix(".json")
 DESIGN = Path(__file__).parent / "rib_stage_design"
