@@ -62,7 +62,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
     good = [p for p in points if truth.at(p).feasible and np.isfinite(truth.at(p).gradient).all()]
     if not good:
         message = f"none of {len(points)} starting designs is certified"
-        return FormulationResult(None, None, (), (), None, False, message)
+        return FormulationResult(message=message)
     program = nested_program(problem, truth)
     program = replace(program, exact_hessian=False)
     try:
@@ -70,7 +70,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
     except OuterFailure as error:
         best = min((truth.at(p) for p in good), key=lambda s: objective_of(problem, s))
         if not np.isfinite(objective_of(problem, best)):
-            return FormulationResult(None, None, (), (), None, False, str(error))
+            return FormulationResult(message=str(error))
         return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
     best = min(truth.known.values(), key=lambda s: objective_of(problem, s))
     return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Landscape, SweepMap, ThetaPath
+from ccd_casadi.drawing.content import Landscape, SweepMap
 from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
@@ -67,7 +67,9 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
                                      label="last trust region"))  # fmt: skip
         for i, path in enumerate(land.paths):
-            _path(axes, path, CYCLE[(i + 1) % len(CYCLE)])
+            axes.plot(*path.theta.T, "-o", color=CYCLE[(i + 1) % len(CYCLE)], linewidth=1.2,
+                      markersize=6, clip_on=False, markerfacecolor="white", markeredgewidth=1.3,
+                      label=path.label, zorder=5)  # fmt: skip
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
@@ -167,11 +169,6 @@ def _shade(axes: "Axes", x: Array, y: Array, excess: Array) -> None:
     veil.set_linewidth(0.0)
     axes.fill([], [], facecolor="white", edgecolor="#777777", hatch="////", linewidth=0.5,
               label="infeasible")  # fmt: skip
-
-
-def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
-    axes.plot(*path.theta.T, "-o", color=colour, linewidth=1.2, markersize=6, clip_on=False,
-              markerfacecolor="white", markeredgewidth=1.3, label=path.label, zorder=5)  # fmt: skip
 
 
 def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:

@@ -60,8 +60,10 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     sections += [
-        Section("The case", (Source(case_to_toml(comparison.case)),)),
-        Section("Versions", (Words(f"{versions}; seed {answer['seed']}."),)),
+        Section(
+            "The case",
+            (Words(f"{versions}; seed {answer['seed']}."), Source(case_to_toml(comparison.case))),
+        )
     ]
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)

@@ -198,7 +198,7 @@ def test_rows_that_are_just_passed_push_out_none_that_is_passed_by_far() -> None
     flat = 2 * ROWS
     A = np.concatenate([np.full((flat, 1), 1e-3), -np.ones((1, 1))])
     b = np.append(np.full(flat, 1e-2), 1.0)
-    model = Smooth(np.eye(1), np.zeros(1), b, A, np.zeros((flat + 1, 1, 1)))
+    model = Smooth(np.eye(1), np.full(1, -1.0), b, A, np.zeros((flat + 1, 1, 1)))
     start = model.at(np.zeros(1))
     assert start is not None
     found = best_step(model, start, model.Q, 4.0, 100.0)
