@@ -162,7 +162,7 @@ def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
     if "hz" not in columns:
-        raise UserError(f"{path}: has no column f_hz; name the frequencies so")
+        raise UserError(f"{path}: has no column f_hz; give the frequencies that name")
     hz = np.real(columns["hz"]).astype(float)
     if "G" in columns:
         G = np.asarray(columns["G"], complex)
