@@ -123,6 +123,7 @@ def unchanged(folder: Path, branches: list[judge.Branch], case: int) -> tuple[fl
     import control
 
     os.chdir(folder)
+    del sys.modules["plant"]  # the example's, of the same name
     sys.path.insert(0, str(folder))
     import function_simulation
     import plant

@@ -53,15 +53,17 @@ def scores(G: control.StateSpace, K: control.StateSpace) -> tuple[bool, float, f
     return (
         stable,
         float(S.max()),
-        float(omega[np.argmax(S > np.sqrt(0.5))]),
+        float(omega[np.argmax(2.0 * S**2 > 1.0)]),
         float(np.linalg.norm(y)),
     )
 
 
 def tuned(plants: list[control.StateSpace], biquads: int) -> control.StateSpace:
     """Sections by `ccd.tune`."""
-    K = ccd.tune(plants, rate_hz=RATE, delay=DELAY, S_max=S_MAX,
-                 structure=ccd.Structure(lead=1, biquads=biquads), starts=12).controller  # fmt: skip
+    structure = ccd.Structure(lead=1, biquads=biquads)
+    K = ccd.tune(
+        plants, rate_hz=RATE, delay=DELAY, S_max=S_MAX, structure=structure, starts=12
+    ).controller
     return control.ss(K.A, K.B, K.C, K.D)
 
 

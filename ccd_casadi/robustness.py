@@ -10,10 +10,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, positive, whole
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
-
-LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -21,7 +18,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import told
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-    from ccd_casadi.robust.study import study_dict, survival_line, tried, with_structured_bound
+    from ccd_casadi.robust.study import robustness, study_dict, survival_line
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
 
@@ -53,29 +50,20 @@ def command(options: argparse.Namespace) -> ExitCode:
         axis=options.axis - 1,
     )
     with Workers(options.workers, PATIENCE) as workers:
-        found = tried(finished, demands, options.seed, options.quiet, workers)
-
-    def write() -> None:
-        answer = study_dict(finished, found)
-        answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
-        write_json(folder / "robustness.json", answer)
-
-    write()  # the last of the figures may not come within its time
-    with Progress(
-        1, f"structured singular value, at most {options.limit:g} s", options.quiet
-    ) as bar:
-        found = with_structured_bound(finished, found, options.limit)
-        bar.advance()
-    write()
+        found = robustness(finished, demands, options.seed, options.quiet, workers)
+    answer = study_dict(finished, found)
+    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+    write_json(folder / "robustness.json", answer)
     from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
 
-    if options.controller is None:
+    own = options.controller is None
+    if own:
         finished = told(finished, folder, "survives", survival_line(finished, found))
-    page = robustness_page(finished, found, options.seed, index_of(folder))
+    page = robustness_page(finished, found, options.seed, index_of(folder), own=own)
     publish(folder, folder / "robustness.html", page)
     if not options.quiet:
-        say("\n".join(conclusion(finished, found)))
+        say("\n".join(filter(None, (page.head.decision, *conclusion(finished, found)))))
         say(f"page          {folder / 'robustness.html'}")
     return ExitCode.DONE
 
@@ -86,25 +74,23 @@ PERCENT = number(0.0, 50.0, strict=True)
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.robustness", "Margins, plants off the model, noise and a move of a design."
+        "ccd_casadi.robustness", "Margins, uncertain plants, noise and a move of a design."
     )
     add = arguments.add_argument
     words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
     add("--controller", type=Path, metavar="FILE", help=words)
-    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
+    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="resonance shift; default 5")
     add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
-        help="factors of the damping; default 0.5 2")  # fmt: skip
+        help="range of factors of the damping; default 0.5 2")  # fmt: skip
     add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
-        help="of every hardware parameter; default 1")  # fmt: skip
+        help="tolerance of every hardware parameter; default 1")  # fmt: skip
     add("--samples", type=whole(1), default=200, metavar="N",
-        help="of random hardware; default 200")  # fmt: skip
-    add("--noise", type=positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
+        help="number of random sets of hardware; default 200")  # fmt: skip
+    add("--noise", type=positive, default=1.0, metavar="X", help="sensor noise, m/√Hz; default 1")
     add("--disturbance", type=positive, default=1.0, metavar="X",
-        help="force at every actuator, N/√Hz; default 1")  # fmt: skip
+        help="density of the force at every actuator, N/√Hz; default 1")  # fmt: skip
     add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
     add_move_options(arguments)
-    add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
-        help=f"for the structured singular value; default {LIMIT:g}")  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 

@@ -13,7 +13,6 @@ from ccd_casadi.support.terminal import say
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
-    from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.c_code import write_c
@@ -22,6 +21,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
+    from ccd_casadi.reporting.facts import loop_lines
     from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.process_pool import Workers
@@ -77,13 +77,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         about="responses (.csv, .mat, .npz) or models (.mat with A, B, C, D); several are one set",
     )  # fmt: skip
     for name, metavar, kind, default, words in (
-        ("--rate-hz", "X", positive, None, "of the controller; a response has the hold in it"),
-        ("--delay", "SECONDS", number(), 0.0, "in s, on top of what is in DATA"),
-        ("--s-max", "X", number(1.0, strict=True), 1.8, "the largest |S|"),
-        ("--shape", "X", number(1.0), 1.1, "|S| over ω/(√2 ω_b) at most"),
-        ("--effort", "X", positive, 20.0, "|KS| at most, over 1/|G| about ω_b"),
-        ("--lead", "N", whole(0), 1, "how many leads, with --biquads"),
-        ("--biquads", "N", whole(0), None, "notches (default: one for each resonance, up to 3)"),
+        (
+            "--rate-hz",
+            "X",
+            positive,
+            None,
+            "sampling rate of the controller; responses include the hold",
+        ),
+        ("--delay", "SECONDS", number(), 0.0, "delay in s besides that in DATA"),
+        ("--s-max", "X", number(1.0, strict=True), 1.8, "bound of |S|"),
+        ("--shape", "X", number(1.0), 1.1, "bound of |S| over ω/(√2 ω_b)"),
+        ("--effort", "X", positive, 20.0, "bound of |KS| over 1/|G| about ω_b"),
+        ("--lead", "N", whole(0), 1, "number of leads, with --biquads"),
+        (
+            "--biquads",
+            "N",
+            whole(0),
+            None,
+            "number of notches (default: one for each resonance, up to 3)",
+        ),
     ):
         shown = words if default is None else f"{words} (default: {default:g})"
         arguments.add_argument(name, metavar=metavar, type=kind, default=default, help=shown)

@@ -20,7 +20,6 @@ from scipy.linalg import expm
 
 from ccd_casadi.analysis.setpoint import Setpoint
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
@@ -126,17 +125,6 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
     wanted = np.eye(len(R))[axis]
     forces = np.linalg.pinv(R) @ wanted if R.size else np.zeros(modal.B.shape[1])
     return forces if np.allclose(R @ forces, wanted, rtol=0.0, atol=1e-6) else None
-
-
-def free_plant(modal: ModalPlant) -> StateSpace:
-    """q̈ + D q̇ + K q = B u, y = C q with states [q; q̇], in SI."""
-    n, m, p = len(modal.K), modal.B.shape[1], len(modal.C)
-    return StateSpace(
-        np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]]),
-        np.vstack([np.zeros((n, m)), modal.B]),
-        np.hstack([modal.C, np.zeros((p, n))]),
-        np.zeros((p, m)),
-    )
 
 
 def moves(

@@ -5,6 +5,11 @@ gives dA, dQ, dC exactly (no difference is taken, so h = 1e-30), and one adjoint
 dσ². Of a table it is the derivative of the quadrature's sum, at its nodes:
 
     dS = -S (dG K + G dK) S,   d‖H‖² = 2 Re tr(H* dH)
+
+    continuous   A P + P A' + Q = 0               A' X + X A + W = 0
+    sampled      (1 + A) P (1 + A)' - P + Q = 0   and alike, with A_c = (2 + A)⁻¹A continuous
+
+    d tr(W P) = 2 tr(X dA P) + tr(X dQ)           sampled 2 tr(X dA P (1 + A)') + …
 """
 
 from collections.abc import Sequence
@@ -12,14 +17,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_continuous_lyapunov
 
-from ccd_casadi.budget.evaluation import is_stable
-from ccd_casadi.budget.frequency import integrated, responses, sampled_plant
-from ccd_casadi.budget.loops import Disturbed, Process, closed, disturbed
-from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
+from ccd_casadi.budget.frequency import integrated, responses
+from ccd_casadi.budget.loops import FORCES, Disturbed, Process, closed, disturbed
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
-from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -51,11 +55,11 @@ def variance_slopes(
     loop: Loop, budget: ErrorBudget, changes: Sequence[Change]
 ) -> VarianceSlopes | None:
     """The variances of a loop under all sources, and their derivatives; None if it is unstable."""
-    if not is_stable(loop):
+    if not loop.stable:
         return None
     value, gradient = np.zeros(3), np.zeros((3, len(changes)))
     for source in budget.sources:
-        own = _of_filter if source.shaped else _of_table
+        own = of_filter if source.shaped else _of_table
         found = own(loop, source, budget.window, changes)
         value, gradient = value + found[0], gradient + found[1]
     return VarianceSlopes(value, gradient)
@@ -66,9 +70,10 @@ def rms_error_slope(found: VarianceSlopes) -> tuple[float, Array]:
     return 0.5 * float(np.log(found.value[0])), 0.5 * found.gradient[0] / found.value[0]
 
 
-def _of_filter(
+def of_filter(
     loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
 ) -> tuple[Array, Array]:
+    """As `VarianceSlopes`, of one shaped source in a stable loop, by Lyapunov's equation."""
     plant = disturbed(loop.plant, source, loop.sampling)
     model = closed(plant, loop.controller)
     scale = model.scales()
@@ -132,6 +137,7 @@ def _of_table(
     averaging = weight(hz)
     at = responses(loop, hz)
     H_e, H_u = at.of(source.kind)
+    seen = at.seen(source.kind)
     density = source.density(hz) * weights
     error, force = ((np.abs(H) ** 2).sum((1, 2)) for H in (H_e, H_u))
     value = np.array([density @ error, (density * averaging) @ error, density @ force])
@@ -140,15 +146,11 @@ def _of_table(
     for i, change in enumerate(changes):
         dG, dK, dfree = moving.of(change)
         dS = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
-        if source.kind in (Kind.FORCE, Kind.FLOOR_MOTION):
-            d_e = -dS @ at.free - at.S @ dfree
-            d_u = dK @ H_e + at.K @ d_e
-        elif source.kind is Kind.SETPOINT:
-            d_e, d_u = dS, dK @ at.S + at.K @ dS
-        else:
-            d_e, d_u = -dS, -dK @ at.S - at.K @ dS
-        slope = 2.0 * (H_e.conj() * d_e).real.sum((1, 2))
-        other = 2.0 * (H_u.conj() * d_u).real.sum((1, 2))
+        d = dS if source.kind is Kind.SETPOINT else -dS
+        if source.kind in FORCES:
+            d = -dS @ at.free - at.S @ dfree
+        slope = 2.0 * (H_e.conj() * d).real.sum((1, 2))
+        other = 2.0 * (H_u.conj() * (dK @ seen + at.K @ d)).real.sum((1, 2))
         gradient[:, i] = density @ slope, (density * averaging) @ slope, density @ other
     return value, gradient
 
@@ -170,8 +172,9 @@ class _ResponseChanges:
         dG = dK = dfree = np.zeros((len(self.hz), 1, 1))
         if change.plant is not None:
             G = _stepped(self.loop.plant, change.plant)
-            dfree = self._change("free", G, 1j * HZ * self.hz)
-            dG = dfree if hold is None else self._change("G", sampled_plant(G, hold), self.s)
+            dG = dfree = self._change("free", G, 1j * HZ * self.hz)
+            if hold is not None:
+                dG = self._change("G", sampled(G, hold.period, hold.delay), self.s)
         if change.controller is not None:
             K = _stepped(self.loop.controller, change.controller)
             dK = self._change("K", K if hold is None else tustin(K, hold.period), self.s)
@@ -186,3 +189,21 @@ class _ResponseChanges:
             self.known[name] = (R @ B, C @ R)
         X, Y = self.known[name]
         return np.asarray((Y @ dA + dC) @ X + Y @ dB + dD)
+
+
+def covariance(A: Array, Q: Array, *, sampled: bool) -> Array:
+    """P of a stable process with Q symmetric; a sampled one's A is the change over a period."""
+    if sampled:
+        inverse = np.linalg.inv(2.0 * np.eye(len(A)) + A)
+        A, Q = inverse @ A, 2.0 * inverse @ Q @ inverse.T
+    P = solve_continuous_lyapunov(A, -Q)
+    return np.asarray(0.5 * (P + P.T))
+
+
+def weighted_slopes(
+    A: Array, P: Array, weight: Array, changes: list[tuple[Array, Array]], *, sampled: bool
+) -> Array:
+    """d tr(W P) for changes (dA, dQ) at a fixed symmetric W (n, n)."""
+    X = covariance(A.T, weight, sampled=sampled)
+    after = P @ (A.T + np.eye(len(A))) if sampled else P
+    return np.array([2.0 * np.sum(X * (dA @ after).T) + np.sum(X * dQ) for dA, dQ in changes])

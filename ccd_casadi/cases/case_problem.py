@@ -7,6 +7,7 @@ from ccd_casadi.cases.case import CaseError, options_in
 from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
+from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.sections import Case, RobustSection
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
 from ccd_casadi.inner_problem.plant_source import PlantSource
@@ -46,6 +47,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             options,
             case.limits.plant_seconds,
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
+            places=places_of(case.places),
         ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
@@ -72,7 +74,12 @@ def problem_of(case: Case) -> CoDesignProblem:
         method=inner.method,
         robust=None if structured else _robust(case.robust),
         controller=sections_problem(
-            case.controller, case.loop, case.robust, inner, _option_sets(case)
+            case.controller,
+            case.loop,
+            case.robust,
+            inner,
+            _option_sets(case),
+            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
         )
         if structured
         else MixedSensitivityProblem(),

@@ -70,29 +70,34 @@ def solve(
 
 
 def co_design(
-    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
+    sampler: Sampler,
+    formulation: Formulation,
+    seed: int,
+    given: Surrogates | None = None,
+    known: Array | None = None,
 ) -> Solution:
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
     A robust problem that leaves its design plant open is solved for each, and the best one kept;
-    one with parameters from lists by branching over these (`catalogue`).
+    one with parameters from lists by branching over these (`catalogue`). `known`: a local optimum
+    that is known already, in place of the formulation.
     """
     if sampler.problem.listed:
         if given is not None:
-            raise UserError("--surrogate: starts no solve with lists of values; leave it out")
+            raise UserError("--surrogate: cannot start a solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
     began = perf_counter()
     name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
     outer = outer_of(sampler)
     require_solvable(sampler.problem)
     if given is not None and not outer.learns_from_others:
-        raise UserError("--surrogate: starts no solve of this kind; solve the case without it")
+        raise UserError("--surrogate: cannot start a solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
 
     def solved(each: Sampler) -> Solution:
-        found = searched(outer_of(each), formulation, seed, given)
+        found = searched(outer_of(each), formulation, seed, given, known)
         return concluded(found, name, tolerance, seed, began)
 
     def continued(each: Sampler, outcome: FormulationResult) -> Solution:
@@ -117,7 +122,7 @@ OUTERS: dict[type[ControllerProblem], type[Outer]] = {
 
 
 def verify(sampler: Sampler, x: Array) -> Verified:
-    """The design at x polished on the truth, held against the whole inner problem, and judged.
+    """Polish the design at x on the truth, compare it with the whole inner problem, judge it.
 
     x is θ, followed by ln ω_S and ln ω_T for mixed sensitivity.
     """
@@ -134,10 +139,15 @@ def require_solvable(problem: CoDesignProblem) -> None:
         raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 
+# What searches over lists of values near by, for the kinds that know how.
+LISTED: dict[type[ControllerProblem], type[ListedSections]] = {SectionsProblem: ListedSections}
+
+
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
-    """A co-design with parameters from lists: local searches near by where these know how."""
-    if isinstance(outer_of(sampler), SectionsOuter):
-        of = ListedSections(formulation, seed, lambda each: co_design(each, formulation, seed))
+    """A co-design with parameters from lists: local searches near by where its kind knows how."""
+    near_by = LISTED.get(type(sampler.problem.controller))
+    if near_by is not None:
+        of = near_by(formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x))
         return best_of_lists(sampler, of.search, of.search, of.judge)
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box
     return best_of_lists(

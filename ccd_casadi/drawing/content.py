@@ -14,7 +14,8 @@ from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE
 from ccd_casadi.support.arrays import Array
 
-Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
+Corner = Literal["best", "lower left", "lower right", "upper left", "upper right", "center left",
+                 "center right", "lower center", "upper center", "center"]  # fmt: skip
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
 
@@ -150,11 +151,10 @@ class Lines:
 
 @dataclass(frozen=True)
 class ThetaPath:
-    """A method's way over θ, rows (θ₁, θ₂); numbered where `numbered`."""
+    """A method's way over θ, rows (θ₁, θ₂)."""
 
     label: str
     theta: Array
-    numbered: bool = False
 
 
 @dataclass(frozen=True)
@@ -294,7 +294,7 @@ class Verdict:
 class Head:
     """Title, status with its reason, a line of circumstances, the conclusion, the verdict.
 
-    `badge`: "good", "warn" or "bad".
+    `badge`: "good", "warn" or "bad". `decision`: what to do, or the answer, in a sentence or two.
     """
 
     title: str
@@ -304,6 +304,7 @@ class Head:
     meta: str
     lead: str
     verdict: tuple[VerdictLine, ...] = ()
+    decision: str = ""
 
 
 Text = Words | Heading | Bullets | Links | Source | Facts | Verdict

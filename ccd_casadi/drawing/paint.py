@@ -48,7 +48,7 @@ def block_html(block: c.Block, key: str) -> str:
         case c.Source(text):
             return f"<pre>{escape(text)}</pre>"
         case c.Bullets(items):
-            return f"<ul>{''.join(f'<li>{escape(words)}</li>' for words in items)}</ul>"
+            return f"<ul>{''.join(f'<li>{escape(typeset(words))}</li>' for words in items)}</ul>"
         case c.Links(pages):
             linked = (f'<li><a href="{escape(to)}">{escape(title)}</a>: {escape(words)}</li>'
                       for to, title, words in pages)  # fmt: skip
@@ -111,8 +111,9 @@ def _steps(found: c.Steps, key: str) -> str:
 def head_html(head: c.Head) -> str:
     """Of a page, or of a cell of a notebook."""
     badge = f'<span class="badge {head.badge}">{STANDINGS[head.badge]} {escape(head.status)}</span>'
+    decision = f'<p class="decision">{escape(typeset(head.decision))}</p>\n'
     return (
-        f"<h1>{escape(head.title)}</h1>\n"
+        f"<h1>{escape(head.title)}</h1>\n{decision if head.decision else ''}"
         f"<p class='standing'>{badge} {escape(typeset(head.reason))}</p>\n"
         f'<p class="meta">{escape(head.meta)}</p>\n'
         f'<p class="lead">{escape(typeset(head.lead))}</p>\n{verdict_html(head.verdict)}'

@@ -42,6 +42,7 @@ class ProofOutcome(StrEnum):
     UNSTABLE = "the model's own loop is not stable"
     NOT_SQUARE = "the plant has not as many channels as outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
+    VARIES = "a theta varies, and moves the modes: its range was searched"
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,8 @@ def prove(
         outputs, inputs = structure.decoupling.outputs, structure.decoupling.inputs
     if len(uncertain.options[0].C) != outputs.shape[1] or outputs.shape[0] != outputs.shape[1]:
         return without(ProofOutcome.NOT_SQUARE)
+    if uncertain.ranges:
+        return without(ProofOutcome.VARIES)
     models = [uncertain.plant(uncertain.nominal, i).plant_si()
               for i in range(len(uncertain.options))]  # fmt: skip
     K = controller_of(structure, kappa)

@@ -82,11 +82,12 @@ def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, n
 def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
     """u_k to y_k of a plant without feedthrough behind hold and delay (s); states [x; u_{k-1}; …].
 
-    One exponential over each part of a period: before and after the delayed force changes.
+    One exponential over each part of a period: before and after the delayed force changes. Analytic
+    in the plant's matrices.
     """
     n, m = G.B.shape
     whole, rest = parts(period, delay)
-    joint = np.zeros((n + m, n + m))
+    joint = np.zeros((n + m, n + m), np.result_type(G.A, G.B))
     joint[:n, :n], joint[:n, n:] = G.A, G.B
     late = expm(joint * (period - rest))[:n]
     gains = [np.zeros((n, m))] * whole + [late[:, n:]]

@@ -52,8 +52,8 @@ def insight_page(run: FinishedRun, front: Front, responses: PostOptimal, index: 
         f"around the design of {run.folder.name}/result.json",
         f"The design, {theta_words(run.result)}, has {number(bandwidth_hz)} Hz at a hardware cost "
         f"of {cost_words(run.result)}. {rule}",
-        run.result,
-    )
+        run.result, front_answer(problem, front),
+    )  # fmt: skip
     drawn = front_figure(problem, front, (cost, bandwidth_hz, "this run's design"))
     answers = [Words(text) for text in response_sentences(responses)]
     sections = (
@@ -98,7 +98,7 @@ def front_figure(
     ]
     if failed.any():
         curves.append(Curve(cost[failed], hz[failed], "not verified", CYCLE[1], "", "x"))
-    mark = Mark(design[0], design[1], design[2], "s", offset=(8.0, 3.0))
+    mark = Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
     top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width
@@ -121,22 +121,29 @@ def _caption(front: Front) -> str:
         f"{verified} of {len(points)} points verified by the true inner problem, in {front.rounds} "
         f"rounds of prediction and truth, {front.syntheses} true syntheses. "
     )
+    return words + (
+        f"{len(efficient)} of them {'is' if len(efficient) == 1 else 'are'} efficient: no other is "
+        "as light and as fast. The curve shows what every further unit of cost gains or loses."
+    )
+
+
+def front_answer(problem: CoDesignProblem, front: Front) -> str:
+    """What the front says of weight against bandwidth, in one sentence."""
+    efficient = [point for point in front.points if point.efficient and point.verified]
+    unit = problem.cost_unit
+    costs = [f"{number(p.hardware_cost)} {unit}".strip() for p in efficient]
+    hz = [f"{number(p.bandwidth / HZ, 4)} Hz" for p in efficient]
+    if not efficient:
+        return "No point of the front is verified."
     if len(efficient) == 1:
-        only = efficient[0]
-        return words + (
-            f"One point dominates all others, f = {number(only.hardware_cost)} with "
-            f"{number(only.bandwidth / HZ, 4)} Hz: here the lightest design is also the fastest, "
-            "and the curve shows what every further unit of cost would lose."
-        )
-    if len(efficient) > 1:
-        light, fast = efficient[0], efficient[-1]
-        rate = (fast.bandwidth - light.bandwidth) / HZ / (fast.hardware_cost - light.hardware_cost)
-        words += (
-            f"{len(efficient)} of them are efficient, from f = {number(light.hardware_cost)} with "
-            f"{number(light.bandwidth / HZ, 4)} Hz to f = {number(fast.hardware_cost)} with "
-            f"{number(fast.bandwidth / HZ, 4)} Hz: on average {number(rate, 3)} Hz per unit of f."
-        )
-    return words
+        words = "There is nothing to trade: the design of least hardware cost"
+        return f"{words}, {costs[0]}, is also the fastest, {hz[0]}."
+    light, fast = efficient[0], efficient[-1]
+    rate = (fast.bandwidth - light.bandwidth) / HZ / (fast.hardware_cost - light.hardware_cost)
+    return (
+        f"Bandwidth costs hardware: from {costs[0]} with {hz[0]} to {costs[-1]} with {hz[-1]}, on "
+        f"average {number(rate, 3)} Hz for every {unit or 'unit of f'}."
+    )
 
 
 def _table(problem: CoDesignProblem, front: Front) -> Table:

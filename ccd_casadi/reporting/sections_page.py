@@ -16,9 +16,11 @@ from ccd_casadi.reporting.facts import (
     conclusion,
     cost_words,
     loop_facts,
+    sensitivity_facts,
     theta_words,
+    value_facts,
 )
-from ccd_casadi.support.units import HZ, counted, number
+from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -116,7 +118,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
 
 def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
-    certificate, robust, inner = r["certificate"], r["robust"], problem.inner
+    certificate, robust = r["certificate"], r["robust"]
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
     sampling = sections_of_problem(problem).sampling
     runs = "continuous" if sampling is None else (
@@ -125,30 +127,18 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
     on = counted(certificate["plants"], "plant")
     worst = f"largest of {counted(robust['plants'], 'plant')} of the box"
     kkt = r["kkt"]["stationarity"]
-    predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
-    if problem.figure is not BANDWIDTH:
-        e, guess = (1e9 * r[key] for key in ("error_rms_of_set", "surrogate_error_rms"))
-        words = f"{number(e, 6)} nm over the set (predicted {number(guess, 6)})"
-        predicted = ("RMS error e", words)
     return [
-        ("Objective J", number(r["objective"], 7),
-         f"{problem.w1:g} f(θ) + ({problem.w2:g}) {problem.figure.symbol}"),
-        ("Hardware cost f(θ)", cost_words(r, 6), ""),
-        ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", "on every plant of the set"),
-        (*predicted, f"relative error {number(r['verification_error'], 2)}"),
+        *value_facts(problem, r, "on every plant of the set"),
         ("Loop", runs, ""),
-        ("Peak of sensitivity", number(r["sensitivity_peak"], 6),
-         f"at {number(r['sensitivity_peak_hz'], 4)} Hz; S_max = {inner.S_max:g}"),
+        *sensitivity_facts(problem, r),
         *((f"Channel {own['name']}", f"peak of S {number(own['sensitivity_peak'], 6)}, "
            f"{number(own['bandwidth_hz'], 6)} Hz", _asked_of(own))
           for own in r.get("channel_bounds", ())),
         ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
-        (f"|S| at {number(inner.omega_low / HZ)} Hz", number(r["sensitivity_low"], 4),
-         f"S_low = {inner.S_low:g}"),
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
         *loop_facts(r),
-        ("Largest |KS|", f"{number(r['KS_max'], 4)} N/m", ""),
+        ("Largest |KS|", shown(r["KS_max"], "N/m", 4), ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
@@ -170,7 +160,8 @@ def _asked_of(own: Mapping[str, Any]) -> str:
     if own["bandwidth_ratio"] > 1.0:
         asked.append(f"at least {own['bandwidth_ratio']:g} ω_b")
     if "M_K" in own:
-        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {own['M_K']:g} N/m")
+        unit = shown(own["M_K"], "N/m")
+        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {unit}")
     return "; ".join(asked)
 
 
@@ -188,9 +179,9 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
     channels = controller.get("channels", ())
-    gains = [f"{own['name']}: gain {number(own['gain'], 6)} N/m" for own in channels]
+    gains = [f"{own['name']}: gain {shown(own['gain'], 'N/m', 4)}" for own in channels]
     if "gain" in controller:
-        gains = [f"Gain {number(controller['gain'], 6)} N/m"]
+        gains = [f"Gain {shown(controller['gain'], 'N/m', 4)}"]
     words = (
         f"{', '.join(gains)}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."

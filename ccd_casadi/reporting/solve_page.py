@@ -39,7 +39,7 @@ from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_figure
+from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.inner_sweep import sweep_data, sweep_figure
 from ccd_casadi.reporting.landscape import (
@@ -137,7 +137,7 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     parts = design_parts(problem, own, theta, K, view, result)
     if isinstance(verified, VerifiedSections):
         table = bandwidths_table(verified)
-        parts["loop"] = lambda: [Section("Closed loop on every plant", (table, gains(view())))]
+        parts["loop"] = lambda: _loop(own, theta, K, view(), table)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
@@ -177,8 +177,9 @@ def design_parts(
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_section(own, theta, K),
     }
+    parts["loop"] = lambda: _loop(own, theta, K, view())
     if "proof" not in result:  # of mixed sensitivity
-        return parts | {"loop": lambda: _loop(own, theta, K, view())}
+        return parts
     return parts | {
         "controller": lambda: [Section("The controller", controller_blocks(result))],
         "limits": lambda: (
@@ -186,7 +187,6 @@ def design_parts(
             if "costs" in result
             else []
         ),
-        "loop": lambda: [Section("Closed loop on every plant", (gains(view()),))],
     }
 
 
@@ -216,7 +216,7 @@ def _theta(
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, processes, truths, radius, verified.theta)
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
-        paths = (ThetaPath("iterates", path, numbered=True),) if len(path) else ()
+        paths = (ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
         error_hz = 0.0 if missed is None else abs(missed.error)
         lifted = len(processes) > 1
@@ -246,13 +246,16 @@ def stage_sections(
 
 
 def _loop(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: Table
 ) -> list[Section]:
     channels = split(scaled_plant(problem, theta), K)
+    plots = Section("Loop, plant and controller", (bode(loop, channels),))
+    if loop.bounded.asked:  # of a fixed structure
+        return [Section("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
         Section("Closed loop: S, KS and T against their bounds", (gains(loop),)),
         Section("What limits the bandwidth", limit_blocks(loop)),
-        Section("Plant and controller", (bode(loop, channels),)),
+        plots,
     ]
 
 
@@ -268,11 +271,11 @@ def _history(
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
         return Section(heading, (Words(words),))
-    figure = history_figure(
+    blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return Section(heading, (figure,))
+    return Section(heading, blocks)
 
 
 def _trust(solution: "Solution") -> list[Section]:

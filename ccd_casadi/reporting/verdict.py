@@ -24,6 +24,7 @@ STATUS = {
     "infeasible": "no feasible design",
 }
 BADGE = re.compile(r"<p class='standing'>.*?</p>", re.DOTALL)
+DECISION = re.compile(r'<p class="decision">(?:Do not b|B)uild this\b.*?</p>', re.DOTALL)
 TABLE = re.compile(r'<table class="wide verdict">.*?</table>', re.DOTALL)
 
 
@@ -54,22 +55,17 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def short(result: Mapping[str, Any]) -> str:
-    """What did not pass, in a few words: `survives warned`."""
-    return ", ".join(
-        f"{line.name} {line.state}"
-        for line in lines_of(result)
-        if line.state in (State.FAILED, State.WARNED)
-    )
-
-
 def head_of(
     title: str, good: bool, status: str, reason: str, meta: str, lead: str,
-    result: Mapping[str, Any],
+    result: Mapping[str, Any], decision: str = "",
 ) -> Head:  # fmt: skip
-    """The head of a page about a run; the badge is not green where the run's verdict warns."""
+    """The head of a page about a run; the badge is not green where the run's verdict warns.
+
+    `decision`: what the page answers, where that is not whether to build the design.
+    """
     badge = "bad" if not good else "good" if worst(result) is State.PASSED else "warn"
-    return Head(title, badge, status, reason, meta, lead, lines_of(result))
+    decision = decision or advice(result)
+    return Head(title, badge, status, reason, meta, lead, lines_of(result), decision)
 
 
 def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Head:
@@ -77,15 +73,15 @@ def run_head(title: str, result: Mapping[str, Any], meta: str, lead: str) -> Hea
     good = result["status"] == "verified"
     reason = head_words(result) if good else str(result.get("reason") or "")
     reason = f"{reason[:1].upper()}{reason[1:].rstrip('.')}." if reason else ""
-    reason = f"{advice(result)} {reason}".strip()
     status = STATUS.get(result["status"], "not verified")
     return head_of(title, good, status, reason, meta, lead, result)
 
 
 def refreshed(text: str, result: Mapping[str, Any], *, whole: bool) -> str:
-    """A page with the verdict as it is now; of the run's own page (`whole`) the badge too."""
+    """A page with the decision and the verdict as they are now; of the run's own (`whole`) the
+    badge too."""
     source = head_html(run_head("", result, "", ""))
-    for place in (TABLE, BADGE) if whole else (TABLE,):
+    for place in (DECISION, TABLE, *([BADGE] if whole else [])):
         old, new = place.search(text), place.search(source)
         if old is not None and new is not None:
             text = text[: old.start()] + new[0] + text[old.end() :]
@@ -121,6 +117,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        checks = ", ".join(result.get("checks", {})).replace("_", " ")
-        return f"all checks passed: {checks}"
+        return "all checks passed"
     return f"with warnings: {', '.join(warned)}"

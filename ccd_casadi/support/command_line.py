@@ -21,7 +21,7 @@ from ccd_casadi.support.user_code import permit_user_code
 from ccd_casadi.support.worker_process import WorkerLost
 
 DEFAULT_CASE = "runs/two_mass.toml"  # the same in cases.case, which says so where it is missing
-_DISK = "see to the disk or choose another --out, then give the same command: it resumes"
+_DISK = "free the disk or choose another --out, then repeat the command: it resumes"
 _NO_MEMORY = "not enough memory; give the plant fewer modes, or fewer --workers"
 _RESUMABLE = "what is sampled is kept; the same command resumes from there"
 
@@ -63,9 +63,9 @@ def _shared(result: argparse.ArgumentParser, without_effect: Sequence[str]) -> N
         "--workers", "worker processes (default: all cores)", metavar="N", type=whole(1),
         default=usable_cores(),
     )  # fmt: skip
-    add("--seed", "default: 0", metavar="N", type=whole(0), default=0)
-    add("--quiet", "no progress, no summary", action="store_true")
-    words = "refuse a case that names a plant function: it is code of who wrote it"
+    add("--seed", "seed of all random numbers (default: 0)", metavar="N", type=whole(0), default=0)
+    add("--quiet", "print no progress and no summary", action="store_true")
+    words = "refuse a case whose plant is a Python function, which is code of its author"
     add("--no-user-code", words, action="store_true")
 
 

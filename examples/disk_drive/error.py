@@ -111,7 +111,7 @@ class PositionError:
         return np.array(at), np.array(held)
 
     def figures(self, kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """σ² of y and of y_p (plants,), and their derivatives (plants, n) to κ (units of the set)."""
+        """σ² of y and y_p (plants,), and their derivatives (plants, n) to κ."""
         v, d, r = self.sources
         K, slopes = np.zeros((2, len(v)), complex), np.zeros((2, len(v), len(kappa)), complex)
         for c, (own, place) in enumerate(

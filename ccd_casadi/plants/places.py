@@ -1,0 +1,245 @@
+"""Forces and sensors where θ puts them: shapes between nodes, and masses that move with them.
+
+The inputs of the plant below are unit forces at nodes p_k, columns b_k: a node moves by b_kᵀ x.
+Between nodes b is interpolated (`nodes`), and a mass m at p adds m b(p) b(p)ᵀ to M. Frequencies,
+shapes and inertia move with it, exactly within the coordinates of the plant: how many modes these
+must be is told by its references.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial import Delaunay
+
+from ccd_casadi.drawing.content import Curve, Figure, Lines, Panel, Table
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.svg import GREEN, GREY, ORANGE
+from ccd_casadi.plants.axes import followed_modes, in_axes
+from ccd_casadi.plants.modal import RIGID_RATIO
+from ccd_casadi.plants.nodes import Between, Point, Points, names_in
+from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+from ccd_casadi.support.process_pool import Pool
+from ccd_casadi.support.units import HZ
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where forces act and sensors read, m; without `sensors` the plant's own outputs are read.
+
+    `nodes` (N, d): of the plant's inputs, in their order. Masses in kg. Actuators, and sensors, are
+    at least `apart` from each other.
+
+    With `axes` all forces act, and all sensors read, together along the motions of a rigid body
+    normal to the nodes, 1, x, y, in directions of length 1: as many inputs and outputs, however
+    many actuators. `quiet` flexible modes, from 1 by frequency, are neither driven nor read by
+    them; each `damped` one is an axis of its own.
+    """
+
+    nodes: tuple[tuple[float, ...], ...]
+    actuators: tuple[Point, ...]
+    sensors: tuple[Point, ...] = ()
+    actuator_mass: float = 0.0
+    sensor_mass: float = 0.0
+    apart: float = 0.0
+    axes: bool = False
+    quiet: tuple[int, ...] = ()
+    damped: tuple[int, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that it takes, each once."""
+        return names_in((*self.actuators, *self.sensors))
+
+
+def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
+    """The plant with its forces and sensors at their places, θ in the order of `names`.
+
+    Raises PlantError where nodes and inputs, or coordinates of nodes and places, do not match.
+    """
+    nodes = np.array(places.nodes, float)
+    if len(nodes) != plant.inputs:
+        words = f"places.nodes are {len(nodes)}, the plant has {plant.inputs} inputs"
+        raise PlantError(f"{words}; give one for each, and each input a unit force at one")
+    for point in (*places.actuators, *places.sensors):
+        if len(point) != nodes.shape[1]:
+            words = f"has {len(point)} coordinates, a node {nodes.shape[1]}"
+            raise PlantError(f"places: {list(point)} {words}; make them agree")
+    axes = places.axes * (1 + nodes.shape[1] + len(places.damped))
+    least = min(len(places.actuators), len(places.sensors))
+    if axes and least < axes + len(places.quiet):
+        words = f"need {axes + len(places.quiet)} actuators and sensors or more"
+        raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
+    between, own = Between(nodes), [list(names).index(name) for name in plant.names]
+    points = Points(places.actuators, names), Points(places.sensors, names)
+    for group in points:
+        still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
+        beyond = np.clip(group.constant, nodes.min(axis=0) - slack, nodes.max(axis=0) + slack)
+        if (still & (beyond != group.constant)).any():
+            raise PlantError("places: a force or sensor is beyond the nodes; move it between them")
+
+    def of(evaluate: Evaluate) -> PlacedMechanics:
+        return PlacedMechanics(evaluate, places, between, *points, own)
+
+    def below(theta: Sequence[float]) -> tuple[float, ...]:
+        return tuple(float(theta[i]) for i in own)
+
+    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
+        assert plant.nearby is not None
+        return of(plant.nearby(below(theta), reach, pool))
+
+    def notes(theta: Sequence[float]) -> tuple[str, ...]:
+        whole = plant.evaluate(below(theta))
+        error = between.left_out(_flexible(whole)[1].T @ whole.B)
+        return (
+            *plant.notes(below(theta)),
+            f"forces and sensors stand between {len(nodes)} nodes: an inner one, left out, is "
+            f"predicted to {100.0 * error:.2g} % of a mode's largest displacement at worst",
+        )
+
+    whole = of(plant.evaluate)
+    x = ca.MX.sym("theta", len(names))
+    f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
+    rules = _rules(whole, x)
+    return Plant(
+        names=tuple(names),
+        constraint_names=(*plant.constraint_names, *rules),
+        evaluate=whole,
+        hardware=ca.Function("hardware", [x], [f, ca.vertcat(lam, *rules.values())]),
+        outputs=axes or len(places.sensors) or plant.outputs,
+        inputs=axes or len(places.actuators),
+        references={name: of(closer) for name, closer in plant.references.items()},
+        exact_hessian=plant.exact_hessian,
+        values=None if plant.values is None else of(plant.values),
+        notes=notes,
+        nearby=None if plant.nearby is None else near,
+        domain=_domain(plant, whole, len(names)),
+        doubt=lambda theta: plant.doubt(below(theta)),
+        shapes=whole.shapes if nodes.shape[1] == 2 else None,
+        drawing=whole.drawing if nodes.shape[1] < 3 else None,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlacedMechanics:
+    """θ -> Mechanics; `evaluate` takes the parameters `own` of it, the points are moved by all."""
+
+    evaluate: Evaluate
+    places: Places
+    between: Between
+    actuators: Points
+    sensors: Points
+    own: list[int]
+
+    def __call__(self, theta: Sequence[float]) -> Mechanics:
+        values = np.asarray(theta, float)
+        below = self.evaluate(tuple(values[self.own].tolist()))
+        count = len(values) if len(below.derivatives[0]) or not self.own else 0
+
+        def spread(slopes: Array) -> Array:
+            """Derivatives to the plant's own θ, among those to all."""
+            out = np.zeros((count, *slopes.shape[1:]))
+            if count:
+                out[self.own] = slopes
+            return out
+
+        places, B0 = self.places, below.B
+        dM, dD, dK, dB0, dC = map(spread, below.derivatives)
+        (W, dW), (R, dR) = (
+            self.between.weights(points, values) for points in (self.actuators, self.sensors)
+        )
+        dW, dR = dW[:count], dR[:count]
+        M = below.M
+        for w, dw, kg in ((W, dW, places.actuator_mass), (R, dR, places.sensor_mass)):
+            F = B0 @ w
+            half = kg * (dB0 @ w + B0 @ dw) @ F.T
+            M, dM = M + kg * F @ F.T, dM + half + half.transpose(0, 2, 1)
+        if places.axes:
+            phi, dphi = followed_modes(M, below.K, dM, dK, (*places.quiet, *places.damped))
+            quiet, nodes = len(places.quiet), self.between.nodes
+            rigid = np.hstack([np.ones((len(nodes), 1)), nodes])
+            motions = np.insert(B0.T @ phi, [quiet] * rigid.shape[1], rigid, axis=1)
+            moved = dB0.transpose(0, 2, 1) @ phi + B0.T @ dphi
+            dmotions = np.insert(moved, [quiet] * rigid.shape[1], 0.0, axis=2)
+            W, dW = in_axes(W, dW, motions, dmotions, quiet)
+            R, dR = in_axes(R, dR, motions, dmotions, quiet)
+        C = below.C
+        if places.sensors:
+            C, dC = (B0 @ R).T, (dB0 @ R + B0 @ dR).transpose(0, 2, 1)
+        return replace(below, M=M, B=B0 @ W, C=C, derivatives=(dM, dD, dK, dB0 @ W + B0 @ dW, dC))
+
+    def shapes(self, theta: Sequence[float], count: int) -> ModeShapes:
+        """The lowest flexible modes at the nodes, with all masses where they are."""
+        omega, modes = _flexible(self(theta))
+        nodes = self.between.nodes
+        moved = modes.T @ self.evaluate(tuple(float(theta[i]) for i in self.own)).B
+        corners = Delaunay(nodes).simplices[:, [0, 1, 2, 2]]
+        flat = np.zeros((len(nodes), 3))
+        found = [
+            ModeShape(flat + row[:, None] * [0.0, 0.0, 1.0], float(w) / HZ, (i + 1,))
+            for i, (w, row) in enumerate(zip(omega[:count], moved, strict=False))
+        ]
+        return ModeShapes(np.hstack([nodes, flat[:, :1]]), corners, tuple(found))
+
+    def drawing(self, thetas: Mapping[str, Sequence[float]]) -> Figure:
+        """Nodes, forces and sensors, for each design a panel."""
+        panels, rows = [], []
+        for title, theta in thetas.items():
+            values = np.asarray(theta, float)
+            curves = [_dots(self.between.nodes, "node", GREY, ".")]
+            kinds = (("sensor", self.sensors.at(values), GREEN, "o"),
+                     ("force", self.actuators.at(values), ORANGE, "x"))  # fmt: skip
+            for label, at, colour, marker in kinds:
+                curves += [_dots(at, label, colour, marker)] if len(at) else []
+                rows += [(title, label, *(1e3 * p for p in point)) for point in at]
+            panels.append(Panel("x (mm)", "y (mm)", tuple(curves), title=title))
+        axes = ("x (mm)", "y (mm)")[: self.between.nodes.shape[1]]
+        return Figure(
+            Lines((tuple(panels),), "where forces and sensors stand", (3.6,)),
+            "Where forces act and sensors read, between the nodes of the model.",
+            (Table(("design", "what", *axes), tuple(rows)),),
+        )
+
+
+def _flexible(system: Mechanics) -> tuple[Array, Array]:
+    """ω in rad/s and shapes, as columns, of the flexible modes."""
+    lam, modes = eigh(system.K, system.M)
+    flexible = lam > RIGID_RATIO**2 * lam[-1]
+    return np.sqrt(lam[flexible]), modes[:, flexible]
+
+
+def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
+    """λ by name: least distances, where θ moves them."""
+    found: dict[frozenset[Point], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
+    for word, points, group in (("actuators", of.places.actuators, of.actuators),
+                                ("sensors", of.places.sensors, of.sensors)):  # fmt: skip
+        at = group.symbols(theta) if of.places.apart else []
+        for i, j in combinations(range(len(at)), 2):
+            if (group.slope[i] != group.slope[j]).any():
+                name = f"{word} {i + 1} and {j + 1} apart"
+                lam = 1.0 - ca.sumsqr(at[i] - at[j]) / of.places.apart**2
+                found.setdefault(frozenset((points[i], points[j])), (name, lam))
+    return dict(found.values())
+
+
+def _domain(plant: Plant, of: PlacedMechanics, count: int) -> tuple[Array, Array]:
+    """The plant's, and for positions the box around the nodes."""
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    if plant.domain is not None:
+        low[of.own], high[of.own] = plant.domain
+    ends = of.between.nodes.min(axis=0), of.between.nodes.max(axis=0)
+    for points in (of.actuators, of.sensors):
+        for point, axis, k in np.argwhere(points.slope):
+            least, most = sorted(points.slope[point, axis, k] * end[axis] for end in ends)
+            low[k], high[k] = max(low[k], least), min(high[k], most)
+    return low, high
+
+
+def _dots(at: Array, label: str, colour: str, marker: str) -> Curve:
+    x, y = 1e3 * at[:, 0], 1e3 * at[:, 1] if at.shape[1] > 1 else 0.0 * at[:, 0]
+    return Curve(x, y, label, colour, line="", marker=marker)

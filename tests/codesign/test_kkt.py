@@ -1,0 +1,108 @@
+"""The KKT certificate of the true problem: small at the optimum, large elsewhere."""
+
+import numpy as np
+import pytest
+from helpers import HZ, few, problem
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccd_casadi.codesign.kkt import kkt_certificate
+from ccd_casadi.codesign.outer_problem import OuterSolution, lifted_program, solve_program
+from ccd_casadi.inner_problem.plant_source import PlantSource
+from ccd_casadi.inner_problem.problem import CoDesignProblem
+from ccd_casadi.inner_problem.true_function import TrueQuantities
+from ccd_casadi.optim.kkt import KktCertificate
+
+
+def point(m1: float, m2: float, S_hz: float, T_hz: float) -> np.ndarray:
+    return np.array([m1, m2, np.log(S_hz * HZ), np.log(T_hz * HZ)])
+
+
+START = point(57.0, 56.5, 1700.0, 30.0)
+
+
+def solved(case: CoDesignProblem, start: np.ndarray) -> tuple[OuterSolution, TrueQuantities]:
+    quantities = TrueQuantities(case)
+    program = lifted_program(case, quantities, exact_hessian=False)
+    return solve_program(program, start), quantities
+
+
+def certified(case: CoDesignProblem, quantities: TrueQuantities, x) -> KktCertificate:
+    return kkt_certificate(case, x, quantities.at(x), quantities.at)
+
+
+def test_optimum_of_the_true_problem_is_certified() -> None:
+    case = problem()
+    solution, quantities = solved(case, START)
+    x = solution.best.x
+    certificate = certified(case, quantities, x)
+    assert solution.best.objective == pytest.approx(-439.465, abs=5e-4)
+    np.testing.assert_allclose(x[:2], 55.0, atol=1e-6)
+    assert certificate.stationarity < 1e-6
+    assert certificate.primal < 1e-8
+    assert certificate.complementarity < 1e-6
+    assert set(certificate.active) == {"S_max", "m1 lower", "m2 lower", "omega_S upper"}
+    assert all(value > 0.0 for value in certificate.multipliers.values())
+    assert certificate.second_order == np.inf  # a vertex: nothing is left to move
+
+
+MODEL = """
+from ccd_casadi.plants.two_mass import two_mass
+
+def model(theta, least, zeta=0.01):
+    m1, m2 = theta["m1"], theta["m2"]
+    cost = (m1 - 61) ** 2 + 2 * (m2 - 63) ** 2
+    return two_mass(theta, zeta) | {
+        "hardware_cost": cost, "constraints": {"least mass": least - m1 - m2}
+    }
+"""
+
+
+@pytest.mark.parametrize(
+    ("least", "start", "active"),
+    [
+        (100.0, (61.0, 63.0, 1700.0, 60.0), {"S_max", "omega_T lower"}),
+        (124.5, (62.0, 62.0, 600.0, 60.0), {"S_max", "omega_T lower", "least mass"}),
+    ],
+)
+def test_optimum_inside_the_box_has_a_positive_reduced_hessian(
+    tmp_path, least, start, active
+) -> None:
+    """A hardware cost with a minimum of its own, with and without λ(θ) <= 0 in force."""
+    file = tmp_path / "plant.py"
+    file.write_text(MODEL)
+    source = PlantSource(None, str(file), "model", (("least", least),))
+    case = problem(source=source, w1=10.0)
+    solution, quantities = solved(case, point(*start))
+    certificate = certified(case, quantities, solution.best.x)
+    assert certificate.stationarity < 1e-6
+    assert certificate.primal < 1e-8
+    assert certificate.complementarity < 1e-6
+    assert set(certificate.active) == active
+    assert certificate.second_order is not None
+    assert 0.0 < certificate.second_order < np.inf
+
+
+@few(max_examples=8)
+@given(st.floats(56.0, 69.0), st.floats(56.0, 69.0), st.floats(2.0, 3.2), st.floats(1.5, 2.9))
+def test_points_that_are_no_optimum_are_not_certified(m1, m2, S, T) -> None:
+    case = problem()
+    quantities = TrueQuantities(case)
+    x = point(m1, m2, 10.0**S, 10.0**T)
+    assert certified(case, quantities, x).stationarity > 1e-2
+
+
+@pytest.mark.parametrize("change", [1e-3, 1e-2])
+def test_residuals_grow_with_the_distance_from_the_optimum(change: float) -> None:
+    case = problem()
+    solution, quantities = solved(case, START)
+    lower = solution.best.x.copy()
+    lower[3] -= change  # towards a smaller peak: feasible, but not optimal any more
+    inside = certified(case, quantities, lower)
+    assert inside.stationarity > 1e-2
+    upper = solution.best.x.copy()
+    upper[3] += change
+    outside = certified(case, quantities, upper)
+    assert max(inside.primal, outside.primal) == pytest.approx(
+        abs(change * quantities.jacobian_at(solution.best.x)[1, 3]), rel=0.1
+    )

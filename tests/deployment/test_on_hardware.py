@@ -1,0 +1,196 @@
+"""On the machine: feedforward, limits with back-calculation, a start without a jump, moves."""
+
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+from helpers import few, well_conditioned
+from hypothesis import given
+from hypothesis import strategies as st
+from sampled_simulation import simulate
+from structured_text import run as run_text
+from test_deploy_code import of_one_channel, random_controller
+
+from ccd_casadi.analysis.move import Move
+from ccd_casadi.analysis.move_limits import Limits
+from ccd_casadi.analysis.setpoint import setpoint
+from ccd_casadi.deployment.anti_windup import back_calculation, limited, takeover
+from ccd_casadi.deployment.c_code import vectors
+from ccd_casadi.deployment.feedforward import feedforward
+from ccd_casadi.deployment.move import PARTS, Hardware, move
+from ccd_casadi.deployment.realisation import Realisation, difference_equation
+from ccd_casadi.deployment.structured_text import structured_text
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.errors import UserError
+
+PERIOD = DELAY = 1e-4
+CROSSOVER = 2.0 * np.pi * 40.0
+PROFILE = setpoint(Limits(0.01, 0.1, 2.0, 100.0, 1e4))
+
+
+def stage(inputs: int = 1) -> StateSpace:
+    """Two masses, 8 and 2 kg, 335 Hz, hardly held and damped; `inputs` of them side by side."""
+    k, c = 2.0 * (2.0 * np.pi * 300.0) ** 2, 0.02 * 2.0 * np.pi * 300.0
+    M, tie = np.diag([8.0, 2.0]), np.array([[1.0, -1.0], [-1.0, 1.0]])
+    held = 0.01 * np.eye(2)
+    A = np.block(
+        [
+            [np.zeros((2, 2)), np.eye(2)],
+            [-np.linalg.solve(M, k * tie) - held, -np.linalg.solve(M, c * tie) - held],
+        ]
+    )
+    eye = np.eye(inputs)
+    B, C = np.array([[0.0], [0.0], [1 / 8], [0.0]]), np.array([[1.0, 0.0, 0.0, 0.0]])
+    return StateSpace(np.kron(eye, A), np.kron(eye, B), np.kron(eye, C), np.zeros((inputs, inputs)))
+
+
+def pid() -> Realisation:
+    """PID with a roll-off, as a motion engineer tunes it, by Tustin's rule."""
+    w = CROSSOVER
+    factors = (
+        ([10.0 * w**2 / 3.0, w**3 / 3.0], [1.0, 0.0]),
+        ([3.0 / w, 1.0], [1.0 / (3.0 * w), 1.0]),
+        ([1.0], [1.0 / (8.0 * w) ** 2, 1.4 / (8.0 * w), 1.0]),
+    )
+    K = control.ss(*(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1)))
+    for zeros, poles in factors:
+        K = K * control.ss(control.tf(zeros, poles))
+    found = K.sample(PERIOD, "tustin")
+    return of_one_channel(StateSpace(found.A, found.B, found.C, found.D, period=PERIOD))
+
+
+def test_the_setpoint_at_any_time_is_its_own_integral() -> None:
+    t = np.linspace(-0.01, 1.2 * PROFILE.duration, 20001)
+    r = PROFILE.at(t)
+    for k in range(4):
+        middle = 0.5 * (r[k + 1, 1:] + r[k + 1, :-1]) * np.diff(t)
+        scale = np.abs(r[k]).max()
+        np.testing.assert_allclose(np.diff(r[k]), middle, rtol=0, atol=1e-3 * scale)
+    assert r[0, 0] == 0.0
+    np.testing.assert_allclose(r[:, -1], [0.01, 0, 0, 0, 0], rtol=1e-12, atol=0)
+
+
+@few(max_examples=20)
+@given(seed=st.integers(0, 10**6), inputs=st.integers(1, 3))
+def test_feedforward_inverts_the_plant_to_fifth_order(seed: int, inputs: int) -> None:
+    rng = np.random.default_rng(seed)
+    G, delay = stage(inputs), rng.uniform(0.0, 3e-4)
+    T, mix = well_conditioned(rng, len(G.A)), well_conditioned(rng, inputs)
+    G = StateSpace(np.linalg.solve(T, G.A @ T), np.linalg.solve(T, G.B @ mix), G.C @ T, G.D)
+    F = feedforward(G, PERIOD, delay)
+    misses = []
+    for w in (200.0, 400.0):
+        s = 1j * w
+        g = G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B)
+        ahead = sum(F[k] * s**k for k in range(5))
+        late = np.exp(-s * (delay + PERIOD / 2))
+        misses.append(np.abs(g @ ahead * late - np.eye(inputs)).max())
+    assert misses[1] < 2e-3
+    assert misses[0] < misses[1] / 2**2.5  # the next term is of third order against the mass
+    np.testing.assert_allclose(mix @ F[2], 10.0 * np.eye(inputs), rtol=0, atol=1e-4)
+
+
+def test_a_plant_that_holds_no_position_has_no_feedforward() -> None:
+    G = StateSpace(
+        np.diag([-1.0, -2.0]), np.ones((2, 1)), np.array([[1.0, -2.0]]), np.zeros((1, 1))
+    )
+    with pytest.raises(UserError, match="zero at 0 Hz"):  # 1/(s+1) - 2/(s+2) = -s/(...)
+        feedforward(G, PERIOD, DELAY)
+
+
+@few(max_examples=30)
+@given(seed=st.integers(0, 10**6), inputs=st.integers(1, 3), unstable=st.booleans())
+def test_states_follow_a_stable_matrix_beyond_the_limit(
+    seed: int, inputs: int, unstable: bool
+) -> None:
+    K = random_controller(seed, 2, 2, inputs)
+    if unstable:
+        K = replace(K, A=1.002 * K.A / np.abs(np.linalg.eigvals(K.A)).max())
+    size = np.abs(K.response(np.array([300.0]))).max()
+    for limit in (1e-3 * size, 10.0 * size):
+        L = back_calculation(K, limit, 300.0)
+        assert np.abs(np.linalg.eigvals(K.A - L @ K.C)).max() < 1.0
+
+
+def test_nothing_changes_between_the_limits() -> None:
+    K = pid()
+    e = 1e-6 * np.random.default_rng(0).normal(size=(300, 1))
+    u = difference_equation(K, e)
+    wide = limited(replace(K, saturation=1.01 * float(np.abs(u).max())), CROSSOVER)
+    np.testing.assert_array_equal(difference_equation(wide, e), u)
+    narrow = limited(replace(K, saturation=0.5 * float(np.abs(u).max())), CROSSOVER)
+    only_clipped = np.clip(u, -(narrow.saturation or 0.0), narrow.saturation)
+    assert np.abs(difference_equation(narrow, e) - only_clipped).max() > 0.0
+
+
+@few(max_examples=30)
+@given(seed=st.integers(0, 10**6), inputs=st.integers(1, 2))
+def test_a_takeover_begins_with_the_force_that_was_there(seed: int, inputs: int) -> None:
+    K = random_controller(seed, 2, 2, inputs)
+    rng = np.random.default_rng(seed)
+    e, u = 1e-6 * rng.normal(size=inputs), rng.normal(size=inputs)
+    x = takeover(K) @ np.concatenate([e, u])
+    np.testing.assert_allclose(K.C @ x + K.D @ e, u, rtol=0, atol=1e-9 * (1 + np.abs(u).max()))
+
+
+def test_an_integrator_takes_over_for_good() -> None:
+    K = pid()
+    x = takeover(K.system) @ np.array([0.0, 7.0])
+    u = difference_equation(K, np.zeros((500, 1)), start=x.tolist())
+    np.testing.assert_allclose(u, 7.0, rtol=1e-9)
+
+
+def made(K: Realisation, **also: object) -> Move:
+    return move(stage(), K, DELAY, PROFILE, **also)  # type: ignore[arg-type]
+
+
+def test_an_unlimited_move_is_the_linear_loop() -> None:
+    K, plant = pid(), sampled(stage(), PERIOD, DELAY)
+    found = made(K)
+    errors, _ = simulate(plant, K.system, found.position[:, None, None])
+    np.testing.assert_allclose(found.error, errors[:, :, 0], rtol=0, atol=1e-9 * 1e-2)
+    late = made(K, hardware=Hardware(jitter=PERIOD / PARTS / 4))
+    np.testing.assert_array_equal(made(K, hardware=Hardware()).error, found.error)
+    assert 0.0 < np.abs(late.error - found.error).max() < 1e-2 * found.peak_error
+
+
+def test_a_limited_move_ends_as_fast_and_without_a_cycle() -> None:
+    K, F = pid(), feedforward(stage(), PERIOD, DELAY)
+    assert made(K, forward=F).peak_error < 0.01 * made(K).peak_error
+    free = made(K)
+    limit = 0.9 * float(np.abs(free.force).max())
+    clipped = replace(K, saturation=limit)
+    held = made(limited(clipped, CROSSOVER))
+    assert held.saturated > 0.05
+    assert held.settled <= 1.2 * free.settled
+    assert held.last_error(0.25) < 1e-7  # of a window of 1e-6
+    assert held.settled <= made(clipped).settled
+    assert np.abs(held.force).max() <= limit
+
+
+def test_steps_of_sensor_and_force_bound_what_is_left() -> None:
+    found = made(pid(), hardware=Hardware(sensor_step=1e-8, force_step=1e-3))
+    assert 0.0 < found.last_error(0.25) < 1e-7
+    np.testing.assert_allclose(found.force / 1e-3, np.round(found.force / 1e-3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "reals", "inputs", "limit"), [(0, 0, 1, None), (2, 1, 1, 5e-3), (3, 2, 3, 5e-3)]
+)
+def test_structured_text_is_the_c_code_line_by_line(
+    pairs: int, reals: int, inputs: int, limit: float | None
+) -> None:
+    found = limited(of_one_channel(random_controller(5, pairs, reals, inputs), limit), 500.0)
+    errors, forwards, first, forces = vectors(found)
+    text = structured_text(found, title="x *) y", delay=1e-4, verified=True)
+    calls = [
+        {"E": list(e), "F": list(f), "U_BEFORE": list(first), "TAKEOVER": k == 0}
+        for k, (e, f) in enumerate(zip(errors, forwards, strict=True))
+    ]
+    got = np.array([answer["U"] for answer in run_text(text, calls)])
+    np.testing.assert_array_equal(got, forces)
+    rest = run_text(text, [*calls, {"RESET": True, "TAKEOVER": False}])[-1]["U"]
+    again = difference_equation(found, errors[-1:], forwards[-1:])[0]
+    np.testing.assert_array_equal(rest, again)

@@ -1,0 +1,310 @@
+"""Fixed structures: the controller, its loops, the peaks and their derivatives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from differences import slopes
+from fixed_structure_channels import closed
+from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, by_curve, loop, plant
+
+from ccd_casadi.deployment.discretise import Conversion, discretise
+from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
+from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.figures import (
+    assess,
+    constraints,
+    evaluate_rows,
+    hessians,
+    to_theta,
+)
+from ccd_casadi.fixed_structure.loop import closed_loops, plant_set, stable
+from ccd_casadi.fixed_structure.loop_problem import Curve
+from ccd_casadi.fixed_structure.peak_search import Brackets
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.starts import at_random
+from ccd_casadi.fixed_structure.structure import response, response_and_slopes, roots, state_space
+from ccd_casadi.kernels import sections
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.lti.norms import hinf_norm
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.sampled import sampled_figures
+from ccd_casadi.support.errors import PlantError
+
+STRUCTURES = [
+    Structure(),
+    Structure(integrator=False, lead=2, biquads=1, roll_off=3),
+    Structure(lead=0, biquads=0, roll_off=1),
+    Structure(lead=1, biquads=3, roll_off=0),
+]
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_state_space_roots_and_response_are_one_controller(structure: Structure) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        kappa = rng.normal(0.0, 0.8, len(structure.names))
+        s = 1j * np.geomspace(0.01, 100.0, 25)
+        K = response(structure, kappa, s)
+        system = state_space(structure, kappa)
+        solved = np.linalg.solve(s[:, None, None] * np.eye(len(system.A)) - system.A, system.B + 0j)
+        np.testing.assert_allclose((system.C @ solved + system.D)[:, 0, 0], K, rtol=1e-9)
+        zeros, poles = roots(structure, kappa)
+        assert len(poles) == structure.order == len(system.A)
+        assert (poles.real < 0.0).sum() == structure.order - structure.integrator
+        assert (zeros.real < 0.0).all()
+        ratio = K * np.prod(s[:, None] - poles, axis=1) / np.prod(s[:, None] - zeros, axis=1)
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-8)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_derivatives_of_the_controller(structure: Structure) -> None:
+    rng = np.random.default_rng(1)
+    kappa = rng.normal(0.0, 0.5, len(structure.names))
+    s = 1j * np.geomspace(0.05, 20.0, 9)
+    _, slopes, slope = response_and_slopes(structure, kappa, s)
+    h, bent = 1e-5, []
+    for i, step in enumerate(h * np.eye(len(kappa))):
+        up, down = (response_and_slopes(structure, kappa + x, s) for x in (step, -step))
+        np.testing.assert_allclose(np.log(up[0] / down[0]) / (2 * h), slopes[:, i], atol=1e-7)
+        bent.append((up[1] - down[1]) / (2 * h))
+    ends = [response(structure, kappa, s * np.exp(x)) for x in (h, -h)]
+    np.testing.assert_allclose(np.log(ends[0] / ends[1]) / (2 * h), slope, atol=1e-7)
+    k, alone, ln_slope = np.empty((3, 1), complex)
+    own, bend = np.empty(len(kappa), complex), np.empty((len(kappa),) * 2, complex)
+    loop = problem_for([plant()], structure, BOUNDS).loop(kappa, 0.0)
+    K = (loop.factors, loop.values)
+    for i, at in enumerate(s):  # the kernel's
+        sections.gains_and_slopes(*K, at, k, ln_slope, own)
+        sections.gains(*K, at, alone)
+        np.testing.assert_allclose(k, alone)
+        np.testing.assert_allclose([k, ln_slope], [[response(structure, kappa, at)], [slope[i]]])
+        np.testing.assert_allclose(own, slopes[i], atol=1e-12)
+        sections.second_slopes(loop.factors, own, bend)
+        np.testing.assert_allclose(bend, np.array(bent)[:, i], atol=1e-6)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST, SLOW])
+def test_the_modal_response_is_that_of_the_matrices(sampling: Sampling | None) -> None:
+    members = plant_set([plant(), plant(0.03, 0.5)], sampling)
+    v = np.geomspace(1e-3, 10.0, 40)
+    for i, member in enumerate(members.plants):
+        G, slope = (part[:, 0, 0] for part in members.responses(np.full(len(v), i), v))
+        solved = np.linalg.solve(1j * v[:, None, None] * np.eye(len(member.A)) - member.A,
+                                 member.B + 0j)  # fmt: skip
+        np.testing.assert_allclose((member.C @ solved + member.D)[:, 0, 0], G, rtol=1e-9)
+        ends = [members.responses(np.full(len(v), i), v * np.exp(x))[0] for x in (1e-6, -1e-6)]
+        np.testing.assert_allclose((ends[0] - ends[1])[:, 0, 0] / 2e-6, slope, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("sampling", [FAST, SLOW, Sampling(4000.0), Sampling(4000.0, 250.0)])
+def test_a_sampled_loop_is_the_one_that_is_deployed(sampling: Sampling) -> None:
+    """Poles, ‖S‖∞ and ω_b against deploy's own sampled loop with Tustin's rule."""
+    problem, kappa = loop(3, Structure(), sampling)
+    members = problem.plants
+    tau = np.log(0.1)
+    found = assess(problem, kappa, tau, depth=-3.0)
+    si = problem.structure.in_units(kappa, members.omega_0, members.force)
+    conversion = Conversion(Discretisation.TUSTIN, False, 1.0)
+    K = discretise(state_space(problem.structure, si), conversion, sampling.period, sampling.delay)
+    S = closed_loop(sampled(plant().plant_si(), sampling.period, sampling.delay), K).S
+    w = found.poles[0] * 0.5 * members.period
+    z = np.sort(np.abs((1.0 + w) / (1.0 - w)))
+    np.testing.assert_allclose(z, np.sort(np.abs(np.linalg.eigvals(S.A)))[-len(z) :], atol=1e-6)
+    figures = sampled_figures(S)
+    peaks = found.peaks
+    assert figures.stable
+    assert peaks is not None
+    top = peaks.value[peaks.curve == Curve.S_MAX].max()
+    assert np.exp(top - problem.margin) * BOUNDS.S_max == pytest.approx(
+        figures.sensitivity_peak, rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sampling", [None, FAST])
+@pytest.mark.parametrize("ends", ShapeEnd)
+def test_peaks_are_the_suprema_of_dense_grids(
+    seed: int, sampling: Sampling | None, ends: ShapeEnd
+) -> None:
+    problem, kappa = loop(seed, Structure(), sampling, (-0.03, 0.03))
+    problem = replace(problem, bounds=replace(problem.bounds, shape_ends=ends))
+    tau = np.log(0.08)
+    found = assess(problem, kappa, tau, depth=-60.0).peaks
+    assert found is not None
+    edge = float(problem.plants.variable(np.array([np.exp(tau)]))[0])
+    v = np.geomspace(problem.base[0], problem.base[-1], 60001)
+    curves = (*problem.curves, Curve.CROSSING)
+    dense = by_curve(problem, kappa, tau, curves, np.tile(v, (2, 1)))
+    for i in range(2):
+        for curve in curves:
+            kinds, values = [curve], dense[curve][i] + problem.margin
+            if curve is Curve.CROSSING or problem.ends_at_crossing(curve):
+                values, kinds = values[v <= edge], [curve, Curve.LEVEL, Curve.CROSSING]
+            own = (found.plant == i) & np.isin(found.curve, kinds)
+            assert found.value[own].max() >= values.max() - 1e-9
+            if not problem.ends_at_crossing(curve) and curve is not Curve.CROSSING:
+                assert found.value[own].max() <= values.max() + 1e-2
+
+
+def test_the_peak_of_s_is_its_h_infinity_norm() -> None:
+    for seed in range(5):
+        problem, kappa = loop(seed, Structure())
+        found = assess(problem, kappa, np.log(0.1), depth=-60.0).peaks
+        G, K = problem.plants.plants[0], state_space(problem.structure, kappa)
+        A = np.block([[G.A - G.B @ K.D @ G.C, G.B @ K.C], [-K.B @ G.C, K.A]])
+        S = StateSpace(A, np.vstack([G.B @ K.D, K.B]),
+                       np.hstack([-G.C, np.zeros((1, len(K.A)))]), np.eye(1))  # fmt: skip
+        assert found is not None
+        top = found.value[found.curve == Curve.S_MAX].max() - problem.margin
+        assert np.exp(top) * BOUNDS.S_max == pytest.approx(hinf_norm(S)[0], rel=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("sampling", [None, LATE])
+def test_derivatives_of_the_peaks(seed: int, sampling: Sampling | None) -> None:
+    """To κ, τ and θ against central differences of fourth order."""
+    problem, kappa = loop(seed, STRUCTURES[(0, 1, 3)[seed]], sampling)
+    tau, theta = -2.2, np.array([55.0, 55.0])
+    peaks = assess(problem, kappa, tau, depth=-3.0).peaks
+    assert peaks is not None
+
+    def values(problem, kappa, tau, which=peaks.plant):
+        return constraints(problem, kappa, tau, peaks.curve, which, peaks.v).value
+
+    size = np.abs(peaks.to_kappa).max(1, keepdims=True) + 1e-3
+    to_kappa = slopes(lambda x: values(problem, x, tau), kappa, 1e-4)
+    assert (np.abs(to_kappa - peaks.to_kappa) / size).max() < 1e-5
+    rising = peaks.curve != Curve.CROSSING
+    slope = (values(problem, kappa, tau + 1e-6) - values(problem, kappa, tau - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope[rising], peaks.to_tau[rising], atol=1e-6)
+    exact = to_theta(problem, kappa, peaks)
+    scale = np.abs(exact).max(1, keepdims=True) + 1e-3 * np.abs(exact).max()
+
+    def moved(theta):
+        pair = problem_for([plant(), plant(theta=theta)], problem.structure, problem.bounds,
+                           sampling)  # fmt: skip
+        return values(pair, kappa, tau, np.ones_like(peaks.plant))
+
+    assert (np.abs(slopes(moved, theta, 2e-3) - exact) / scale).max() < 1e-5
+
+
+def test_the_hessian_of_every_peak_moves_with_the_peak() -> None:
+    problem, kappa = loop(2, Structure(), FAST)
+    tau = -2.2
+    peaks = assess(problem, kappa, tau).peaks
+    assert peaks is not None
+    chosen = np.unique(peaks.curve, return_index=True)[1]  # one of each kind
+    assert len(chosen) > 4
+    for j in chosen:
+        one = peaks.only(np.array([j]))
+        exact = hessians(problem, kappa, tau, one)[0]
+        x = np.append(kappa, tau)
+        rows = []
+        for step in 1e-5 * np.eye(len(x)):
+            ends = []
+            for moved in (x + step, x - step):
+                near = assess(problem, moved[:-1], moved[-1], depth=-3.0).peaks
+                assert near is not None
+                same = np.flatnonzero(near.curve == one.curve[0])
+                k = same[np.argmin(np.abs(np.log(near.v[same] / one.v[0])))]
+                ends.append(np.append(near.to_kappa[k], near.to_tau[k]))
+            rows.append((ends[0] - ends[1]) / 2e-5)
+        np.testing.assert_allclose(exact, rows, atol=1e-4 * (1.0 + np.abs(rows).max()))
+
+
+def test_stability_is_that_of_the_closed_loops_characteristic_polynomial() -> None:
+    """Against roots of the polynomial of 1 + GK, for stable and unstable random loops alike."""
+    rng = np.random.default_rng(5)
+    structure = Structure(lead=1, biquads=1, roll_off=1)
+    problem = problem_for([plant()], structure, BOUNDS)
+    kappa = at_random(problem, np.exp(rng.uniform(-4.0, 0.5, 200)), rng)
+    member = problem.plants
+    verdicts = stable(closed_loops(member, structure, kappa))[:, 0]
+    for one, verdict in zip(kappa, verdicts, strict=True):
+        zeros, poles = roots(structure, one)
+        s0 = np.array([1.3j])
+        lead = (response(structure, one, s0) * np.prod(s0 - poles) / np.prod(s0 - zeros))[0].real
+        p, r = member.poles[0], member.residues[0, :, 0, 0]
+        above = sum(r[i] * np.poly(np.delete(p, i)) for i in range(len(p)))
+        joint = np.polyadd(np.polymul(np.poly(p), np.poly(poles)),
+                           lead * np.polymul(above, np.poly(zeros)))  # fmt: skip
+        margin = np.roots(joint.real).real.max()
+        if abs(margin) > 1e-5:
+            assert verdict == (margin < 0.0)
+    assert 10 < verdicts.sum() < 190
+
+
+def test_units_change_nothing() -> None:
+    """The same plant in mm and mN, M_K accordingly: the same constraints, κ in its units."""
+    problem, kappa = loop(1, Structure())
+    modal_units = plant()
+    other = replace(modal_units, force=modal_units.force * 7.0)
+    bounds = replace(BOUNDS, weights=replace(BOUNDS.weights, M_K=BOUNDS.weights.M_K * 7.0),
+                     compliance_max=BOUNDS.compliance_max / 7.0)  # fmt: skip
+    again = problem_for([other], problem.structure, bounds)
+    si = problem.structure.in_units(kappa, problem.plants.omega_0, problem.plants.force)
+    moved = problem.structure.in_units(si, 1.0, 7.0)
+    np.testing.assert_allclose(in_problem_units(again, moved), kappa, atol=1e-12)
+    a, b = (assess(x, kappa, -2.0).peaks for x in (problem, again))
+    assert a is not None
+    assert b is not None
+    np.testing.assert_allclose(a.value, b.value, atol=1e-9)
+
+
+def test_plants_that_cannot_be_in_a_set_are_refused() -> None:
+    with pytest.raises(PlantError, match="at least one"):
+        plant_set([])
+    good = plant()
+    with pytest.raises(PlantError, match="not stable"):
+        plant_set([replace(good, A=-good.A)])
+    double = replace(good, B=np.hstack([good.B, good.B]))
+    with pytest.raises(PlantError, match="SISO"):
+        plant_set([double])
+
+
+def test_grid_points_that_rounding_parts_count_as_one() -> None:
+    """Two of them at a peak left the judge a bracket without it."""
+    pair = np.array([-1.0 + 100.0j, (-1.0 + 100.0j) * (1.0 + 1e-13)])
+    grid = frequency_grid([pair], None, 1.0, 100.0, 0.0)
+    assert (np.diff(grid) > 1e-10 * grid[1:]).all()
+    assert np.abs(grid - 100.0).min() < 1e-9
+
+
+@pytest.mark.parametrize("power", [3, 9, 21])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_peak_is_closed_in_on_however_flat_one_side_of_it_is(
+    power: int, mirrored: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A slope of 1e-4 at one end and of 1 at the other: false position alone stays at its end.
+
+    The search took such a point for the peak of T, and the judge refused its best controller.
+    """
+    least = 1e-4
+
+    def slope(v: float) -> float:
+        return mirror * (least - (mirror * np.log(v)) ** power)
+
+    mirror = -1.0 if mirrored else 1.0
+    ends = np.exp(mirror * np.array([0.0, 1.0]))
+    none = np.zeros(1, int)
+    brackets = Brackets(none, none, ends[:1], np.exp([min(0.0, mirror)]),
+                        np.exp([max(0.0, mirror)]))  # fmt: skip
+    top, inside = closed(monkeypatch, slope, brackets)
+    assert inside.all()
+    assert mirror * np.log(top) == pytest.approx(least ** (1.0 / power), abs=1e-6)
+
+
+def test_a_plant_that_answers_nothing_raises_nothing() -> None:
+    """G = 0 at a frequency: curves of it are -inf, and no division is an error."""
+    problem, kappa = loop(0, Structure())
+    silence = replace(problem.plants, residues=0.0 * problem.plants.residues)
+    silent = replace(problem, plants=silence)
+    v = np.geomspace(0.01, 1.0, 5)
+    found = by_curve(silent, kappa, 0.0, silent.curves, np.tile(v, (1, 1)))
+    assert (found[Curve.T] == -np.inf).all()
+    rows = np.full(5, int(Curve.T))
+    assert not np.isfinite(evaluate_rows(silent, kappa, 0.0, rows, np.zeros(5, int), v)[1]).any()

@@ -1,0 +1,238 @@
+"""Measured frequency responses: read, judged and designed on as the model they came from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from fixed_structure_loops import BOUNDS, FAST, loop, plant
+from scipy.io import savemat
+
+from ccd_casadi.fixed_structure import Bounds, Sampling, Structure, certify, synthesise_sections
+from ccd_casadi.fixed_structure.line_problem import line_problem
+from ccd_casadi.fixed_structure.local_search import LoopModel
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.measured import (
+    MeasuredResponse,
+    from_control,
+    read_frequency_response,
+)
+from ccd_casadi.fixed_structure.measured_design import design_on_data
+from ccd_casadi.fixed_structure.measured_loop import judge
+from ccd_casadi.fixed_structure.sections_design import in_problem_units
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ
+
+PID = Structure(biquads=0)
+KEPT = replace(BOUNDS, compliance_max=None)  # which no PID meets
+
+
+def measured(sampling: Sampling | None, lines: int = 2000) -> MeasuredResponse:
+    """Case study 1 as a spectrum analyser would give it, hold and delay in it."""
+    P = plant_set([plant()], sampling)
+    hz = np.geomspace(0.3, 4900.0, lines)
+    G = P.responses(np.zeros(lines, int), P.variable(HZ * hz / P.omega_0))[0][:, 0, 0] / P.force
+    return MeasuredResponse(hz, G)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_judge_on_lines_agrees_with_the_one_on_the_model(sampling: Sampling | None) -> None:
+    """Stability always; figures to what lies between lines, which the stated bound covers."""
+    found = measured(sampling)
+    period = None if sampling is None else sampling.period
+    for seed in range(3):
+        problem, kappa = loop(seed, PID, sampling)
+        P = problem.plants
+        K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+        for factor in (1.0, 30.0):
+            own = StateSpace(K.A, K.B, factor * K.C, factor * K.D)
+            model = certify([plant()], own, BOUNDS, sampling).plants[0]
+            lines = judge(found, own, BOUNDS, period=period)
+            assert lines.sure, lines.words
+            assert lines.stable == model.stable
+            if not model.stable:
+                assert lines.right_half_plane > 0
+                continue
+            assert max(lines.S_peak / model.S_peak, lines.KS / model.KS) <= 1.0 + 1e-6
+            assert model.S_peak / lines.S_between <= 1.0 + 1e-6
+            assert lines.bandwidth == pytest.approx(model.bandwidth, rel=1e-4)
+            np.testing.assert_allclose(lines.GS, model.GS, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_design_on_lines_is_that_on_the_model() -> None:
+    found = design_on_data(measured(FAST), PID, KEPT, period=FAST.period)
+    assert found.usable, found.words
+    assert found.figures is not None
+    assert all(ratio <= 1.0 + 1e-5 for ratio in KEPT.shares(found.figures).values())
+    model = synthesise_sections([plant()], PID, KEPT, sampling=FAST, starts=2)
+    assert model.certified
+    assert found.bandwidth == pytest.approx(model.bandwidth, rel=1e-2)
+
+
+def test_rows_on_lines_have_their_derivatives() -> None:
+    structure = Structure(biquads=1)
+    modelled, kappa = loop(3, structure)
+    kappa = structure.in_units(kappa, modelled.plants.omega_0, modelled.plants.force)
+    problem = line_problem([measured(None, 60)], structure, BOUNDS)
+    kappa = in_problem_units(problem, kappa)
+    model = LoopModel(problem)
+    tau = float(np.log(2.0 * HZ * 1.013 / problem.plants.omega_0))
+    x = np.append(kappa, tau)
+    point = model.at(x)
+    assert point is not None
+    rows = model.rows(point, 1.0)
+    rng = np.random.default_rng(0)
+    way, h = rng.normal(size=len(x)), 1e-6
+    ends = [model.at(x + s * h * way) for s in (1.0, -1.0)]
+    assert ends[0] is not None
+    assert ends[1] is not None
+    values = [end.data.peaks.value for end in ends if end and end.data.peaks is not None]
+    assert len(values[0]) == len(values[1]) == len(rows.value)
+    difference = (values[0] - values[1]) / (2.0 * h)
+    slope = rows.slopes @ way
+    np.testing.assert_allclose(slope, difference, atol=1e-6)
+
+
+def test_a_resonance_narrower_than_the_lines_is_not_sure() -> None:
+    """It may encircle -1 between two lines; what the lines show of it is that the phase falls."""
+    whole = measured(None)
+    problem, kappa = loop(0, PID)
+    K = state_space(PID, PID.in_units(kappa, problem.plants.omega_0, problem.plants.force))
+    L = whole.G * K.response(HZ * whole.hz)[:, 0, 0]
+    i = int(np.flatnonzero(np.abs(L) > 0.3)[-1])
+    ends, omega = HZ * whole.hz[i : i + 2], HZ * whole.hz
+    at, half = float(ends.mean()), 0.5 * float(np.ptp(ends))
+    for width, sure in ((0.2, False), (20.0, True)):  # of the resonance, in half steps
+        zeta = width * half / at
+        mode = 6.0 * abs(whole.G[i]) * at * half / (at**2 - omega**2 + 2j * zeta * at * omega)
+        found = judge(MeasuredResponse(whole.hz, whole.G + mode), K, BOUNDS)
+        assert ("narrower than the lines" not in found.words) == sure, found.words
+        assert sure or not found.sure
+
+
+def test_what_the_data_do_not_show_is_said() -> None:
+    whole = measured(None)
+    problem, kappa = loop(0, PID)
+    P = problem.plants
+    K = state_space(PID, PID.in_units(kappa, P.omega_0, P.force))
+    assert judge(whole, K, BOUNDS).sure
+    cut = MeasuredResponse(whole.hz[whole.hz < 20.0], whole.G[whole.hz < 20.0])
+    assert "not small" in judge(cut, K, BOUNDS).words
+    high = MeasuredResponse(whole.hz[whole.hz > 40.0], whole.G[whole.hz > 40.0])
+    assert not judge(high, K, BOUNDS).sure
+    # An unstable pole that is told moves the count by as many.
+    assert judge(replace(whole, unstable_poles=2), K, BOUNDS).right_half_plane == 2
+
+
+def test_files_of_every_kind_hold_the_same_response(tmp_path: Path) -> None:
+    found = measured(None, 20)
+    hz, G = found.hz, found.G
+    angle = np.angle(G)
+    tables = {
+        "f_hz,re,im": (hz, G.real, G.imag),
+        "f_hz, magnitude, phase_deg": (hz, np.abs(G), np.rad2deg(angle)),
+        "# a comment\nf_hz,magnitude_db,phase_rad": (hz, 20.0 * np.log10(np.abs(G)), angle),
+    }
+    read = []
+    for number, (head, columns) in enumerate(tables.items()):
+        path = tmp_path / f"{number}.csv"
+        rows = [",".join(repr(float(v)) for v in row) for row in zip(*columns, strict=True)]
+        path.write_text("\n".join([head, *rows]) + "\n")
+        read.append(read_frequency_response(path))
+    savemat(tmp_path / "G.mat", {"f_hz": hz, "G": G})
+    read.append(read_frequency_response(tmp_path / "G.mat"))
+    np.savez(tmp_path / "G.npz", frequency_hz=hz, response=G)
+    read.append(read_frequency_response(tmp_path / "G.npz"))
+    read.append(from_control(control.FRD(G, HZ * hz)))
+    for one in read:
+        np.testing.assert_allclose(one.hz, hz, rtol=1e-12)
+        np.testing.assert_allclose(one.G, G, rtol=1e-10)
+
+
+def two_by_two(gain: float) -> MeasuredResponse:
+    """Two coupled channels with a lag and a mode each, at 1 kHz behind a hold."""
+    hz = np.geomspace(0.5, 490.0, 90)
+    s = HZ * 1j * hz
+    turn = np.array([[1.0, 0.2], [-0.15, 0.9]])
+    modes = [gain * k * w**2 / (s**2 + 0.8 * w * s + w**2) for k, w in ((1.0, 300.0), (0.8, 420.0))]
+    held = -np.expm1(-1e-3 * s) / (1e-3 * s)
+    G = held[:, None, None] * (turn @ (np.stack(modes, -1)[:, :, None] * np.linalg.inv(turn)))
+    return MeasuredResponse(hz, G)
+
+
+def test_two_channels_are_designed_on_two_responses_and_judged_apart(tmp_path: Path) -> None:
+    """Every bound on every line by NumPy alone, and the winding of det(I + GK)."""
+    plants, period = [two_by_two(1.0), two_by_two(1.25)], 1e-3
+    np.savez(tmp_path / "G.npz", f_hz=plants[0].hz, G=plants[0].G)
+    np.testing.assert_array_equal(read_frequency_response(tmp_path / "G.npz").G, plants[0].G)
+    bounds = replace(KEPT, S_max=1.7, S_low=0.9, omega_low=HZ, weights=None, weighted_level=None)
+    structure = Structure(lead=0, biquads=0, roll_off=1)
+    found = design_on_data(plants, structure, bounds, period=period, starts=2)
+    assert found.usable, found.words
+    assert found.controller is not None
+    K = found.controller
+    for one in plants:
+        s = 2j / period * np.tan(np.pi * one.hz * period)
+        k = K.C @ np.linalg.solve(s[:, None, None] * np.eye(len(K.A)) - K.A, K.B + 0j) + K.D
+        back = np.eye(2) + one.G @ k
+        S = np.linalg.norm(np.linalg.inv(back), 2, axis=(1, 2))
+        assert S.max() <= 1.7 * (1.0 + 1e-5)
+        assert S[HZ * one.hz <= found.bandwidth].max() <= np.sqrt(0.5) * (1.0 + 1e-4)
+        F = np.linalg.det(back)  # two integrators: from -180 deg to 0, an unstable loop to -360
+        grown = np.angle(F[1:] / F[:-1]).sum()
+        assert -np.pi + np.angle(-F[0]) + grown == pytest.approx(np.angle(F[-1]))
+    other = MeasuredResponse(plants[0].hz, plants[0].G[:, :1, :1])
+    with pytest.raises(UserError, match="different numbers of channels"):
+        design_on_data([plants[0], other], structure, bounds, period=period)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("f_hz,re\n1,2\n2,3\n3,4\n4,5\n5,6\n", "needs re and im"),
+        ("re,im\n1,2\n", "no column f_hz"),
+        ("f_hz,re,im\n1,2,x\n", "not a table of numbers"),
+        ("f_hz,re,im\n1,2,3\n2,3,4\n", "five lines"),
+        ("f_hz,re,im\n" + "1,2,3\n" * 6, "have to rise"),
+        ("", "not a table of numbers"),
+    ],
+)
+def test_mistakes_in_files(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "G.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=words):
+        read_frequency_response(path)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_frequency_response(tmp_path / "none.csv")
+
+
+def test_what_repeated_measurements_leave_open_is_in_the_bound_on_S(tmp_path) -> None:
+    """Every response within the spread of the mean stays below what is said of the mean."""
+    rng = np.random.default_rng(4)
+    hz = np.geomspace(1.0, 400.0, 300)
+    s = 1j * HZ * hz
+    G = (1.0 / (s + 5.0))[:, None, None] * np.array([[1.0, 0.1], [0.0, 0.8]])
+    spread = 0.05 * np.abs(G)
+    K = StateSpace(
+        -60.0 * HZ * np.eye(2), 60.0 * HZ * np.eye(2), 100.0 * np.eye(2), np.zeros((2, 2))
+    )
+    bounds = Bounds(S_max=10.0, S_low=2.0, omega_low=HZ)
+    plain, wide = (
+        judge(MeasuredResponse(hz, G, spread=one), K, bounds, integrator=False)
+        for one in (None, spread)
+    )
+    assert plain.stable
+    assert wide.S_peak == plain.S_peak
+    assert plain.S_between < wide.S_between < np.inf
+    for _ in range(50):
+        moved = G + spread * np.exp(2j * np.pi * rng.random(G.shape))
+        S = np.linalg.inv(np.eye(2) + moved @ K.response(HZ * hz))
+        assert np.linalg.norm(S, 2, axis=(1, 2)).max() <= wide.S_between
+    np.savez(tmp_path / "two.npz", f_hz=hz, G=G, spread=spread)
+    assert np.array_equal(read_frequency_response(tmp_path / "two.npz").spread, spread)
+    with pytest.raises(UserError, match="spread"):
+        MeasuredResponse(hz, G, spread=spread[:5])
