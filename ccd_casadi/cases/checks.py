@@ -128,6 +128,15 @@ def factors(value: Any) -> str | None:
     return f"is {shown(value)}; give a list of numbers above 0"
 
 
+@_with({"anyOf": [{"type": "number", "exclusiveMinimum": 0.0},
+                  _list({"type": "number", "exclusiveMinimum": 0.0}, 1)]})
+def one_or_more(value: Any) -> str | None:
+    several = value if isinstance(value, list | tuple) else [value]
+    if several and all(POSITIVE(item) is None for item in several):
+        return None
+    return f"is {shown(value)}; give a number above 0, or a list of them"
+
+
 @_with(_list({"type": "number"}, 2))
 def listed(value: Any) -> str | None:
     if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):

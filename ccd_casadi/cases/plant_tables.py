@@ -116,18 +116,21 @@ def _option(value: Any) -> str | None:
 
 
 def theta_tables(
-    table: Mapping[str, Any], model: str | None, fail: Callable[[str, str], Exception]
+    table: Mapping[str, Any],
+    model: str | None,
+    fail: Callable[[str, str], Exception],
+    motor: str = "",
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
     """[theta.NAME] of every parameter, searched ones and fixed ones.
 
-    Those that a model of the package needs, and no other.
+    Those that a model of the package needs, and no other but the size of a `motor`.
     """
     searched, fixed = parameters_of(table, fail)
     known = model_named(model)
     needed = None if known is None else known.theta
     if needed is not None:
         for name in table:
-            if name not in needed:
+            if name not in (*needed, motor):
                 raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
         for name in needed:
             if name not in table:

@@ -18,6 +18,7 @@ from ccd_casadi.codesign.design_entries import (
     controller_dict,
     figures_dict,
     loop_of_design,
+    move_entry,
 )
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response
@@ -152,6 +153,7 @@ def _design(
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
         **budget_entry(problem, theta, made.controller),
+        **move_entry(problem, theta, made.controller),
     }
     return figures.certified, answer, controller_dict(made.controller)
 

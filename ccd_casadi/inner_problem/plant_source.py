@@ -3,12 +3,14 @@
 import hashlib
 import importlib.util
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from typing import Any
 
+from ccd_casadi.analysis.driven_plant import with_motion
+from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
 from ccd_casadi.plants.plant import ModelFunction, Plant
@@ -21,7 +23,8 @@ from ccd_casadi.support.user_code import limited, require_user_code
 class PlantSource:
     """Where the model comes from: a known name or `file.py:function`, and its options.
 
-    `fixed`: parameters that are not in θ, each with value and unit.
+    `fixed`: parameters that are not in θ, each with value and unit. `motion`: the move that it is
+    for, and its motors.
     """
 
     model: str | None
@@ -31,6 +34,7 @@ class PlantSource:
     seconds: float = 60.0  # that a function may take; no part of what the plant is
     content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
     fixed: tuple[tuple[str, float, str], ...] = ()
+    motion: Motion | None = None
 
     @property
     def held(self) -> dict[str, float]:
@@ -60,6 +64,7 @@ class PlantSource:
             "source": digest,
             "options": options,
             **({"fixed": self.held} if self.fixed else {}),
+            **({"motion": asdict(self.motion)} if self.motion else {}),
         }
 
 
@@ -82,10 +87,26 @@ def plant_from(
     Raises UserError where the plant cannot be built, and UserCodeRefused where a user's function
     must not run.
     """
+    if source.motion is not None:
+        return _plant_with_motion(source.pinned(), names, lower, upper)
     if source.model is not None:
         return _shipped_plant(source, names)
     require_user_code(f"{source.file}:{source.function}")
     return _own_plant(source.pinned(), names, lower, upper)
+
+
+@lru_cache(maxsize=8)
+def _plant_with_motion(
+    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
+) -> Plant:
+    motion = source.motion
+    assert motion is not None
+    size = "" if motion.motor is None else motion.motor.size
+    kept = [i for i, name in enumerate(names) if name != size]
+    own = (tuple(values[i] for i in kept) for values in (names, lower, upper))
+    fixed = tuple(item for item in source.fixed if item[0] != size)
+    plant = plant_from(replace(source, motion=None, fixed=fixed), *own)  # type: ignore[arg-type]
+    return with_motion(plant, motion, names, source.held)
 
 
 @lru_cache(maxsize=8)

@@ -86,7 +86,7 @@ def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
     """
     n, m = G.B.shape
     whole, rest = parts(period, delay)
-    joint = np.zeros((n + m, n + m))
+    joint = np.zeros((n + m, n + m), np.result_type(G.A, G.B))
     joint[:n, :n], joint[:n, n:] = G.A, G.B
     late = expm(joint * (period - rest))[:n]
     gains = [np.zeros((n, m))] * whole + [late[:, n:]]

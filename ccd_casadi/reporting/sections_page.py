@@ -70,7 +70,8 @@ def binding_words(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[s
     mu, kink = result["controller"]["multipliers"], result["kkt"].get("kink")
     if kink is not None:  # at this θ they are not unique; with θ, which follows the kink, they are
         mu = kink["multipliers"]
-    gain = "raise ω_b" if problem.figure is BANDWIDTH else "lower the RMS error"
+    v = problem.figure
+    gain = "raise ω_b" if v is BANDWIDTH else f"lower the {v.words}"
     names = {"S_MAX": "the peak of S", "SHAPE": "the shape of S", "LEVEL": "-3 dB below ω_b",
              "S_LOW": "|S| at ω_low",
              "KS": "|W_KS KS|", "T": "|W_T T|", "GS": "the compliance"}  # fmt: skip
@@ -127,9 +128,10 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
     kkt = r["kkt"]["stationarity"]
     predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
     if problem.figure is not BANDWIDTH:
-        e, guess = (1e9 * r[key] for key in ("error_rms_of_set", "surrogate_error_rms"))
-        words = f"{number(e, 6)} nm over the set (predicted {number(guess, 6)})"
-        predicted = ("RMS error e", words)
+        v = problem.figure
+        value, guess = (v.shown(r[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}"))
+        predicted = (f"{v.words[0].upper()}{v.words[1:]} {v.symbol}",
+                     f"{value} over the set (predicted {guess})")  # fmt: skip
     return [
         ("Objective J", number(r["objective"], 7),
          f"{problem.w1:g} f(θ) + ({problem.w2:g}) {problem.figure.symbol}"),
