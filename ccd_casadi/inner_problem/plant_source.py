@@ -3,7 +3,7 @@
 import hashlib
 import importlib.util
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -64,7 +64,7 @@ class PlantSource:
             "source": digest,
             "options": options,
             **({"fixed": self.held} if self.fixed else {}),
-            **({"motion": asdict(self.motion)} if self.motion else {}),
+            **({"motion": repr(self.motion)} if self.motion else {}),
         }
 
 
