@@ -6,7 +6,7 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all:
 
-.PHONY: solve test tests test-processors lint docs bench peers setup setup-test clean
+.PHONY: solve test tests test-room test-processors lint docs bench peers setup setup-test clean
 
 solve: setup
 	$(BIN)/python -m ccd_casadi.solve runs/two_mass.toml
@@ -18,6 +18,10 @@ test: setup-test
 tests: setup-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 	$(BIN)/python benchmarks/processors.py --other
+
+# The room that one works in: `make test-room ROOM=kernels`, under a minute each.
+test-room: setup-test
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/$(ROOM)
 
 # The suite under the kernels that OpenBLAS has for other processors, three times each, with
 # examples drawn anew: an hour or more on two cores.

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path += [str(folder) for folder in (Path(__file__).parents[1] / "tests").iterdir()]
 
 from fixed_structure_loops import FAST, LATE, SLOW
 from test_error_budget import SHAPED, built, simulated
@@ -36,7 +36,7 @@ def main() -> None:
         source = (*SHAPED, *SHAPED)[number]
         made, _, _ = built(sampling, number, structures[number % 2])
         exact = variances(made, source, None).error
-        model = process(made.plant, made.controller, source, made.sampling)
+        model = process(made, source)
         mean, error = simulated(model, samples, number, 100)
         scores.append((mean - exact) / error)
         print(f"{sampling.rate_hz:6.0f} Hz {sampling.delay_us:4.0f} us  {source.name:20s} "

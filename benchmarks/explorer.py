@@ -48,7 +48,7 @@ WATCH = """([name, scale, figures]) => {
     }
   }
 }"""
-FIGURES = ["gain_S", "gain_KS", "gain_T", "nyquist", "step", "move"]
+FIGURES = ["S", "nyquist", "L", "phase", "KS", "T", "K", "G", "step", "move"]
 
 
 def main() -> None:
@@ -96,9 +96,7 @@ def drag(url: str, given: argparse.Namespace) -> tuple[list[float], int, float]:
         page = browser.new_page(viewport={"width": 1300, "height": 1000})
         page.set_default_timeout(400e3)
         page.goto(url)
-        page.wait_for_function(
-            "document.getElementById('verdict')?.textContent.length > 10",
-        )
+        page.wait_for_function("document.getElementById('verdict')?.textContent.length > 10")
         page.wait_for_timeout(2000.0 + 1e3 * given.wait)
         scale = page.evaluate(
             "name => { const d = Bokeh.documents[0], s = d.get_model_by_name(`theta_${name}`);"

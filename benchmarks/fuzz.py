@@ -2,7 +2,8 @@
 
 `python benchmarks/fuzz.py [--count 10000] [--seed 0] [--out FILE]` goes on from what the file
 holds, and sums it up in benchmarks/fuzz.json. `--only N` runs one input and shows what it prints.
-The inputs are made by tests/fuzz_inputs.py. Four fifths of the solves leave their pictures out.
+The inputs are made by tests/support/fuzz_inputs.py. Four fifths of the solves leave their pictures
+out.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path += [str(folder) for folder in (ROOT / "tests").iterdir()]
 DEADLINE = 120.0  # s for one input
 FRESH = 400  # inputs after which a process is exchanged for a new one
 MEMORY = 6 << 30  # bytes of address space of a process

@@ -1,4 +1,4 @@
-"""Twenty solves and their ends: tests/data/golden.json, which tests/test_golden.py compares.
+"""Twenty solves and their ends: tests/data/golden.json, which test_golden.py compares.
 
     python benchmarks/golden.py                # what is not there yet
     python benchmarks/golden.py --anew NAME    # these again, where an answer is meant to move
@@ -18,7 +18,7 @@ from typing import Any
 
 from processors import ROOT, available
 
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path += [str(folder) for folder in (ROOT / "tests").iterdir()]
 
 from kinds import kinds
 

@@ -1,7 +1,7 @@
 """Mutation testing of the numerical core: a seeded sample of mutants, and which the tests kill.
 
     python benchmarks/mutation.py --mutants 150 --seed 0
-    python benchmarks/mutation.py --survivors --tests tests/test_plant.py    # these again
+    python benchmarks/mutation.py --survivors --tests tests/plants/test_plant.py    # these again
 
 Each mutant is one changed operator, comparison, constant or condition in a copy of the sources;
 the tests of its group (`mutation_tests`) run on it until one fails, the cheapest first. Kernels

@@ -5,6 +5,9 @@ group does too, on more examples.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -21,20 +24,15 @@ def _kernels(*names: str) -> tuple[str, ...]:
     return tuple(f"ccd_casadi/kernels/{name}.py" for name in names)
 
 
-DESIGN_TESTS = tuple(
-    f"tests/test_{name}.py"
-    for name in (
-        "weights",
-        "kernel_parts",
-        "loop_gains",
-        "gamma_search",
-        "gamma_error",
-        "certificate",
-        "balance",
-        "synthesis",
-        "sensitivity",
-        "channels",
+def _tests(*names: str) -> tuple[str, ...]:
+    return tuple(
+        str(next((ROOT / "tests").rglob(f"test_{name}.py")).relative_to(ROOT)) for name in names
     )
+
+
+DESIGN_TESTS = _tests(
+    "weights", "kernel_parts", "loop_gains", "gamma_search", "gamma_error", "certificate",
+    "balance", "synthesis", "sensitivity", "channels",
 )
 DIFFERENCES = "two_mass_plant or both_limits or both_sides_agree"  # many syntheses each
 GROUPS = (
@@ -44,20 +42,19 @@ GROUPS = (
             "design", "refine", "small", "blocks", "riccati", "gamma", "synthesis", "balance",
             "figures",
         ),
-        (*DESIGN_TESTS, "tests/test_derivatives.py"),
+        DESIGN_TESTS + _tests("derivatives"),
         f"not every_two_mass and not flexible_plants_are_certified and not ({DIFFERENCES})",
         interpreted=True,
     ),
     Group(
         _kernels("gradients", "pullback", "bound_peak"),
-        ("tests/test_gradient_parts.py", "tests/test_derivatives.py", "tests/test_channels.py",
-         "tests/test_gamma_error.py"),
+        _tests("gradient_parts", "derivatives", "channels", "gamma_error"),
         "not both_limits",
         interpreted=True,
     ),
     Group(
         _kernels("limits", "sections", "modes", "loop_point", "loop_rows", "loop_curvature"),
-        ("tests/test_fixed_structure_loops.py", "tests/test_fixed_structure_channels.py"),
+        _tests("fixed_structure_loops", "fixed_structure_channels"),
         "derivatives or closed_in_on or crossing or moves_with or hessian_of_the_whole",
         interpreted=True,
     ),
@@ -69,9 +66,8 @@ GROUPS = (
                 "synthesis/weights", "synthesis/derivatives",
             )
         ),
-        (*DESIGN_TESTS, "tests/test_closed_loop.py", "tests/test_plant.py",
-         "tests/test_derivatives.py", "tests/test_backends.py", "tests/test_robust_design.py",
-         "tests/test_compliance.py"),
+        DESIGN_TESTS
+        + _tests("closed_loop", "plant", "derivatives", "backends", "robust_design", "compliance"),
         "not robust_co_design",
         interpreted=False,
     ),
@@ -80,7 +76,7 @@ GROUPS = (
             f"ccd_casadi/sampling/{n}.py"
             for n in ("keys", "rows", "store", "samples", "units", "sampler")
         ),
-        ("tests/test_samples.py", "tests/test_damaged_stores.py", "tests/test_sampling.py"),
+        _tests("samples", "damaged_stores", "sampling"),
         "",
         interpreted=False,
     ),

@@ -3,7 +3,7 @@
 OpenBLAS picks its kernels by the processor; OPENBLAS_CORETYPE overrules it, and last digits move.
 
     python benchmarks/processors.py                          # the whole suite, three times each
-    python benchmarks/processors.py --times 1 --kernels Haswell tests/test_balance.py
+    python benchmarks/processors.py --times 1 --kernels Haswell tests/kernels/test_balance.py
     python benchmarks/processors.py --other                  # CI: numerical tests, one other kernel
     python benchmarks/processors.py --times 1 --examples 10  # property tests, ten times as many
 

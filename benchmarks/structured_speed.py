@@ -32,7 +32,7 @@ DESIGN = ROOT / "benchmarks" / "rib_stage_design"
 
 def problems():
     """Name, problem, κ and τ of each set, κ stable on all its plants."""
-    sys.path[:0] = [str(Path(os.environ.get("PYTHONPATH", ROOT)) / "tests")]
+    sys.path[:0] = [str(Path(os.environ.get("PYTHONPATH", ROOT)) / "tests/support")]
     from fixed_structure_loops import FAST, loop
 
     from ccd_casadi.cases.case import load_case

@@ -5,9 +5,10 @@ chains of two or three masses with one or two parameters in a small box and solv
 command, as mixed sensitivity (alone, on a set, with a bound of the compliance, with disturbances)
 or sections (bandwidth, least RMS error; continuous, sampled, on a set), by `nested`, `lifted` or
 `direct`. `verdicts_judge`, which shares no code with the package, then looks at every claim of the
-run; tests/contradictions.py at its figures among each other. A run that is not verified, or found
-nothing, is solved again by another formulation: verified there at the same J, it is falsely not
-verified. What FILE holds already is not run again. One in twenty is a measured response.
+run; tests/support/contradictions.py at its figures among each other. A run that is not verified,
+or found nothing, is solved again by another formulation: verified there at the same J, it is
+falsely not verified. What FILE holds already is not run again. One in twenty is a measured
+response.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from verdicts_judge import HZ, Chain, Loop, wrong
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests/support"))
 from contradictions import contradictions
 
 SAME = 1e-6  # relative: two values of J that are one optimum

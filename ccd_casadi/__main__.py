@@ -15,28 +15,29 @@ from ccd_casadi.support.terminal import say
 
 # word -> the module of its `main`, and what it does
 COMMANDS = {
-    "check": ("ccd_casadi.check", "looks at a case's plant before anything is designed"),
-    "inner": ("ccd_casadi.inner", "the best controller at one theta, as JSON"),
-    "gap": ("ccd_casadi.gap", "what no controller at one theta can reach, as JSON"),
-    "tune": ("ccd_casadi.tune", "the fastest PID with notches for a plant that exists"),
-    "solve": ("ccd_casadi.solve", "designs stage and controller together, verifies, reports"),
-    "compare": ("ccd_casadi.compare", "every method side by side, steepest descent among them"),
-    "retrain": ("ccd_casadi.retrain", "adds true samples to a run where they help most"),
-    "insight": ("ccd_casadi.insight", "weight against bandwidth; what the optimum answers to"),
+    "check": ("ccd_casadi.check", "examine a case's plant before anything is designed"),
+    "inner": ("ccd_casadi.inner", "find the best controller at one theta, as JSON"),
+    "gap": ("ccd_casadi.gap", "bound what any controller reaches at one theta, as JSON"),
+    "tune": ("ccd_casadi.tune", "find the fastest PID with notches for a plant that exists"),
+    "solve": ("ccd_casadi.solve", "design stage and controller together, verify, report"),
+    "compare": ("ccd_casadi.compare", "run every method on a case, side by side"),
+    "worth": ("ccd_casadi.worth", "estimate in seconds what co-design gains"),
+    "retrain": ("ccd_casadi.retrain", "add true samples to a run where they help most"),
+    "insight": ("ccd_casadi.insight", "trade hardware cost against bandwidth"),
     "explore": ("ccd_casadi.explore", "drag the hardware and see the certified loop move"),
-    "robustness": ("ccd_casadi.robustness", "what a run's design survives"),
-    "deploy": ("ccd_casadi.deploy", "a run's controller sampled, as C, .mat and structured text"),
-    "report": ("ccd_casadi.report", "draws the pages of a finished folder again"),
-    "cross_check": ("ccd_casadi.cross_check", "one synthesis by every back end"),
-    "imported": ("ccd_casadi.imported", "a modal table from result files; also: ccd import"),
+    "robustness": ("ccd_casadi.robustness", "find what a run's design survives"),
+    "deploy": ("ccd_casadi.deploy", "write a run's controller as C, .mat and structured text"),
+    "report": ("ccd_casadi.report", "draw the pages of a finished folder again"),
+    "cross_check": ("ccd_casadi.cross_check", "compare one synthesis by every back end"),
+    "imported": ("ccd_casadi.imported", "make a modal table from result files; also: ccd import"),
 }
 ALIASES = {"import": "imported"}
 TEMPLATE = ("plant.py", "case.toml")
 SCHEMA = "case.schema.json"
 OWN = {
-    "new": "a plant and a case to begin with, in a folder of that name",
-    "keys": "every table and key of a case file, as Markdown",
-    "schema": "the same as JSON Schema, for an editor; with --result that of result.json",
+    "new": "write a plant and a case to begin with into a new folder",
+    "keys": "list every table and key of a case file, as Markdown",
+    "schema": "print them as JSON Schema; with --result that of result.json",
 }
 
 

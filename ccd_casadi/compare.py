@@ -34,23 +34,13 @@ def table(comparison: "Comparison") -> str:
 
 def command(options: argparse.Namespace) -> ExitCode:
     """The command itself."""
-    from ccd_casadi.cases.case import load_case
-    from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.toml_writer import case_to_toml
-    from ccd_casadi.inner_problem.problem import plant_of
-    from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth
     from ccd_casadi.sampling.cluster import pool
+    from ccd_casadi.studies.baselines import case_to_compare
     from ccd_casadi.studies.comparison import compare, comparison_dict
-    from ccd_casadi.support.errors import UserError
     from ccd_casadi.support.json_files import write_json
 
-    case = load_case(options.case)
-    problem = problem_of(case)
-    require_bandwidth(problem, "compare")
-    for name, _ in problem.listed:
-        words = "compare needs a range; give fixed, as the case.toml of a finished solve does"
-        raise UserError(f"{options.case}: theta.{name}.values: {words}")
-    plant_of(problem)
+    case, problem = case_to_compare(options.case, "compare")
     out = options.out or options.case.with_name(options.case.stem + "_compare")
     folder = run_folder(options.case, out)
     with pool(options.scheduler, options.workers, PATIENCE) as workers:
@@ -75,7 +65,7 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.compare", "Every method on one case.")
+    arguments = parser("ccd_casadi.compare", "Run every method on one case, side by side.")
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.studies.comparison"])
 

@@ -151,15 +151,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         "One synthesis by every back end; CASE.toml may also be the folder of a finished solve.",
         without_effect=["--seed"],
     )
-    arguments.add_argument("--theta", metavar="m1=60,m2=60", help="with a case file")
+    arguments.add_argument("--theta", metavar="m1=60,m2=60", help="the hardware, with a case file")
     for name in ("S", "T"):
         arguments.add_argument(
             f"--omega-{name.lower()}-hz", dest=f"omega_{name}_hz", type=positive, metavar="X",
-            help="with the other one; without both the best pair at theta, or the run's",
+            help="a pair (default: the best at theta, or the run's)",
         )  # fmt: skip
     arguments.add_argument(
         "--limit", type=positive, default=60.0, metavar="SECONDS",
-        help="for each optional back end (default: 60)",
+        help="time limit of each optional back end (default: 60)",
     )  # fmt: skip
     needs = ["ccd_casadi.codesign.result", "ccd_casadi.synthesis.backends.mixed"]
     return run(command, arguments, argv, needs=needs)

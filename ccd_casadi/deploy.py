@@ -91,6 +91,7 @@ def command(options: argparse.Namespace) -> ExitCode:
             folder / FMU_FILE, found.realisation, texts, str(naming["title"])
         ):
             say("note: no C compiler here (cc, or CC): the FMU has its sources alone", sys.stderr)
+    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     if not options.quiet:
         say(_summary(finished, found))
         if moved is not None:
@@ -98,11 +99,8 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
 
-    finished = told(finished, folder, "deployable", deployed_line(finished, found))
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
-    if not options.quiet and page.head.decision:
-        say(f"decision      {page.head.decision}")
     if not options.quiet:
         say(f"page          {folder / 'report.html'}")
     if found.passed:
@@ -115,6 +113,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
     from ccd_casadi.deployment.words import against, status_words
     from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.reporting.verdict import advice
 
     full, small, sampled, measured = (
         run.figures, found.reduced_figures, found.sampled, found.measured,
@@ -125,6 +124,7 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
         orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
+        *([("decision", advice(run.result))] if advice(run.result) else []),
         ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
         ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
         ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),
@@ -187,15 +187,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     arguments.add_argument(
         "--rate-hz", metavar="X", type=positive,
-        help="sampling rate (default: the next round one above what is needed)",
+        help="sampling rate (default: the next round rate above what is needed)",
     )  # fmt: skip
     delay = arguments.add_mutually_exclusive_group()
     delay.add_argument(
-        "--delay", metavar="SECONDS", type=number(), help="from reading y to the new u, in s"
+        "--delay", metavar="SECONDS", type=number(), help="time from reading y to the new u, in s"
     )
     delay.add_argument(
         "--delay-samples", metavar="X", type=number(), default=Timing.delay_samples,
-        help="the same in sampling periods (default: 1)",
+        help="the same time in sampling periods (default: 1)",
     )  # fmt: skip
     arguments.add_argument(
         "--method", choices=["auto", *Discretisation], default="auto",
@@ -203,11 +203,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     arguments.add_argument(
         "--lead", choices=list(LEADS), default="auto",
-        help="a lead that makes up for hold and delay (default: where it lowers the rate)",
+        help="a lead that compensates hold and delay (default: if it lowers the rate)",
     )  # fmt: skip
     arguments.add_argument(
         "--unverified", action="store_true",
-        help="go on with a run that is not verified; its controller is never called so",
+        help="deploy a run that is not verified; the result is not verified either",
     )  # fmt: skip
     arguments.add_argument(
         "--saturation", metavar="NEWTON", type=positive,

@@ -59,10 +59,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         without_effect=["--workers", "--seed", "--no-user-code"],
     )
     arguments.add_argument(
-        "--modes", type=whole(1), default=10, metavar="N", help="of matrices: 10"
+        "--modes", type=whole(1), default=10, metavar="N", help="modes of matrices (default: 10)"
     )
     arguments.add_argument(
-        "--static-correction", action="store_true", help="of matrices: exact static compliance"
+        "--static-correction", action="store_true", help="exact static compliance of matrices"
     )
     return run(command, arguments, argv, needs=["ccd_casadi.plants.imported.results"])
 

@@ -65,11 +65,13 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = run_parser(
-        "ccd_casadi.insight", "Weight against bandwidth, and what the optimum answers to."
-    )
+    arguments = run_parser("ccd_casadi.insight", "Hardware cost against bandwidth around a design.")
     arguments.add_argument(
-        "--points", metavar="N", type=whole(2, 9999), default=20, help="of the front (default: 20)"
+        "--points",
+        metavar="N",
+        type=whole(2, 9999),
+        default=20,
+        help="points on the front (default: 20)",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.insight"])

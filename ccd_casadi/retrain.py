@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )  # fmt: skip
     add = arguments.add_argument
     add("--budget", metavar="N", type=whole(1), default=500,
-        help="syntheses that retraining may add in all (default: 500)")  # fmt: skip
+        help="most syntheses that retraining adds in total (default: 500)")  # fmt: skip
     add("--tolerance", metavar="X", type=number(1e-12, 0.5),
         help="relative agreement of prediction and truth (default: the case's)")  # fmt: skip
     add_scheduler(arguments)

@@ -87,25 +87,25 @@ PERCENT = number(0.0, 50.0, strict=True)
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
     arguments = run_parser(
-        "ccd_casadi.robustness", "Margins, plants off the model, noise and a move of a design."
+        "ccd_casadi.robustness", "Margins, uncertain plants, noise and a move of a design."
     )
     add = arguments.add_argument
     words = "judge this controller, not the run's: .json, .mat or .toml, see docs/robustness.md"
     add("--controller", type=Path, metavar="FILE", help=words)
-    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="of resonances; default 5")
+    add("--shift", type=PERCENT, default=5.0, metavar="PERCENT", help="resonance shift; default 5")
     add("--damping", type=positive, nargs=2, default=[0.5, 2.0], metavar=("LOW", "HIGH"),
-        help="factors of the damping; default 0.5 2")  # fmt: skip
+        help="range of factors of the damping; default 0.5 2")  # fmt: skip
     add("--tolerance", type=PERCENT, default=1.0, metavar="PERCENT",
-        help="of every hardware parameter; default 1")  # fmt: skip
+        help="tolerance of every hardware parameter; default 1")  # fmt: skip
     add("--samples", type=whole(1), default=200, metavar="N",
-        help="of random hardware; default 200")  # fmt: skip
-    add("--noise", type=positive, default=1.0, metavar="X", help="sensor, m/√Hz; default 1")
+        help="number of random sets of hardware; default 200")  # fmt: skip
+    add("--noise", type=positive, default=1.0, metavar="X", help="sensor noise, m/√Hz; default 1")
     add("--disturbance", type=positive, default=1.0, metavar="X",
-        help="force at every actuator, N/√Hz; default 1")  # fmt: skip
+        help="density of the force at every actuator, N/√Hz; default 1")  # fmt: skip
     add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
     add_move_options(arguments)
     add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
-        help=f"for the structured singular value; default {LIMIT:g}")  # fmt: skip
+        help=f"time limit of the structured singular value; default {LIMIT:g}")  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 

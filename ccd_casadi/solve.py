@@ -10,7 +10,7 @@ from ccd_casadi.codesign import FORMULATIONS
 from ccd_casadi.support.command_line import ExitCode, add_scheduler, parser, run, run_folder
 from ccd_casadi.support.process_pool import PATIENCE
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import counted
+from ccd_casadi.support.units import counted, shown
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.sections import Case
@@ -130,8 +130,8 @@ def _gains(controller: Mapping[str, Any]) -> str:
     """`4.7e+05 N/m`, of several channels `z: 4.7e+05 N/m, tip: …`."""
     channels = controller.get("channels")
     if channels is None:
-        return f"{controller['gain']:.4g} N/m"
-    return ", ".join(f"{item['name']}: {item['gain']:.4g} N/m" for item in channels)
+        return shown(controller["gain"], "N/m", 4)
+    return ", ".join(f"{item['name']}: {shown(item['gain'], 'N/m', 4)}" for item in channels)
 
 
 def inner_value_lines(result: Mapping[str, Any]) -> list[str]:
@@ -247,16 +247,16 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point."""
-    arguments = parser("ccd_casadi.solve", "Co-design a stage and its controller; see the README.")
+    arguments = parser("ccd_casadi.solve", "Design a stage and its controller together.")
     arguments.add_argument(
         "--formulation",
         choices=FORMULATIONS,
-        help="default: nested; direct where that is slow, as with many parameters",
+        help="default: nested, or direct with many parameters or lists",
     )
     arguments.add_argument(
         "--resume",
         action="store_true",
-        help="say what the run folder holds already; every run goes on from that",
+        help="print what the run folder holds; every run continues from it",
     )
     arguments.add_argument(
         "--surrogate",
@@ -266,7 +266,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.add_argument(
         "--no-report",
         action="store_true",
-        help="write no report: for jobs whose result.json is read by a program",
+        help="write no pages, for jobs that only need result.json",
     )
     add_scheduler(arguments)
     return run(command, arguments, argv, needs=["ccd_casadi.codesign.run"])

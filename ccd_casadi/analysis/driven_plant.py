@@ -12,12 +12,12 @@ import numpy as np
 
 from ccd_casadi.analysis.motor import Motion, MotionAt, motion_at
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.plants.fixed import through
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
-from ccd_casadi.support.process_pool import Pool
 
 REMEMBERED = 64  # θ whose figures are kept
 
@@ -70,36 +70,15 @@ def with_motion(
     def of(evaluate: Evaluate) -> Moved:
         return Moved(evaluate, motion, place, fixed)
 
-    own = of(plant.evaluate)
-    nearby, domain = plant.nearby, plant.domain
-
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert nearby is not None
-        return of(nearby(own.own(theta), reach, pool))
-
-    if domain is not None and place is not None:
-        assert motor is not None
+    own, domain = of(plant.evaluate), plant.domain
+    if domain is not None and motor is not None and place is not None:
         ends = (motor.moving_mass[0], motor.moving_mass[-1])
-        domain = tuple(np.insert(d, place, end) for d, end in zip(domain, ends, strict=True))  # type: ignore[assignment]
-    shapes, drawing = plant.shapes, plant.drawing
+        domain = (np.insert(domain[0], place, ends[0]), np.insert(domain[1], place, ends[1]))
     hardware, limited = _hardware(plant, own, names)
-    return replace(
-        plant,
-        names=tuple(names),
+    return through(
+        plant, of, own.own, names=tuple(names), evaluate=own, hardware=hardware, domain=domain,
         constraint_names=(*plant.constraint_names, *limited),
-        evaluate=own,
-        hardware=hardware,
-        exact_hessian=plant.exact_hessian and motor is None,
-        references={name: of(closer) for name, closer in plant.references.items()},
-        values=None if plant.values is None else of(plant.values),
-        notes=lambda theta: plant.notes(own.own(theta)),
-        nearby=None if nearby is None else near,
-        domain=domain,
-        doubt=lambda theta: plant.doubt(own.own(theta)),
-        shapes=None if shapes is None else lambda theta, count: shapes(own.own(theta), count),
-        drawing=None if drawing is None else lambda thetas: drawing(
-            {name: own.own(theta) for name, theta in thetas.items()}
-        ),
+        exact_hessian=plant.exact_hessian and not limited,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from ccd_casadi.lti.grid import around, climbed, frequency_grid, light, local_ma
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
 
 POINTS = 500  # of the frequency grid, besides those around lightly damped poles and zeros
 # In half widths of a resonance, in even steps of its phase: its circle in a Nyquist plot is round.
@@ -80,6 +81,11 @@ class LoopView:
         return f"|{name}|" if self.scalar else f"σ_max({name})"
 
     @cached_property
+    def margins(self) -> ClassicalMargins:
+        """The least on the model, of its loops broken one at a time at the plant's inputs."""
+        return least_margins(self.loop.responses, HZ * self.hz)
+
+    @cached_property
     def shares(self) -> Array:
         """The largest gain of any plant over its bound (3, k)."""
         return np.asarray(self.sizes[:3].max(axis=1) / self.bounds)
@@ -92,17 +98,17 @@ def loop_view(
     bandwidth_hz: float,
     label: str = "",
     points: int = POINTS,
-    peaks: bool = True,
-    special: Sequence[float] = (),
+    peaks: tuple[tuple[float, float], ...] | None = None,
 ) -> LoopView:
     """The loops of one controller on plants in SI, the model first, on one grid.
 
     It reaches from below ω_low and ω_b to beyond the modes, of a sampled loop to half its rate,
-    and is fine around light poles and zeros of every plant and of K, with `special` ones in Hz.
+    and is fine around light poles and zeros of every plant and of K, with `peaks`: local maxima of
+    σ_max(S) on the model that are known; by default they are searched.
     """
     model = loops[0]
     poles, zeros = (_hz(of) for of in (model.plant.poles, model.plant.zeros(_unit(model))))
-    found = peaks_of(model) if peaks else ()
+    found = peaks_of(model) if peaks is None else peaks
     tops = [hz for hz, gain in found if gain > 1.05]
     low = min(bounded.low_hz, bandwidth_hz / 10.0) / 5.0
     high = max([20.0 * bandwidth_hz, *(3.0 * hz for hz in (*poles[:12], *tops))])
@@ -111,7 +117,7 @@ def loop_view(
     roots = [light(loop.plant.poles) for loop in loops]
     roots += [light(model.controller.rates), light(model.plant.zeros(_unit(model)))]
     near = around(np.concatenate(roots), FLANKS) / HZ
-    places = np.array([*poles, *zeros, bandwidth_hz, *special, *(hz for hz, _ in found)])
+    places = np.array([*poles, *zeros, bandwidth_hz, *(hz for hz, _ in found)])
     hz = frequency_grid(low, high, points, near, places, apart=SAME)
     sizes, opened, first = [], [], None
     for loop in loops:

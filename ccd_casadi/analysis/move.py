@@ -129,17 +129,6 @@ def mass_feedforward(modal: ModalPlant, axis: int) -> Array | None:
     return forces if np.allclose(R @ forces, wanted, rtol=0.0, atol=1e-6) else None
 
 
-def free_plant(modal: ModalPlant) -> StateSpace:
-    """q̈ + D q̇ + K q = B u, y = C q with states [q; q̇], in SI."""
-    n, m, p = len(modal.K), modal.B.shape[1], len(modal.C)
-    return StateSpace(
-        np.block([[np.zeros((n, n)), np.eye(n)], [-modal.K, -modal.D]]),
-        np.vstack([np.zeros((n, m)), modal.B]),
-        np.hstack([modal.C, np.zeros((p, n))]),
-        np.zeros((p, m)),
-    )
-
-
 def moves(
     suspended: Sequence[Loop],
     free: Sequence[Loop],

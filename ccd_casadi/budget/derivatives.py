@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ccd_casadi.budget.evaluation import is_stable
-from ccd_casadi.budget.frequency import integrated, responses, sampled_plant
-from ccd_casadi.budget.loops import Disturbed, Process, closed, disturbed
+from ccd_casadi.budget.frequency import integrated, responses
+from ccd_casadi.budget.loops import FORCES, Disturbed, Process, closed, disturbed
 from ccd_casadi.budget.lyapunov import covariance, weighted_slopes
 from ccd_casadi.budget.moving_average import average_gain, average_matrix, average_slope
 from ccd_casadi.budget.sources import ErrorBudget, Kind, Source
-from ccd_casadi.lti.hold import tustin
+from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
@@ -51,11 +50,11 @@ def variance_slopes(
     loop: Loop, budget: ErrorBudget, changes: Sequence[Change]
 ) -> VarianceSlopes | None:
     """The variances of a loop under all sources, and their derivatives; None if it is unstable."""
-    if not is_stable(loop):
+    if not loop.stable:
         return None
     value, gradient = np.zeros(3), np.zeros((3, len(changes)))
     for source in budget.sources:
-        own = _of_filter if source.shaped else _of_table
+        own = of_filter if source.shaped else _of_table
         found = own(loop, source, budget.window, changes)
         value, gradient = value + found[0], gradient + found[1]
     return VarianceSlopes(value, gradient)
@@ -66,9 +65,10 @@ def rms_error_slope(found: VarianceSlopes) -> tuple[float, Array]:
     return 0.5 * float(np.log(found.value[0])), 0.5 * found.gradient[0] / found.value[0]
 
 
-def _of_filter(
+def of_filter(
     loop: Loop, source: Source, window: float | None, changes: Sequence[Change]
 ) -> tuple[Array, Array]:
+    """As `VarianceSlopes`, of one shaped source in a stable loop, by Lyapunov's equation."""
     plant = disturbed(loop.plant, source, loop.sampling)
     model = closed(plant, loop.controller)
     scale = model.scales()
@@ -132,6 +132,7 @@ def _of_table(
     averaging = weight(hz)
     at = responses(loop, hz)
     H_e, H_u = at.of(source.kind)
+    seen = at.seen(source.kind)
     density = source.density(hz) * weights
     error, force = ((np.abs(H) ** 2).sum((1, 2)) for H in (H_e, H_u))
     value = np.array([density @ error, (density * averaging) @ error, density @ force])
@@ -140,15 +141,11 @@ def _of_table(
     for i, change in enumerate(changes):
         dG, dK, dfree = moving.of(change)
         dS = -at.S @ (dG @ at.K + at.G @ dK) @ at.S
-        if source.kind in (Kind.FORCE, Kind.FLOOR_MOTION):
-            d_e = -dS @ at.free - at.S @ dfree
-            d_u = dK @ H_e + at.K @ d_e
-        elif source.kind is Kind.SETPOINT:
-            d_e, d_u = dS, dK @ at.S + at.K @ dS
-        else:
-            d_e, d_u = -dS, -dK @ at.S - at.K @ dS
-        slope = 2.0 * (H_e.conj() * d_e).real.sum((1, 2))
-        other = 2.0 * (H_u.conj() * d_u).real.sum((1, 2))
+        d = dS if source.kind is Kind.SETPOINT else -dS
+        if source.kind in FORCES:
+            d = -dS @ at.free - at.S @ dfree
+        slope = 2.0 * (H_e.conj() * d).real.sum((1, 2))
+        other = 2.0 * (H_u.conj() * (dK @ seen + at.K @ d)).real.sum((1, 2))
         gradient[:, i] = density @ slope, (density * averaging) @ slope, density @ other
     return value, gradient
 
@@ -170,8 +167,9 @@ class _ResponseChanges:
         dG = dK = dfree = np.zeros((len(self.hz), 1, 1))
         if change.plant is not None:
             G = _stepped(self.loop.plant, change.plant)
-            dfree = self._change("free", G, 1j * HZ * self.hz)
-            dG = dfree if hold is None else self._change("G", sampled_plant(G, hold), self.s)
+            dG = dfree = self._change("free", G, 1j * HZ * self.hz)
+            if hold is not None:
+                dG = self._change("G", sampled(G, hold.period, hold.delay), self.s)
         if change.controller is not None:
             K = _stepped(self.loop.controller, change.controller)
             dK = self._change("K", K if hold is None else tustin(K, hold.period), self.s)

@@ -5,13 +5,13 @@ filter's densities are integrated too, the two have to agree: `disagreement`.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from ccd_casadi.budget.derivatives import of_filter
 from ccd_casadi.budget.frequency import integrated
-from ccd_casadi.budget.loops import process
-from ccd_casadi.budget.lyapunov import covariance
-from ccd_casadi.budget.moving_average import average_gain, average_matrix
+from ccd_casadi.budget.moving_average import average_gain
 from ccd_casadi.budget.sources import ErrorBudget, Source
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
@@ -20,8 +20,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
 
-@dataclass(frozen=True)
-class Variances:
+class Variances(NamedTuple):
     """σ² of error (m²), of its moving average over the window (NaN without one), of force (N²)."""
 
     error: float
@@ -85,7 +84,7 @@ def evaluate_budget(
     if np.any(G.D):
         raise UserError("the plant of an error budget has no feedthrough")
     loop = Loop(G, K, hold)
-    if not is_stable(loop):
+    if not loop.stable:
         return None
     found = tuple(_figures(loop, source, budget.window) for source in budget.sources)
 
@@ -97,25 +96,9 @@ def evaluate_budget(
     )
 
 
-def is_stable(loop: Loop) -> bool:
-    """Whether all poles of the loop are; a sampled one's by their logarithms."""
-    return bool((loop.poles.real < 0.0).all())
-
-
 def variances(loop: Loop, source: Source, window: float | None) -> Variances:
     """σ² of a shaped source by Lyapunov's equation, exactly; of a stable loop."""
-    model = process(loop.plant, loop.controller, source, loop.sampling).balanced()
-    P = covariance(model.A, model.noise, sampled=model.sampled)
-    error = np.trace(model.C @ P @ model.C.T)
-    force = np.trace(model.F @ P @ model.F.T) + (model.V**2).sum()
-    average = np.nan
-    if window is not None:
-        F = average_matrix(model.A, window, loop.period)
-        average = float(np.trace(model.C @ F @ P @ model.C.T))
-    return Variances(
-        np.inf if model.infinite_error else float(error), average,
-        np.inf if model.infinite_force else float(force),
-    )  # fmt: skip
+    return Variances(*map(float, of_filter(loop, source, window, ())[0]))
 
 
 def _figures(loop: Loop, source: Source, window: float | None) -> SourceFigures:

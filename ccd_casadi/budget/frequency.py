@@ -12,27 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ccd_casadi.budget.holding import held
-from ccd_casadi.budget.loops import process
+from ccd_casadi.budget.loops import FORCES, process
 from ccd_casadi.budget.quadrature import Integral, integrate
 from ccd_casadi.budget.sources import Kind, Source
 from ccd_casadi.lti.closed_loop import sensitivity
-from ccd_casadi.lti.grid import around
-from ccd_casadi.lti.hold import Sampling, delayed
+from ccd_casadi.lti.grid import around, frequency_grid
 from ccd_casadi.lti.loop import Loop
-from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
 LOWEST, HIGHEST = 1e-9, 1e4  # of what is white: over the slowest and the fastest pole
 PER_DECADE = 6  # panels at least, so that a curve is drawn through their ends
 FLANKS = np.array([-10.0, -3.0, -1.0, 1.0, 3.0, 10.0])  # in half widths of a root
-
-
-def sampled_plant(G: StateSpace, hold: Sampling) -> StateSpace:
-    """The plant behind hold and delay at its samples; states [x; u_{k-1}; …]."""
-    change, gains = held(G.A, G.B, hold)
-    return delayed(np.eye(len(G.A)) + change, gains, G.C, hold.period)
 
 
 @dataclass(frozen=True)
@@ -44,15 +35,17 @@ class Responses:
     free: np.ndarray
     S: np.ndarray
 
+    def seen(self, kind: Kind) -> np.ndarray:
+        """What of a source the controller reads."""
+        if kind in FORCES:
+            return -self.S @ self.free
+        return self.S if kind is Kind.SETPOINT else -self.S
+
     def of(self, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
         """H_e and H_u of a source."""
-        if kind in (Kind.FORCE, Kind.FLOOR_MOTION):
-            error = -self.S @ self.free
-            return error, self.K @ error
-        if kind is Kind.SETPOINT:
-            return self.S, self.K @ self.S
-        one = np.eye(self.S.shape[1])
-        return one - self.S, -self.K @ self.S
+        seen = self.seen(kind)
+        true = np.eye(seen.shape[1]) + seen if kind is Kind.SENSOR_NOISE else seen
+        return true, self.K @ seen
 
 
 def responses(loop: Loop, hz: Array) -> Responses:
@@ -78,7 +71,7 @@ def densities(loop: Loop, source: Source) -> Callable[[Array], Array]:
 
 def _folded(loop: Loop, source: Source, T: float) -> Callable[[Array], Array]:
     """The densities of the samples below half the rate, with all that is folded into them."""
-    model = process(loop.plant, loop.controller, source, loop.sampling).balanced()
+    model = process(loop, source).balanced()
 
     def at(hz: Array) -> Array:
         z = np.expm1(1j * HZ * hz * T)
@@ -111,11 +104,9 @@ def panels(loop: Loop, source: Source) -> Array:
             low = min(low, 1e-6 * high)
     else:
         low, high = corners[0], corners[-1]
-    steps = np.geomspace(low, high, 2 + int(PER_DECADE * np.log10(high / low)))
-    joint = np.concatenate([[low, high], steps, corners, sizes, around(roots, FLANKS)])
-    joint = np.unique(joint[(joint >= low) & (joint <= high)])
-    apart = np.concatenate([[True], np.diff(joint) > 1e-9 * joint[1:]])
-    return np.asarray(joint[apart] / HZ)
+    points = 2 + int(PER_DECADE * np.log10(high / low))
+    special = (corners, sizes, around(roots, FLANKS))
+    return np.asarray(frequency_grid(low, high, points, *special, apart=1e-9) / HZ)
 
 
 def integrated(loop: Loop, source: Source, weight: Callable[[Array], Array]) -> Integral:

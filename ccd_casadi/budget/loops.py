@@ -3,29 +3,33 @@
     ẋ = A x + w                x_{k+1} = (1 + A) x_k + w_k
     e = C x,   u = F x + v
 
-x holds the plant, the controller, the source's filter, and of a sampled loop the forces that are
-under way (`holding`). Sampled, e is the error at the samples, and white sensor noise that of the
-samples: its density counts up to half the rate. The controller is converted by Tustin's rule
-without prewarping. Everything is analytic in the matrices of plant and controller.
+x holds the plant, of a sampled loop the forces that are under way, the controller, and the source's
+filter. Sampled, e is the error at the samples, and white sensor noise that of the samples: its
+density counts up to half the rate. The controller runs by Tustin's rule without prewarping. A loop
+of changes over a period is that of the changes of plant and controller: transitions would lose the
+digits of slow poles next to 1. Everything is analytic in the matrices of both, so that a step along
+the imaginary axis gives derivatives to rounding (Squire and Trapp 1998).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.linalg import matrix_balance
+from scipy.linalg import expm, matrix_balance
 
-from ccd_casadi.budget.holding import Matrix, held, noise_of_a_period, over, stacked, tustin_change
 from ccd_casadi.budget.sources import Kind, Source
-from ccd_casadi.lti.closed_loop import closed_matrix
-from ccd_casadi.lti.hold import Sampling, tustin
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import Sampling, delayed, parts, tustin
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 
 FORCES = (Kind.FORCE, Kind.FLOOR_MOTION)
+Matrix = np.ndarray[Any, Any]  # real, or complex with a step along the imaginary axis
 
 
 @dataclass(frozen=True)
 class Process:
-    """A (n, n), Q (n, n), C (p, n), F (m, n), and what is white at the samples: E (n, q), V (m, q).
+    """A (n, n), Q (n, n), C (p, n), F (m, n), and what is white: E (n, q), V (m, q).
 
         cov w = Q + E E',   v = V ν,   w = E ν + …
 
@@ -38,9 +42,9 @@ class Process:
     F: Matrix
     E: Matrix
     V: Matrix
-    sampled: bool = False
-    infinite_error: bool = False
-    infinite_force: bool = False
+    sampled: bool
+    infinite_error: bool
+    infinite_force: bool
 
     @property
     def noise(self) -> Matrix:
@@ -70,21 +74,20 @@ class Process:
 
 @dataclass(frozen=True)
 class Disturbed:
-    """A plant with a source: all of its process that no controller changes.
+    """A plant with a source, as they run: all of its process that no controller changes.
 
-    `system` is the plant with the filter of a force among its states, `filter` that of noise or
-    setpoint. Sampled: `change` and `gains` of `system` over a period and `noise` (Q) of it, and
-    the same of the filter; without a hold those are empty.
+    Sampled, A of `plant` and `filter` are changes over a `period`. `plant` has the filter of a
+    force among its states; `filter` is that of noise or setpoint. The states that the source
+    drives, the first of the plant's or the filter's, have `noise` (Q) of a period, or in continuous
+    time `enters` (E).
     """
 
     kind: Kind
-    hold: Sampling | None
-    system: StateSpace
+    period: float | None
+    plant: StateSpace
     filter: StateSpace
-    change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
-    gains: tuple[Matrix, ...] = ()
-    noise: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
-    filter_change: Matrix = field(default_factory=lambda: np.zeros((0, 0)))
+    noise: Matrix
+    enters: Matrix
 
 
 def disturbed(G: StateSpace, source: Source, hold: Sampling | None) -> Disturbed:
@@ -97,78 +100,88 @@ def disturbed(G: StateSpace, source: Source, hold: Sampling | None) -> Disturbed
     is_force = source.kind in FORCES
     own, each = source.shaping(), np.eye(G.B.shape[1] if is_force else len(G.C))
     f = StateSpace(*(np.asarray(np.kron(each, getattr(own, name)), float) for name in "ABCD"))
+    driven, W = f, f.B
+    if is_force:
+        none = np.zeros((len(f.A), len(G.A) + G.B.shape[1]))
+        W = np.vstack([G.B @ f.D, f.B])
+        G = driven = StateSpace(
+            np.block([[G.A, G.B @ f.C], [none[:, : len(G.A)], f.A]]),
+            np.vstack([G.B, none[:, len(G.A) :]]),
+            np.hstack([G.C, np.zeros((len(G.C), len(f.A)))]),
+            G.D,
+        )
     if hold is None:
-        return Disturbed(source.kind, None, G, f)
+        return Disturbed(source.kind, None, G, f, 0.0 * driven.A, W / np.sqrt(2.0))
     T = hold.period
-    if not is_force:
-        change, gains = held(G.A, G.B, hold)
-        return Disturbed(source.kind, hold, G, f, change, tuple(gains),
-                         noise_of_a_period(f.A, f.B, T), over(f.A, T)[0])  # fmt: skip
-    n, nf = len(G.A), len(f.A)
-    A = stacked([[G.A, G.B @ f.C], [np.zeros((nf, n)), f.A]])
-    B = np.vstack([G.B, np.zeros((nf, G.B.shape[1]))])
-    C = np.hstack([G.C, np.zeros((len(G.C), nf))])
-    change, gains = held(A, B, hold)
-    noise = noise_of_a_period(A, np.vstack([G.B @ f.D, f.B]), T)
-    return Disturbed(source.kind, hold, StateSpace(A, B, C, G.D), f, change, tuple(gains), noise)
-
-
-def process(G: StateSpace, K: StateSpace, source: Source, hold: Sampling | None) -> Process:
-    """The loop of a plant without feedthrough (SI), a controller (e in, u out) and a source."""
-    return closed(disturbed(G, source, hold), K)
+    noise, f = noise_of_a_period(driven.A, W, T), replace(f, A=over(f.A, T)[0])
+    return Disturbed(source.kind, T, _held(G, hold), f, noise, 0.0 * W)
 
 
 def closed(plant: Disturbed, K: StateSpace) -> Process:
     """The process of a disturbed plant with a controller around it."""
-    return _continuous(plant, K) if plant.hold is None else _sampled(plant, K, plant.hold)
+    f, kind, T = plant.filter, plant.kind, plant.period
+    if T is not None and K.period:
+        K = replace(K, A=K.A - np.eye(len(K.A)))
+    elif T is not None:
+        change: Matrix = T * np.linalg.solve(np.eye(len(K.A)) - 0.5 * T * K.A, K.A)
+        K = replace(tustin(K, T), A=change)
+    loop = closed_loop(plant.plant, K)
+    A, C, F = loop.A, -loop.C_y, loop.C_u
+    E, V, first = np.zeros((len(A), plant.enters.shape[1])), np.zeros((len(F), 1)), 0
+    if kind not in FORCES:
+        first, sign = len(A), -1.0 if kind is Kind.SENSOR_NOISE else 1.0
+        A = np.block([[A, sign * loop.B_r @ f.C], [np.zeros((len(f.A), first)), f.A]])
+        C = np.hstack([C, f.C * (kind is Kind.SETPOINT)])
+        F = np.hstack([F, sign * loop.D_u @ f.C])
+        # The white part enters by way of e alone; sampled, of variance density times half the rate.
+        white = sign * f.D / np.sqrt(2.0 * (T or 1.0))
+        E, V = np.vstack([loop.B_r @ white, 0.0 * f.B]), loop.D_u @ white
+    Q, E = np.zeros_like(A), E.astype(A.dtype)
+    at = slice(first, first + len(plant.noise))
+    Q[at, at], E[at] = plant.noise, plant.enters
+    white_error = T is None and kind is Kind.SETPOINT and bool(np.any(f.D))
+    return Process(A, Q, C, F, E, V, T is not None, white_error, T is None and bool(np.any(V)))
 
 
-def _continuous(plant: Disturbed, K: StateSpace) -> Process:
-    G, f, kind = plant.system, plant.filter, plant.kind
-    n, nk, nf = len(G.A), len(K.A), len(f.A)
-    m = G.B.shape[1]
-    loop = closed_matrix(G, K)
-    C = np.hstack([-G.C, np.zeros((len(G.C), nk + nf))])
-    if kind in FORCES:
-        enters, direct = np.vstack([G.B, np.zeros((nk, m))]), np.zeros((len(K.C), m))
-    else:
-        sign = -1.0 if kind is Kind.SENSOR_NOISE else 1.0
-        enters, direct = sign * np.vstack([G.B @ K.D, K.B]), sign * K.D
-        if kind is Kind.SETPOINT:
-            C = np.hstack([C[:, : n + nk], f.C])
-    A = stacked([[loop, enters @ f.C], [np.zeros((nf, n + nk)), f.A]])
-    W = np.vstack([enters @ f.D, f.B])
-    F = np.hstack([-K.D @ G.C, K.C, direct @ f.C])
-    return Process(A, 0.5 * W @ W.T, C, F, np.zeros((len(A), 0)), np.zeros((len(F), 0)),
-                   infinite_error=kind is Kind.SETPOINT and bool(np.any(f.D)),
-                   infinite_force=bool(np.any(direct @ f.D)))  # fmt: skip
+def process(loop: Loop, source: Source) -> Process:
+    """A loop whose plant has no feedthrough, under a source."""
+    return closed(disturbed(loop.plant, source, loop.sampling), loop.controller)
 
 
-def _sampled(plant: Disturbed, K: StateSpace, hold: Sampling) -> Process:
-    B, C, f, gains = plant.system.B, plant.system.C, plant.filter, plant.gains
-    k, k_change = tustin(K, hold.period), tustin_change(K, hold.period)
-    own = plant.kind not in FORCES  # whether the filter stands beside the plant
-    m, n, nk, nf = B.shape[1], len(B), len(k.A), len(f.A) if own else 0
-    kept = len(gains) - 1
-    size = n + nk + nf + kept * m
-    x, c, z, old = np.split(np.eye(size), np.cumsum([n, nk, nf]))
-    sign = -1.0 if plant.kind is Kind.SENSOR_NOISE else 1.0
-    e = -C @ x + sign * f.C @ z if own else -C @ x
-    u = k.C @ c + k.D @ e
-    forces = [u, *np.split(old, kept)] if kept else [u]
-    rows = [plant.change @ x + sum(g @ force for g, force in zip(gains, forces, strict=True))]
-    rows.append(k_change @ c + k.B @ e)
-    driven = z if own else x
-    E, V = np.zeros((size, 0)), np.zeros((m, 0))
-    if own:
-        rows.append(plant.filter_change @ z)
-        # The white part, of variance density times half the rate, enters by way of e alone.
-        white = sign * f.D / np.sqrt(2.0 * hold.period)
-        V = k.D @ white
-        E = np.vstack([gains[0] @ V, k.B @ white, np.zeros((nf, white.shape[1])),
-                       np.eye(kept * m, m) @ V])  # fmt: skip
-    if kept:
-        rows.append(np.vstack(forces[:kept]) - old)
-    error = e if plant.kind is Kind.SETPOINT else -C @ x
-    Q = driven.T @ plant.noise @ driven
-    return Process(np.vstack(rows), Q, error, u, E, V, sampled=True)
+def _held(G: StateSpace, hold: Sampling) -> StateSpace:
+    """The plant behind hold and delay, states [x; u_{k-1}; …]; A their change over a period."""
+    n, m = G.B.shape
+    whole, rest = parts(hold.period, hold.delay)
+    (late, late_in), (early, early_in) = over(G.A, hold.period - rest), over(G.A, rest)
+    gains = [np.zeros((n, m))] * whole + [late_in @ G.B, (early_in + late @ early_in) @ G.B]
+    change = late + early + late @ early
+    found = delayed(change, gains if rest > 0.0 else gains[:-1], G.C, hold.period)
+    found.A[n:, n:] -= np.eye(len(found.A) - n)
+    return found
+
+
+def over(A: Matrix, h: float) -> tuple[Matrix, Matrix]:
+    """e^{Ah} - 1 = A∫ and ∫₀ʰ e^{As} ds, to the digits of A h."""
+    n = len(A)
+    joint = np.block([[A * h, h * np.eye(n)], [np.zeros((n, 2 * n))]])
+    integral = expm(joint)[:n, n:] if n else A
+    return A @ integral, integral
+
+
+def noise_of_a_period(A: Matrix, W: Matrix, T: float) -> Matrix:
+    """∫₀ᵀ e^{As} W W'/2 e^{A's} ds: Van Loan's exponential (1978) of a short step, then doublings.
+
+    It holds e^{-Ah}, so the step is short; Q(2h) = Q(h) + Φ(h) Q(h) Φ(h)' adds no
+    error of cancellation.
+    """
+    n = len(A)
+    if n == 0:
+        return np.zeros((0, 0))
+    doublings = max(0, int(np.ceil(np.log2(max(np.abs(A).sum(0).max() * T, 1e-300)))))
+    h = T / 2.0**doublings
+    whole = expm(h * np.block([[-A, 0.5 * W @ W.T], [np.zeros((n, n)), A.T]]))
+    moved = whole[n:, n:].T
+    Q = moved @ whole[:n, n:]
+    for _ in range(doublings):
+        Q, moved = Q + moved @ Q @ moved.T, moved @ moved
+    return 0.5 * (Q + Q.T)

@@ -55,29 +55,28 @@ class Integral:
 def integrate(f: Callable[[Array], Array], ends: Array, *, relative: float = RELATIVE) -> Integral:
     """Rows f(x) (rows, len(x)) over the panels between `ends`, rising and above 0."""
     low, high = np.log(ends[:-1]), np.log(ends[1:])
-    done: list[tuple[Array, ...]] = []
+    done: list[Array] = []  # low, high, shares and errors of panels, by column
     spent = 0
     for turn in range(ROUNDS):
         x, weights = _points(low, high)
         value = f(x.ravel())
         value = value.reshape(len(value), *x.shape) * weights
         spent += x.size
-        part = value @ KRONROD
+        part, rows = value @ KRONROD, len(value)
         error = np.abs(value @ (KRONROD - GAUSS))
-        total = part.sum(1) + sum((item[2].sum(1) for item in done), np.zeros(len(part)))
+        total = part.sum(1) + sum(item[2 : 2 + rows].sum(1) for item in done)
         allowed = relative * np.abs(total)[:, None] / (4 * len(ends))
         wide = (error > np.maximum(allowed, 1e-15 * np.abs(part))).any(0)
         if turn == ROUNDS - 1 or spent > MOST:
             wide[:] = False
-        done.append((low[~wide], high[~wide], part[:, ~wide], error[:, ~wide]))
+        done.append(np.vstack([low, high, part, error])[:, ~wide])
         if not wide.any():
             break
         middle = 0.5 * (low + high)[wide]
         low, high = np.concatenate([low[wide], middle]), np.concatenate([middle, high[wide]])
-    low, high = (np.concatenate([item[i] for item in done]) for i in (0, 1))
-    part, error = (np.concatenate([item[i] for item in done], axis=1) for i in (2, 3))
-    order = np.argsort(low)
-    low, high, part, error = low[order], high[order], part[:, order], error[:, order]
+    found = np.hstack(done)
+    low, high, *both = found[:, np.argsort(found[0])]
+    part, error = np.split(np.array(both), 2)
     x, weights = _points(low, high)
     return Integral(
         part.sum(1), error.sum(1), np.exp(np.append(low, high[-1])), part, x.ravel(),

@@ -9,7 +9,6 @@ unit = "N^2/Hz"
 psd = [[1.0, 1e-3], [100.0, 1e-6]]      # [Hz, density]; or file = "cables.csv"
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, TabulatedSpectrum
-from ccd_casadi.cases.checks import POSITIVE, Check, number, rows, shown, text
+from ccd_casadi.cases.checks import NOT_NEGATIVE, POSITIVE, Check, rows, shown, text
 from ccd_casadi.cases.sections import BudgetSection
 
 Fail = Callable[[str, str], Exception]
@@ -47,7 +46,6 @@ def _corners(value: Any) -> str | None:
 
 
 CORNERS = Check(_corners, {"type": "array"})
-_NONE_OR_MORE = number(0.0, math.inf, "give 0 or more", closed=True)
 TABLE_CHECKS: dict[str, Check] = {
     "name": text,
     "unit": text,
@@ -56,7 +54,7 @@ TABLE_CHECKS: dict[str, Check] = {
     "poles_hz": CORNERS,
     "psd": rows(2),
     "file": text,
-    **dict.fromkeys(PATH, _NONE_OR_MORE),
+    **dict.fromkeys(PATH, NOT_NEGATIVE),
 }
 
 

@@ -14,6 +14,7 @@ from ccd_casadi.cases.checks import closest, shown
 from ccd_casadi.cases.controller_sections import ChannelSection
 from ccd_casadi.cases.kinds import check_kind, read_options
 from ccd_casadi.cases.motion import check_motion
+from ccd_casadi.cases.places import checked_places, place_names
 from ccd_casadi.cases.plant_tables import plant_table, theta_tables
 from ccd_casadi.cases.sections import SECTIONS, Case
 from ccd_casadi.support.errors import UserError
@@ -130,13 +131,19 @@ def parse_case(data: Mapping[str, Any], path: Path = Path("case")) -> Case:
             raise fail(f"weights.{high}", words)
     check_kind(sections, fail)
     sections["budget"] = checked_budget(sections["budget"], path.parent, fail)
+    sections["places"] = checked_places(sections["places"], path.parent, fail)
     plant = plant_table(data["plant"], path, fail)
     files = sections["robust"].plants
     absolute = tuple(str((path.parent / file).resolve()) for file in files)
     for file, place in zip(files, absolute, strict=True):
         plant_table(dict(data["plant"]) | options_in(file, place, fail), path, fail)
     sections["robust"] = replace(sections["robust"], plants=absolute)
-    theta, fixed = theta_tables(data["theta"], plant.model, fail, sections["motor"].size)
+    of_case = (*place_names(sections["places"]), *filter(None, [sections["motor"].size]))
+    theta, fixed = theta_tables(data["theta"], plant.model, of_case, fail)
+    for parameter in fixed:
+        if parameter.varies and controller.structure != "sections":
+            words = 'needs controller.structure = "sections"; choose that, or drop it'
+            raise fail(f"theta.{parameter.name}.varies", words)
     check_motion(sections, {p.name: (p.lower, p.upper) for p in (*theta, *fixed)}, fail)
     return Case(path=path, plant=plant, theta=theta, fixed=fixed, **sections)
 
@@ -162,7 +169,8 @@ def section_of(
             raise fail(f"{name}.{key}", wrong)
         value = table[key]
         if isinstance(value, list):
-            kept = item.type in (tuple[int, int], tuple[str, ...], tuple[Mapping[str, Any], ...])
+            numbers = all(isinstance(v, int | float) for v in value)
+            kept = item.type in (tuple[int, int], tuple[int, ...]) or not numbers
             value = tuple(v if kept else float(v) for v in value)
         elif item.type in (float, float | None):
             value = float(value)

@@ -8,6 +8,7 @@ from ccd_casadi.cases.diagnosis import diagnose
 from ccd_casadi.cases.findings import Severity
 from ccd_casadi.cases.kinds import disturbance_of, sections_problem, weights_of
 from ccd_casadi.cases.motion import motion_problem
+from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.sections import Case, RobustSection
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
 from ccd_casadi.inner_problem.motion import require_motion
@@ -49,6 +50,7 @@ def problem_of(case: Case) -> CoDesignProblem:
             case.limits.plant_seconds,
             fixed=tuple((p.name, p.start, p.unit) for p in case.fixed),
             motion=motion_problem(case.move, case.motor, case.loop.rate_hz),
+            places=places_of(case.places),
         ).pinned(),
         names=tuple(p.name for p in case.theta),
         units=tuple(p.unit for p in case.theta),
@@ -75,7 +77,12 @@ def problem_of(case: Case) -> CoDesignProblem:
         method=inner.method,
         robust=None if structured else _robust(case.robust),
         controller=sections_problem(
-            case.controller, case.loop, case.robust, inner, _option_sets(case)
+            case.controller,
+            case.loop,
+            case.robust,
+            inner,
+            _option_sets(case),
+            tuple((p.name, p.lower, p.upper) for p in case.fixed if p.varies),
         )
         if structured
         else MixedSensitivityProblem(),

@@ -106,30 +106,14 @@ def interval(value: Any) -> str | None:
     return None if value[0] < value[1] else f"is an empty range {shown(value)}; {remedy}"
 
 
-@_with(_list({"type": "integer", "minimum": 2}, 2, 2))
-def points(value: Any) -> str | None:
-    good = isinstance(value, list | tuple) and len(value) == 2
-    if good and all(count(2)(item) is None for item in value):
-        return None
-    return f"is {shown(value)}; give two whole numbers of at least 2"
-
-
-@_with(_list({"type": "number", "exclusiveMinimum": 0.0, "exclusiveMaximum": 1.0}, 1))
-def steps(value: Any) -> str | None:
-    if isinstance(value, list | tuple) and value and all(FRACTION(v) is None for v in value):
-        return None
-    return f"is {shown(value)}; give a list of numbers between 0 and 1, both exclusive"
-
-
-@_with(_list({"type": "number", "exclusiveMinimum": 0.0}))
-def factors(value: Any) -> str | None:
-    if isinstance(value, list | tuple) and all(POSITIVE(v) is None for v in value):
-        return None
-    return f"is {shown(value)}; give a list of numbers above 0"
-
-
-@_with({"anyOf": [{"type": "number", "exclusiveMinimum": 0.0},
-                  _list({"type": "number", "exclusiveMinimum": 0.0}, 1)]})
+@_with(
+    {
+        "anyOf": [
+            {"type": "number", "exclusiveMinimum": 0.0},
+            _list({"type": "number", "exclusiveMinimum": 0.0}, 1),
+        ]
+    }
+)
 def one_or_more(value: Any) -> str | None:
     several = value if isinstance(value, list | tuple) else [value]
     if several and all(POSITIVE(item) is None for item in several):
@@ -137,36 +121,16 @@ def one_or_more(value: Any) -> str | None:
     return f"is {shown(value)}; give a number above 0, or a list of them"
 
 
-@_with(_list({"type": "number"}, 2))
-def listed(value: Any) -> str | None:
-    if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
-        return None
-    return f"is {shown(value)}; give a list of numbers"
-
-
-@_with(_list({"type": "number"}, 1))
-def direction(value: Any) -> str | None:
-    if isinstance(value, list | tuple) and value and all(ANY(item) is None for item in value):
-        return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
-    return f"is {shown(value)}; give a list of numbers, one for each"
+@_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
+def text_or_rows(value: Any) -> str | None:
+    width = len(value[0]) if isinstance(value, list | tuple) and value and value[0] else 1
+    return text(value) if isinstance(value, str) else rows(width)(value)
 
 
 @_with({"type": "object"})
 def table(value: Any) -> str | None:
     good = isinstance(value, Mapping) and all(isinstance(v, Mapping) for v in value.values())
     return None if good else f"is {shown(value)}; write tables of that name"
-
-
-@_with(_list({"type": "string", "minLength": 1}))
-def files(value: Any) -> str | None:
-    good = isinstance(value, list | tuple) and all(isinstance(v, str) and v for v in value)
-    return None if good else f"is {shown(value)}; give a list of file names in quotes"
-
-
-@_with(_list({"type": "string", "minLength": 1}, 1))
-def names(value: Any) -> str | None:
-    good = isinstance(value, list | tuple) and value and all(isinstance(v, str) for v in value)
-    return None if good else f"is {shown(value)}; give a list of texts in quotes"
 
 
 @_with({"anyOf": [{"type": "object"}, _list({"type": "object"})]})
@@ -176,19 +140,16 @@ def tables(value: Any) -> str | None:
     return None if good else f"is {shown(value)}; write a table, or several in double brackets"
 
 
-def rows(width: int) -> Check:
-    """A list of rows of `width` finite numbers."""
+def every(item: Check, remedy: str, least: int = 0, most: int | None = None) -> Check:
+    """A list of so many items that all pass a check; `remedy` says what to give."""
 
     def check(value: Any) -> str | None:
-        good = isinstance(value, list | tuple) and all(
-            isinstance(row, list | tuple)
-            and len(row) == width
-            and all(ANY(item) is None for item in row)
-            for row in value
-        )
-        return None if good else f"is {shown(value)}; give a list of rows of {width} numbers"
+        good = isinstance(value, list | tuple) and all(item(each) is None for each in value)
+        if good and least <= len(value) <= (math.inf if most is None else most):
+            return None
+        return f"is {shown(value)}; {remedy}"
 
-    return Check(check, _list(_list({"type": "number"}, width, width)))
+    return Check(check, _list(item.schema, least, most))
 
 
 def too_large(value: Any) -> bool:
@@ -208,8 +169,44 @@ def shown(value: Any) -> str:
 
 ANY = number(-math.inf, math.inf, "give a finite number")
 POSITIVE = number(0.0, math.inf, "give a number above 0")
+NOT_NEGATIVE = number(0.0, math.inf, "give 0 or more", closed=True)
 FRACTION = number(0.0, 1.0, "give a number between 0 and 1, both exclusive")
 ABOVE_ONE = number(1.0, 1e7, "give a number above 1 and below 1e7")
+
+points = every(count(2), "give two whole numbers of at least 2", 2, 2)
+steps = every(FRACTION, "give a list of numbers between 0 and 1, both exclusive", 1)
+factors = every(POSITIVE, "give a list of numbers above 0")
+numbers = every(ANY, "give a list of numbers", 1)
+listed = Check(numbers.test, _list(ANY.schema, 2))
+named = Check(
+    lambda value: None if value and isinstance(value, str) else "is no text",
+    {"type": "string", "minLength": 1},
+)
+files = every(named, "give a list of file names in quotes")
+names = every(Check(text.test, named.schema), "give a list of texts in quotes", 1)
+coordinate = Check(
+    lambda value: (
+        None if isinstance(value, str) and value.removeprefix("-").isidentifier() else ANY(value)
+    ),
+    {"type": ["number", "string"]},
+)
+coordinates = every(coordinate, 'give a list of numbers and names of [theta], as [0.1, "x", "-x"]')
+places = every(
+    every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
+)
+numbers_of_modes = every(count(1), "give a list of whole numbers from 1")
+
+
+@_with(numbers.schema)
+def direction(value: Any) -> str | None:
+    wrong = numbers(value)
+    if wrong is not None:
+        return f"{wrong}, one for each"
+    return None if any(value) else f"is {shown(value)}; give numbers that are not all 0"
+
+
+def rows(width: int) -> Check:
+    return every(every(ANY, "", width, width), f"give a list of rows of {width} numbers")
 
 
 def closest(name: str, known: Collection[str]) -> str:

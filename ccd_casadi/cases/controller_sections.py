@@ -32,16 +32,14 @@ class ChannelSection:
     """
 
     outputs: tuple[float, ...] | None = key(
-        direction, None, says="how the channel's measurement is made of the plant's outputs"
+        direction, None, says="the channel's measurement as weights of the plant's outputs"
     )
     inputs: tuple[float, ...] | None = key(
         direction,
         None,
-        says="how the channel's force acts on the plant's inputs; default: as outputs",
+        says="the channel's force as weights of the plant's inputs; default: as outputs",
     )
-    like: str | None = key(
-        text, None, says="the channel whose parameters this one has: one controller for both"
-    )
+    like: str | None = key(text, None, says="another channel: both have one controller")
     integrator: bool | None = key(flag, None, says="instead of [controller]'s")
     lead: int | None = key(count(0), None, says="instead of [controller]'s")
     biquads: int | None = key(count(0), None, says="instead of [controller]'s")
@@ -54,18 +52,18 @@ class ChannelSection:
     S_max: float | None = key(
         number(1.0, math.inf, "give more than 1, at most [inner]'s S_max"),
         None,
-        says="bound of the peak of this channel's S, tighter than [inner]'s, which the whole keeps",
+        says="bound of the peak of this channel's S, tighter than the whole loop's in [inner]",
     )
     M_K: float | None = key(
         POSITIVE,
         None,
-        says="of this channel's W_KS, lower than [weights]': its force counts more",
+        says="M_K of this channel's W_KS, lower than that of [weights]: its force counts more",
         unit="N/m",
     )
     bandwidth_ratio: float = key(
         number(1.0, 1000.0, "give 1 or more: ω_b is that of the slowest channel", closed=True),
         1.0,
-        says="this channel's bandwidth is at least this many times ω_b, which is the slowest one's",
+        says="least ratio of this channel's bandwidth to ω_b, which is that of the slowest channel",
     )
 
 
@@ -84,27 +82,27 @@ class ControllerSection:
         "h_infinity",
         says="mixed sensitivity, the same with an input disturbance, or a fixed structure",
     )
-    integrator: bool = key(flag, True, says="of sections: an integrator with a zero")
-    lead: int = key(count(0), 1, says="of sections: how many first-order leads")
+    integrator: bool = key(flag, True, says="sections: whether K has an integrator with a zero")
+    lead: int = key(count(0), 1, says="sections: number of first-order leads")
     biquads: int = key(
         count(0),
         2,
-        says="of sections: how many pairs of zeros with pairs of poles: notches, skewed notches",
+        says="sections: number of biquads, pairs of zeros and poles: notches, skewed notches",
     )
-    roll_off: int = key(count(0), 2, says="of sections: order of the roll-off")
+    roll_off: int = key(count(0), 2, says="sections: order of the roll-off")
     weighted_level: float | None = key(
         POSITIVE,
         None,
-        says="of sections: bound of |W_KS KS| and |W_T T|; absent: no bound, and results say so",
+        says="sections: bound of |W_KS KS| and |W_T T|; absent: no bound, which results report",
     )
     least_damping: float = key(
         number(0.0, 1.0, "give a damping ratio from 0 to below 1", closed=True),
         0.0,
-        says="of sections: least damping ratio of their zeros and poles",
+        says="sections: least damping ratio of zeros and poles",
     )
-    starts: int = key(count(1), 12, says="of sections: how many places the search starts from")
+    starts: int = key(count(1), 12, says="sections: number of starts of the search")
     channel: tuple[tuple[str, ChannelSection], ...] = key(
-        table, (), says="tables [controller.channel.NAME] of plants with several outputs"
+        table, (), says="tables [controller.channel.NAME] for plants with several outputs"
     )
 
 
@@ -115,13 +113,13 @@ class LoopSection:
     rate_hz: float | None = key(
         POSITIVE,
         None,
-        says="with sections: the loop is sampled with a hold at this rate; absent: continuous",
+        says="sections: sampling rate of the loop, with a hold; absent: continuous",
         unit="Hz",
     )
     delay_us: float = key(
         number(0.0, 1e6, "give 0 to 1e6", closed=True),
         0.0,
-        says="from reading the sensor to the new force",
+        says="delay from reading the sensor to the new force",
         unit="µs",
     )
 
@@ -133,12 +131,12 @@ class SamplingSection:
     `lifted_points` designs of (θ, ω_S, ω_T) are sampled for the lifted formulation; 0 chooses.
     """
 
-    design: str = key(choice("grid", "sobol", "lhs"), "grid", says="how θ is spread for samples")
+    design: str = key(choice("grid", "sobol", "lhs"), "grid", says="sampling plan over θ")
     points: int = key(
-        count(2), 5, says="of θ: on each axis of a grid, in all for the other designs"
+        count(2), 5, says="number of θ: along each axis of a grid, in total for other plans"
     )
     lifted_points: int = key(
-        count(0), 0, says="designs of (θ, ω_S, ω_T) for the lifted formulation; 0 chooses"
+        count(0), 0, says="number of designs (θ, ω_S, ω_T) for lifted; 0: chosen by the program"
     )
 
 
@@ -151,19 +149,19 @@ class OuterSection:
     that a solve ends with a look at, those that it has solved already among them; 0: none.
     """
 
-    starts: int = key(count(1), 16, says="of IPOPT on the surrogates")
-    direct_starts: int = key(count(1), 4, says="of IPOPT on the true problem")
+    starts: int = key(count(1), 16, says="starts of IPOPT on the surrogates")
+    direct_starts: int = key(count(1), 4, says="starts of IPOPT on the true problem")
     tolerance: float = key(
-        FRACTION, 1e-3, says="to which prediction and truth have to agree, relative"
+        FRACTION, 1e-3, says="largest relative difference of prediction and truth"
     )
-    max_refinements: int = key(count(0), 12, says="rounds of adding true samples at the optimum")
+    max_refinements: int = key(count(0), 12, says="most rounds of adding true samples")
     surrogate: str = key(
         choice("matern52", "rbf", "auto"),
         "matern52",
-        says='kernel of the Gaussian processes; "auto": what predicts left-out samples best',
+        says='kernel of the Gaussian processes; "auto": the one with the least left-out error',
     )
     box_points: int = key(
-        count(0), 32, says="θ spread over the box that every solve ends with a look at; 0: none"
+        count(0), 32, says="number of θ over the box in the global check at the end; 0: no check"
     )
 
 
@@ -176,16 +174,13 @@ class BaselineSection:
     """
 
     first_resonance_hz: float = key(
-        POSITIVE,
-        250.0,
-        says="of the sequential design: its first resonance is at least this",
-        unit="Hz",
+        POSITIVE, 250.0, says="least first resonance of the sequential design", unit="Hz"
     )
     steps: tuple[float, ...] = key(
-        steps, (0.02, 0.05, 0.1), says="first steps that the descents try, as shares of the box"
+        steps, (0.02, 0.05, 0.1), says="first steps of the descents, as shares of the box"
     )
-    starts: int = key(count(1), 3, says="of the descents: the case's own and a Latin hypercube")
-    max_iterations: int = key(count(1), 100, says="of a descent")
+    starts: int = key(count(1), 3, says="starts of the descents: the case's own, a Latin hypercube")
+    max_iterations: int = key(count(1), 100, says="most iterations of a descent")
 
 
 @dataclass(frozen=True)
@@ -193,8 +188,5 @@ class LimitsSection:
     """[limits]: how long a user's plant function may take at each call, in s."""
 
     plant_seconds: float = key(
-        POSITIVE,
-        60.0,
-        says="how long a plant function of one's own may take at each call",
-        unit="s",
+        POSITIVE, 60.0, says="time limit of each call of your own plant function", unit="s"
     )

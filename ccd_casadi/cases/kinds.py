@@ -169,6 +169,7 @@ def sections_problem(
     robust: RobustSection,
     inner: InnerSection,
     options: tuple[tuple[tuple[str, object], ...], ...],
+    ranges: tuple[tuple[str, float, float], ...] = (),
 ) -> SectionsProblem:
     """The problem of a fixed structure."""
     return SectionsProblem(
@@ -184,6 +185,7 @@ def sections_problem(
             (min(1.0, *robust.damping, 1.0), max(1.0, *robust.damping, 1.0)),
             robust.gain,
             options,
+            ranges,
         ),
         starts=controller.starts,
         minimise=inner.minimise,

@@ -11,13 +11,18 @@ MOST_VALUES = 100  # of a list: more are better taken as a range, and rounded
 
 # Every key of a [theta.NAME], what is asked of it, and what it says.
 KEYS: dict[str, tuple[Check, str]] = {
-    "lower": (ANY, "the least that may be chosen, in `unit`"),
-    "upper": (ANY, "the most that may be chosen"),
-    "start": (ANY, "where descents start; default: the middle"),
-    "unit": (text, "for tables and pages; what the plant function takes"),
-    "values": (listed, "instead of bounds: the values that it may have, as in a catalogue"),
-    "integer": (flag, "whether it is a whole number between the bounds; default false"),
-    "fixed": (ANY, "instead of all these but unit: its value, which is not searched"),
+    "lower": (ANY, "least value, in `unit`"),
+    "upper": (ANY, "largest value"),
+    "start": (ANY, "start of searches; default: the middle"),
+    "unit": (text, "unit, as the plant function takes it; shown in tables and on pages"),
+    "values": (listed, "instead of bounds: a list of values, as in a catalogue"),
+    "integer": (flag, "whole numbers between the bounds only; default false"),
+    "fixed": (ANY, "instead of bounds: its value, which is not searched"),
+    "varies": (
+        flag,
+        "with sections: true where it is not chosen but takes all values in between, as "
+        "a stroke does; `start` is the model",
+    ),
 }
 Fail = Callable[[str, str], Exception]
 
@@ -25,16 +30,17 @@ Fail = Callable[[str, str], Exception]
 def parameters_of(
     table: Mapping[str, Any], fail: Fail
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
-    """The parameters that are searched, and the fixed ones."""
+    """The parameters that are searched, and the fixed ones, with those that vary."""
     if not table:
         raise fail("theta", "names no parameter; add a table [theta.NAME]")
     found = [_parameter(name, entry, fail) for name, entry in table.items()]
-    if not any(not parameter.values for parameter in found):
+    if not any(not (parameter.values or parameter.varies) for parameter in found):
         words = "has no parameter with a range: give one lower and upper, or ask inner for each"
         raise fail("theta", words)
+    kept = [len(parameter.values) != 1 and not parameter.varies for parameter in found]
     return (
-        tuple(parameter for parameter in found if len(parameter.values) != 1),
-        tuple(parameter for parameter in found if len(parameter.values) == 1),
+        tuple(parameter for parameter, free in zip(found, kept, strict=True) if free),
+        tuple(parameter for parameter, free in zip(found, kept, strict=True) if not free),
     )
 
 
@@ -51,8 +57,9 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         if wrong is not None:
             raise fail(f"{place}.{key}", wrong)
     unit = entry.get("unit", "")
-    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer")),
-                        ("values", ("lower", "upper", "integer"))):  # fmt: skip
+    for key, others in (("fixed", ("values", "lower", "upper", "start", "integer", "varies")),
+                        ("values", ("lower", "upper", "integer", "varies")),
+                        ("integer", ("varies",))):  # fmt: skip
         beside = [other for other in others if key in entry and other in entry]
         if beside:
             raise fail(f"{place}.{beside[0]}", f"has no place beside {key}; drop it")
@@ -86,4 +93,4 @@ def _parameter(name: str, entry: Any, fail: Fail) -> Parameter:
         start = min(max(start, lower), upper)
     if len(values) > MOST_VALUES:
         raise fail(f"{place}.values", f"has more than {MOST_VALUES}; give lower and upper instead")
-    return Parameter(name, lower, upper, start, unit, values)
+    return Parameter(name, lower, upper, start, unit, values, entry.get("varies", False))

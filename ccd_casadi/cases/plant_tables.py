@@ -118,19 +118,24 @@ def _option(value: Any) -> str | None:
 def theta_tables(
     table: Mapping[str, Any],
     model: str | None,
+    of_case: tuple[str, ...],
     fail: Callable[[str, str], Exception],
-    motor: str = "",
 ) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
     """[theta.NAME] of every parameter, searched ones and fixed ones.
 
-    Those that a model of the package needs, and no other but the size of a `motor`.
+    Those that a model of the package needs, those that [places] and [motor] name, and no other.
     """
     searched, fixed = parameters_of(table, fail)
     known = model_named(model)
     needed = None if known is None else known.theta
+    for name in of_case:
+        if name not in table:
+            words = f"is missing; add a table [theta.{name}], which [places] or [motor] names"
+            raise fail(f"theta.{name}", words)
     if needed is not None:
+        needed = (*needed, *of_case)
         for name in table:
-            if name not in (*needed, motor):
+            if name not in needed:
                 raise fail(f"theta.{name}", f"is not a parameter of {model}{closest(name, needed)}")
         for name in needed:
             if name not in table:

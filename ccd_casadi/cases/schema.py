@@ -96,7 +96,7 @@ def case_schema() -> dict[str, Any]:
 def keys_page() -> str:
     """Every key of a case file in tables, as Markdown."""
     lines = [
-        "# The case file",
+        "# Case file",
         "",
         "Every table and key, made by `ccd keys` from the definitions that check a case.",
         "An unknown key is an error. `ccd schema` prints the same as JSON Schema, for an editor",
@@ -177,7 +177,7 @@ def _values(schema: Mapping[str, Any]) -> str:
 
 
 def _rows(rows: list[tuple[str, str, str, str]]) -> list[str]:
-    head = ["| key | default | unit | |", "|---|---|---|---|"]
+    head = ["| key | default | unit | meaning |", "|---|---|---|---|"]
     # a bar in the words would end the cell
     return head + [
         f"| `{key}` | {default} | {unit} | {says.replace('|', chr(92) + '|')} |"

@@ -5,25 +5,31 @@ Units are those of the file (Hz where a name says so).
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.checks import (
     ABOVE_ONE,
     FRACTION,
+    NOT_NEGATIVE,
     POSITIVE,
     choice,
+    coordinates,
     count,
     factors,
     files,
+    flag,
     interval,
     key,
     number,
+    numbers_of_modes,
+    places,
     points,
     signed,
     tables,
     text,
+    text_or_rows,
 )
 from ccd_casadi.cases.controller_sections import (
     BaselineSection,
@@ -52,7 +58,8 @@ class Parameter:
     """[theta.NAME]: bounds, start (default: the middle) and unit of one hardware parameter.
 
     `values`: those that it may have, in rising order, from `lower` to `upper`; none: all between
-    the bounds. With one value it is fixed, and no part of θ.
+    the bounds. With one value it is fixed, and no part of θ. One that `varies` is none either: what
+    is designed holds between its bounds.
     """
 
     name: str
@@ -61,6 +68,7 @@ class Parameter:
     start: float
     unit: str
     values: tuple[float, ...] = ()
+    varies: bool = False
 
     def fixed_at(self, value: float) -> "Parameter":
         """The same at one value."""
@@ -73,7 +81,8 @@ class Parameter:
             return {"fixed": self.start, "unit": self.unit}
         if self.values:
             return {"values": self.values, "start": self.start, "unit": self.unit}
-        return {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        found = {"lower": self.lower, "upper": self.upper, "start": self.start, "unit": self.unit}
+        return found | {"varies": True} if self.varies else found
 
 
 @dataclass(frozen=True)
@@ -82,14 +91,14 @@ class ObjectiveSection:
 
     w1: float = key(
         number(0.0, math.inf, "give 0 or more: J is minimised", closed=True),
-        says="what a unit of the hardware cost f(θ) weighs in J",
+        says="weight of the hardware cost f(θ) in J",
     )
     w2: float = key(
         signed("give a negative number: J must reward bandwidth"),
-        says="what bandwidth is worth in J, negative, in 1/(rad/s); of an RMS error or a move time "
-        "positive, in 1/m or 1/s",
+        says="weight of the bandwidth in J, negative, 1/(rad/s); of an RMS error or a move's time "
+        "positive, 1/m or 1/s",
     )
-    cost_unit: str = key(text, "", says="of the hardware cost f(θ), for tables and pages")
+    cost_unit: str = key(text, "", says="unit of the hardware cost f(θ), for tables and pages")
 
 
 @dataclass(frozen=True)
@@ -101,10 +110,10 @@ class WeightsSection:
     """
 
     M_S: float = key(
-        POSITIVE, says="W_S at high frequency is 1/M_S: the peak of S that the weight lets pass"
+        POSITIVE, says="W_S at high frequency is 1/M_S: the peak of S that the weight allows"
     )
     A_S: float = key(
-        FRACTION, says="W_S at zero frequency is 1/A_S: the S that the weight lets pass there"
+        FRACTION, says="W_S at zero frequency is 1/A_S: the S that the weight allows there"
     )
     c_K: float = key(ABOVE_ONE, says="W_KS grows by this factor above omega_K")
     omega_K_hz: float = key(
@@ -112,17 +121,17 @@ class WeightsSection:
     )
     M_K: float = key(
         POSITIVE,
-        says="gain of the controller that W_KS lets pass: about mass times (2π ω_b)²",
+        says="gain of the controller that W_KS allows: about mass times (2π ω_b)²",
         unit="N/m",
     )
     A_l: float = key(POSITIVE, says="W_T at zero frequency is 1/A_l")
     A_u: float = key(
-        FRACTION, says="W_T at high frequency is 1/A_u: the T that the weight lets pass there"
+        FRACTION, says="W_T at high frequency is 1/A_u: the T that the weight allows there"
     )
     disturbance: float | None = key(
         POSITIVE,
         None,
-        says='of "h_infinity_disturbance": weighs as one metre of reference; default 10 M_K',
+        says='"h_infinity_disturbance": force that weighs as 1 m of reference; default 10 M_K',
         unit="N/m",
     )
 
@@ -142,30 +151,30 @@ class InnerSection:
     S_low: float = key(FRACTION, says="bound of |S| at omega_low")
     omega_low_hz: float = key(POSITIVE, says="where S_low holds", unit="Hz")
     omega_S_hz: tuple[float, float] = key(
-        interval, says="range of the frequency of W_S that is searched", unit="Hz"
+        interval, says="searched range of the frequency of W_S", unit="Hz"
     )
     omega_T_hz: tuple[float, float] = key(
         interval,
-        says="range of the frequency of W_T that is searched; with sections its lower end is W_T's",
+        says="searched range of the frequency of W_T; sections: the lower end is that of W_T",
         unit="Hz",
     )
     gamma_backoff: float = key(
         number(1.0, 10.0, "give a number above 1 and below 10, such as 1.02"),
         1.02,
-        says="controllers are made at this multiple of γ_opt",
+        says="controllers are synthesised at this multiple of γ_opt",
     )
     sweep_points: tuple[int, int] = key(
-        points, (20, 20), says='mesh of (omega_S, omega_T) of method "sweep", as the paper has it'
+        points, (20, 20), says='grid of (omega_S, omega_T) for method "sweep", as in the paper'
     )
     method: str = key(
         choice("search", "sweep"),
         "search",
-        says="the best pair of weights by a search with exact derivatives, or on a mesh",
+        says="find the best weights by a search with exact derivatives, or on a grid",
     )
     shape: float | None = key(
         number(1.0, 10.0, "give 1 to 10", closed=True),
         None,
-        says="with sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
+        says="sections: |S| stays below this times (ω/ω_b)/√2 at every frequency; absent: 1.1",
     )
     shape_ends: str = key(
         choice(*ShapeEnd),
@@ -200,12 +209,12 @@ class SuspensionSection:
     frequency_hz: float = key(
         POSITIVE,
         0.1,
-        says="where the poles of rigid bodies are put, which synthesis needs off the axis",
+        says="frequency of the soft suspension that keeps rigid-body poles off the axis",
         unit="Hz",
     )
     damping_ratio: float = key(POSITIVE, 0.7, says="of these poles")
     rigid_modes: int | None = key(
-        count(0), None, says="how many rigid-body modes there must be; absent: any number"
+        count(0), None, says="required number of rigid-body modes; absent: any number"
     )
 
 
@@ -225,29 +234,74 @@ class RobustSection:
     resonance_shift: float = key(
         number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
         0.0,
-        says="every flexible frequency may be off by this share, all together",
+        says="largest common shift of all flexible frequencies, as a share",
     )
-    shifts: int = key(
-        count(2), 5, says="how many plants are taken over that range (full-order kinds)"
-    )
+    shifts: int = key(count(2), 5, says="number of plants over that range (full-order kinds)")
     damping: tuple[float, ...] = key(factors, (), says="factors of every modal damping, besides 1")
     design_at: str = key(
         choice("auto", "low", "nominal", "high"),
         "auto",
-        says='which plant of the range a full-order controller is made on; "auto" tries all three',
+        says='plant of the range that a full-order controller is made for; "auto" tries all three',
     )
     mode_shift: float = key(
         number(0.0, 0.5, "give a share of the frequency, 0 to 0.5", closed=True),
         0.0,
-        says="with sections: each flexible mode may be off by this share on its own",
+        says="sections: largest shift of each flexible mode by itself, as a share",
     )
     gain: float = key(
         number(0.0, 0.9, "give a share of the gain, 0 to 0.9", closed=True),
         0.0,
-        says="with sections: the plant's gain may be off by this share",
+        says="sections: largest error of the plant's gain, as a share",
     )
     plants: tuple[str, ...] = key(
-        files, (), says="with sections: TOML files of plant options: other loads, positions, meshes"
+        files, (), says="sections: TOML files of plant options: other loads, positions, meshes"
+    )
+
+
+@dataclass(frozen=True)
+class PlacesSection:
+    """[places]: forces and sensors between the nodes of a plant, see `plants.places`; m and kg.
+
+    A coordinate is a number, the name of a [theta], or that name after a minus sign.
+    """
+
+    nodes: str | tuple[tuple[float, ...], ...] = key(
+        text_or_rows,
+        (),
+        says="places of the plant's inputs, each a unit force, in their order: a CSV file with a "
+        "row of coordinates each after a header, or the rows",
+        unit="m",
+    )
+    actuators: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each force: numbers, or names of [theta]", unit="m"
+    )
+    sensors: tuple[tuple[float | str, ...], ...] = key(
+        places, (), says="coordinates of each sensor; absent: the plant's own outputs", unit="m"
+    )
+    actuator_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each force", unit="kg")
+    sensor_mass: float = key(NOT_NEGATIVE, 0.0, says="moves with each sensor", unit="kg")
+    apart: float = key(
+        NOT_NEGATIVE, 0.0, says="least distance of two forces, and of two sensors", unit="m"
+    )
+    present: tuple[float | str, ...] = key(
+        coordinates,
+        (),
+        says="one for each force: 1 present, 0 absent, or the name of a [theta] with "
+        "values = [0, 1]; default: all are present",
+    )
+    at_most: int | None = key(count(1), None, says="largest number of forces that are present")
+    actuator_cost: float = key(NOT_NEGATIVE, 0.0, says="hardware cost of each present force")
+    axes: bool = key(
+        flag,
+        False,
+        says="true: all forces and all sensors act together, an input and an output for each "
+        "motion of a rigid body normal to the nodes",
+    )
+    quiet: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, which these leave alone"
+    )
+    damped: tuple[int, ...] = key(
+        numbers_of_modes, (), says="with axes: flexible modes, from 1, each an axis of its own"
     )
 
 
@@ -292,6 +346,7 @@ class Case(Shown):
     limits: LimitsSection
     motor: MotorSection
     move: MoveSection
+    places: PlacesSection = field(default_factory=PlacesSection)
     fixed: tuple[Parameter, ...] = ()
 
 
@@ -300,6 +355,7 @@ SECTIONS: dict[str, type] = {
     "weights": WeightsSection,
     "inner": InnerSection,
     "suspension": SuspensionSection,
+    "places": PlacesSection,
     "robust": RobustSection,
     "controller": ControllerSection,
     "loop": LoopSection,

@@ -161,11 +161,10 @@ def best_of_lists(
         else:
             open_ += [replace(part, lists=half, lost=True) for half in _halves(part.lists)]
     assert best is not None
-    cut = sum(part.count for part in open_)
     result = best.result | {
         "seconds": perf_counter() - began,
         **spent_entry(sampler.spent.by_purpose, was_moved(best.result)),
-        "listed": _listed(problem, best, [*nodes.values()], cut, judged),
+        "listed": _listed(problem, best, [*nodes.values()], open_, judged),
     }
     words = _words(problem, result)
     notes = [*result.get("notes", ()), words]
@@ -225,13 +224,14 @@ def _halves(lists: Lists) -> list[Lists]:
 
 
 def _listed(
-    problem: CoDesignProblem, best: Solution, nodes: list[Node], cut: int, judged: int
+    problem: CoDesignProblem, best: Solution, nodes: list[Node], left: list[_Part], judged: int
 ) -> dict[str, Any]:
     whole = sum(node.whole for node in nodes)
     free = np.inf if nodes[0].whole else nodes[0].objective
     J = best.result.get("objective", np.inf)
     assert best.problem is not None
     held = best.problem.source.held
+    cutting = min((part.bound for part in left if not part.lost), default=np.inf)
     return {
         "values": {name: list(values) for name, values in problem.listed},
         "chosen": {name: held[name] for name, _ in problem.listed},
@@ -239,7 +239,9 @@ def _listed(
         "solved": whole,
         "between": len(nodes) - whole,
         "judged": judged,
-        "cut": cut,
+        "cut": sum(part.count for part in left if not part.lost),
+        "least_of_cut": cutting if np.isfinite(cutting) else None,
+        "without_design": sum(part.count for part in left if part.lost),
         "free_objective": free if np.isfinite(free) else None,
         "objective_above_free": J - free if np.isfinite([J, free]).all() else None,
         "nodes": [
@@ -280,5 +282,9 @@ def _words(problem: CoDesignProblem, result: Mapping[str, Any]) -> str:
     counts = f"{found['solved']} of {counted(found['combinations'], 'combination')} searched"
     if found["between"]:
         counts += f", and {counted(found['between'], 'part')} with all values between them allowed"
-    cut = f", {found['cut']} cut by bounds that are the best of their searches"
-    return f"listed values: {named}{free}; {counts}{cut if found['cut'] else ''}"
+    if found["cut"] and found["least_of_cut"] is not None:
+        counts += f", {found['cut']} cut: the best found of a part that each is in, with all values"
+        counts += f" between allowed, is J {found['least_of_cut']:.6g} or more"
+    if found["without_design"]:
+        counts += f", {found['without_design']} in parts where no design was found"
+    return f"listed values: {named}{free}; {counts}"

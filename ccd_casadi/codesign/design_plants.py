@@ -49,7 +49,7 @@ def widen(sampler: Sampler, x: Array) -> Reached:
             break
         share = min(1.0, reached.share + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
-        found, made, _ = polish(sampler.of(narrower, traced=share == 1.0), reached.x)
+        found, made = polish(sampler.of(narrower, traced=share == 1.0), reached.x)
         if acceptable(narrower, found, made):
             reached, step = Reached(found, share), 2.0 * step
         else:

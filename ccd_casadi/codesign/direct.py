@@ -9,11 +9,9 @@ import numpy as np
 
 from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.kinked import descend
-from ccd_casadi.codesign.kkt import SMOOTH, kkt_certificate, newton_step
+from ccd_casadi.codesign.kkt import kkt_certificate, newton_step
 from ccd_casadi.codesign.outer_problem import (
-    LocalOptimum,
     OuterFailure,
-    OuterSolution,
     lifted_bounds,
     lifted_program,
     solve_program,
@@ -78,40 +76,17 @@ def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> Formulation
     return FormulationResult(None, None, (), (), solution, False, message)
 
 
-def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities, OuterSolution | None]:
+def polish(sampler: Sampler, x: Array) -> tuple[Array, Sensitivities]:
     """From a design nearly optimal to the nearest stationary point of the true problem.
 
-    A descent past kinks, IPOPT where that leaves a residual, then Newton's steps. Returns the
-    start itself where none of them finds better that is certified and feasible.
+    A descent past kinks, then Newton's steps. Returns the start itself where neither finds better
+    that is certified and feasible.
     """
-    x, design, solution = _descended(sampler.problem, sampler.truth, x)
-    return *_settled(sampler.problem, sampler.truth, x, design), solution
-
-
-def _descended(
-    problem: CoDesignProblem, quantities: TrueQuantities, x: Array
-) -> tuple[Array, Sensitivities, OuterSolution | None]:
-    """As far as J falls."""
-    program = lifted_program(problem, quantities, exact_hessian=False)
-    start = quantities.at(x)
-    if acceptable(problem, x, start) and _stationary(problem, x, start):
-        return x, start, None
-    x, start = _past_kinks(problem, quantities, x, start)
-    if acceptable(problem, x, start) and (
-        _residual(problem, x, start) <= SMOOTH or other_peaks(problem, x, start, ON_EDGE)
-    ):
-        return x, start, None
-    solution: OuterSolution | None = None
-    try:
-        solution = solve_program(program, x, warm=True)
-    except OuterFailure:
-        return x, start, None
-    found = quantities.at(solution.best.x)
-    if acceptable(problem, solution.best.x, found) and (
-        not acceptable(problem, x, start) or _no_worse(problem, solution.best, x, start)
-    ):
-        return solution.best.x, found, solution
-    return x, start, solution
+    problem, truth = sampler.problem, sampler.truth
+    design = truth.at(x)
+    if not (acceptable(problem, x, design) and _residual(problem, x, design) <= STATIONARY):
+        x, design = _past_kinks(problem, truth, x, design)
+    return _settled(problem, truth, x, design)
 
 
 def _settled(
@@ -165,21 +140,9 @@ def acceptable(problem: CoDesignProblem, x: Array, design: Sensitivities) -> boo
     return problem.inner.feasible(design.figures) and not unmet(problem, x[: len(problem.names)])
 
 
-def _stationary(problem: CoDesignProblem, x: Array, design: Sensitivities) -> bool:
-    """Whether the true optimality conditions hold already, to what IPOPT would reach."""
-    return _residual(problem, x, design) <= STATIONARY
-
-
 def _residual(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:
     kkt = kkt_certificate(problem, x, design)
     return max(kkt.stationarity, kkt.complementarity)
-
-
-def _no_worse(
-    problem: CoDesignProblem, candidate: LocalOptimum, x: Array, start: Sensitivities
-) -> bool:
-    before = true_objective(problem, x, start)
-    return candidate.objective <= before + _level(problem, x, start)
 
 
 def _level(problem: CoDesignProblem, x: Array, design: Sensitivities) -> float:

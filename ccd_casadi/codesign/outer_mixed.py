@@ -112,7 +112,7 @@ class MixedOuter(Outer):
             before = len(sampler.trace)
             polishing = Progress(1, "polishing on the truth", quiet=sampler.quiet)
             with polishing as progress, sampler.spent.on("polish"):
-                x, made, _ = polish(sampler, x)
+                x, made = polish(sampler, x)
                 progress.advance()
             sampler.report(before)
             at_bounds = _snapped(problem, x)

@@ -7,7 +7,6 @@ end a multi-start search and a search for worse plants ask whether these were go
 The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,14 +17,13 @@ import numpy as np
 from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.codesign.costs import Costs, costs_of
 from ccd_casadi.codesign.outer import End
-from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
 from ccd_casadi.codesign.survival import loops_of
-from ccd_casadi.codesign.theta_direct import PRECISE, SETTLED, TrueBandwidth, pieces_from
-from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
+from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
+from ccd_casadi.codesign.theta_kkt import theta_kkt
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
@@ -44,6 +42,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
 )
 from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.limitations.of_problem import known_gap
+from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
@@ -174,9 +173,6 @@ class SectionsOuter(ThetaOuter):
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more anchors, where the given ones lose it.
-
-    By pieces (`pieces`), which know kinks; by IPOPT where J has one gradient and that is not yet
-    zero to what it is known to.
     """
     problem = sampler.problem
     lower, upper = box(problem)
@@ -187,25 +183,11 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     best = min(candidates, key=lambda s: objective_of(problem, s))
     if theta_kkt(problem, best).stationarity > STATIONARY:
         truth, best = by_pieces(truth, best)
-    sampler, problem = truth.sampler, truth.sampler.problem
-    if theta_kkt(problem, best).stationarity <= SMOOTH or _on_a_kink(sampler, best):
-        return sampler, best
-    program = nested_program(problem, truth)
-    program = replace(program, exact_hessian=False)
-    with suppress(OuterFailure):  # what it has asked for on its way counts
-        solve_program(program, np.array(best.theta), warm=True, tolerance=PRECISE, settled=SETTLED)
-    return sampler, min(truth.known.values(), key=lambda s: objective_of(problem, s))
-
-
-def _on_a_kink(sampler: Sampler, best: BandwidthSample) -> bool:
-    """Whether a sample is optimal to first order by the gradients of several sides of it."""
-    envelope = value_at(sampler, best.theta).envelope
-    found = theta_kkt(sampler.problem, best, envelope=envelope)
-    return found.kink is not None and found.stationarity <= SMOOTH
+    return truth.sampler, best
 
 
 def by_pieces(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL
+    truth: TrueBandwidth, best: BandwidthSample, settled: float = LEVEL, first: float = FIRST
 ) -> tuple[TrueBandwidth, BandwidthSample]:
     """From a sample, and what was asked for near it, to where the pieces of J promise no more.
 
@@ -213,7 +195,7 @@ def by_pieces(
     one becomes an anchor, and the search goes on.
     """
     for _ in range(FOLLOWED):
-        best, jumped = pieces_from(truth, best, settled)
+        best, jumped = pieces_from(truth, best, settled, first)
         if not jumped:
             break
         problem = joined(truth.sampler.problem, np.array(best.kappa), ())

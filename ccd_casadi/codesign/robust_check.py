@@ -163,7 +163,7 @@ def other_damping(problem: CoDesignProblem, loops: LoopsOffModel) -> OtherDampin
             modal = of.modal(place)
             modal = replace(modal, B=gain * modal.B, dB=gain * modal.dB)
             plants.append(scale_plant(modal, problem.weights.M_K, bare=True))
-        return certify(plants, of.controller.given, bounds, of.controller.sampling)
+        return certify(plants, of.controller, bounds, of.sampling)
 
     kept = "matrix" if loops.given else "ratio"
     return OtherDamping(kept, judged(loops).worst, judged(loops.other).worst)

@@ -70,12 +70,17 @@ def solve(
 
 
 def co_design(
-    sampler: Sampler, formulation: Formulation, seed: int, given: Surrogates | None = None
+    sampler: Sampler,
+    formulation: Formulation,
+    seed: int,
+    given: Surrogates | None = None,
+    known: Array | None = None,
 ) -> Solution:
     """Run one formulation on a sampler, verify and polish its design on the truth.
 
     A robust problem that leaves its design plant open is solved for each, and the best one kept;
-    one with parameters from lists by branching over these (`catalogue`).
+    one with parameters from lists by branching over these (`catalogue`). `known`: a local optimum
+    that is known already, in place of the formulation.
     """
     if sampler.problem.listed:
         if given is not None:
@@ -92,7 +97,7 @@ def co_design(
         return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
 
     def solved(each: Sampler) -> Solution:
-        found = searched(outer_of(each), formulation, seed, given)
+        found = searched(outer_of(each), formulation, seed, given, known)
         return concluded(found, name, tolerance, seed, began)
 
     def continued(each: Sampler, outcome: FormulationResult) -> Solution:
@@ -139,7 +144,9 @@ def require_solvable(problem: CoDesignProblem) -> None:
 def _of_lists(sampler: Sampler, formulation: Formulation, seed: int) -> Solution:
     """A co-design with parameters from lists: local searches near by where these know how."""
     if isinstance(outer_of(sampler), SectionsOuter):
-        of = ListedSections(formulation, seed, lambda each: co_design(each, formulation, seed))
+        of = ListedSections(
+            formulation, seed, lambda each, x: co_design(each, formulation, seed, known=x)
+        )
         return best_of_lists(sampler, of.search, of.search, of.judge)
     quick = replace(formulation, box_points=0)  # a bound needs no look at the box
     return best_of_lists(

@@ -19,6 +19,7 @@ from ccd_casadi.codesign.outer import End, Outer
 from ccd_casadi.codesign.result import infeasible_dict, predicted_value, result_dict
 from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.support.arrays import Array
 
 AGAIN = 3  # times at most that a search begins with what the inner problem has found better
 MOVED_ROUNDS = 1  # more after a look: local solves on the truth have found what they would look for
@@ -36,14 +37,24 @@ class Searched:
 
 
 def searched(
-    outer: Outer, formulation: Formulation, seed: int, given: Surrogates | None = None
+    outer: Outer,
+    formulation: Formulation,
+    seed: int,
+    given: Surrogates | None = None,
+    known: Array | None = None,
 ) -> Searched:
-    """Formulation and polish, again with what the inner problem at the end has found better."""
+    """Formulation and polish, again with what the inner problem at the end has found better.
+
+    `known`: x of a local optimum that another search has found, in place of the formulation.
+    """
     outer = outer.prepared(seed)
     rounds = 0
     while True:
         rounds += 1
-        outcome = outer.formulated(formulation, seed, given)
+        if known is None:
+            outcome = outer.formulated(formulation, seed, given)
+        else:
+            outcome = FormulationResult(known, None, (), (), None, True, "")
         if outcome.x is None:
             outcome = outer.rescued(outcome, seed)
         if outcome.x is None:
@@ -53,7 +64,7 @@ def searched(
         more = None if rounds == AGAIN else outer.joined(end)
         if more is None:
             return _looked(Searched(outer, outcome, end, rounds), formulation, sampled, seed)
-        outer = more
+        outer, known = more, None if known is None else end.x
 
 
 def _looked(

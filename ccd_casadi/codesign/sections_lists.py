@@ -46,18 +46,20 @@ from surrogates import design
 
 SETTLED = 1e-7  # of J: what local steps promise less than that is not looked for
 INSIDE = 1e-7  # of λ
+FIRST = 0.1  # of the box: how far the optimum of a part may be from the one that is known near by
 
 
 @dataclass
 class ListedSections:
-    """`search` and `judge` as `best_of_lists` asks for them; `solve` is a whole co-design.
+    """`search` and `judge` as `best_of_lists` asks for them.
 
-    `members`: all plants that were found worse than those of the set, at any of the θ.
+    `solve` goes on from a θ to a whole co-design. `members`: all plants that were found worse than
+    those of the set, at any of the θ.
     """
 
     formulation: Formulation
     seed: int
-    solve: Callable[[Sampler], Solution]
+    solve: Callable[[Sampler, Array], Solution]
     members: tuple[Member, ...] = ()
 
     def search(self, sampler: Sampler, near: Solution | None) -> Solution:
@@ -93,7 +95,9 @@ class ListedSections:
 
     def judge(self, sampler: Sampler, found: Solution) -> Solution:
         """The whole co-design of a combination, from the controller that was found for it."""
-        solution = self.solve(sampler.of(carried(_start(found), sampler.problem, self.members)))
+        near = _start(found)
+        begun = replace(sampler.problem, start=near.start)
+        solution = self.solve(sampler.of(carried(near, begun, self.members)), np.array(near.start))
         if solution.verified is not None:
             self.members = sections_of_problem(solution.verified.problem).members
         return solution
@@ -102,7 +106,7 @@ class ListedSections:
 def _climbed(sampler: Sampler, theta: Array) -> Solution:
     """From θ to the least J near by."""
     truth = TrueBandwidth(sampler, "near by")
-    truth, best = by_pieces(truth, truth.at(theta), SETTLED)
+    truth, best = by_pieces(truth, truth.at(theta), SETTLED, FIRST)
     return _found(truth.sampler.problem, best)
 
 

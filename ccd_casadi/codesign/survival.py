@@ -19,13 +19,13 @@ from functools import partial
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel, loops_off_model
+from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.inner_problem.kinds import MixedSensitivity, kind_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import scale_plant
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.classical_margins import least_margins
 from ccd_casadi.synthesis.statics import INTEGRATOR, Statics, statics
@@ -72,12 +72,12 @@ def loops_of(
     """The loops of a controller in SI (e in, u out) of whatever kind on plants off the model at θ,
     sampled where the problem's loop is."""
     system = mechanics(plant_of(problem), theta)
-    return loops_off_model(system, problem.suspension, Controller(controller, problem.sampling))
+    return loops_off_model(system, problem.suspension, controller, problem.sampling)
 
 
 def growth_of(loop: Loop) -> float:
-    """Below 0 where the loop is stable."""
-    return loop.growth
+    """The largest real part of a pole over its size: below 0 where the loop is stable."""
+    return float((loop.poles.real / np.maximum(np.abs(loop.poles), 1e-300)).max())
 
 
 def excess_of(loop: Loop, level: float) -> float:
@@ -128,7 +128,6 @@ def survival_of(
         S_max=problem.inner.S_max,
         bandwidth=bandwidth,
         omega_low=problem.inner.omega_low,
-        M_K=problem.weights.M_K,
         slack=kind_of(problem).slack,
         marks=marks,
     )
@@ -140,18 +139,17 @@ def survival(
     S_max: float,
     bandwidth: float,
     omega_low: float,
-    M_K: float,
     slack: float = PEAK,
     marks: Sequence[float] = (),
 ) -> Survival:
-    """The figures of a loop that is stable on the model; ω_b in rad/s, M_K in N/m.
+    """The figures of a loop that is stable on the model; ω_b in rad/s.
 
     `slack`: what S_max may be passed by, relative; `marks`: shifts that are asked on both sides.
     """
     nominal = loops.at(Perturbation())
     excess = partial(excess_of, level=max(S_max, nominal.peak) * (1.0 + slack))
-    margins = least_margins(nominal.responses, nominal.grid)
-    poles = np.linalg.eigvals(loops.controller.given.A)
+    margins = least_margins(nominal.responses, nominal.grid())
+    poles = np.linalg.eigvals(loops.controller.A)
     sizes = np.abs(poles)  # of an integrator rounding alone
     unstable = poles[(poles.real > np.maximum(1e-9 * sizes, INTEGRATOR * bandwidth))
                      & (poles.imag >= 0.0)]  # fmt: skip
@@ -164,12 +162,7 @@ def survival(
         delay=margins.delay,
         modulus=1.0 / nominal.peak,
         unstable_poles_hz=tuple(sorted(float(abs(p)) / HZ for p in unstable)),
-        statics=statics(
-            scale_plant(loops.plant, M_K).plant_si(),
-            loops.controller.given,
-            bandwidth=bandwidth,
-            omega_low=omega_low,
-        ),
+        statics=statics(nominal.plant, loops.controller, bandwidth=bandwidth, omega_low=omega_low),
     )
 
 

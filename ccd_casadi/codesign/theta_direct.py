@@ -8,7 +8,7 @@ from ccd_casadi.codesign.formulation import FormulationResult
 from ccd_casadi.codesign.outer_problem import OuterFailure, nested_program, solve_program
 from ccd_casadi.inner_problem.objective import hardware_at, objective_gradient, objective_of
 from ccd_casadi.inner_problem.problem import box
-from ccd_casadi.optim.pieces import Local, descend, jumps
+from ccd_casadi.optim.pieces import FIRST, Local, descend, jumps
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
@@ -71,7 +71,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
 
 
 def pieces_from(
-    truth: TrueBandwidth, best: BandwidthSample, settled: float
+    truth: TrueBandwidth, best: BandwidthSample, settled: float, first: float = FIRST
 ) -> tuple[BandwidthSample, bool]:
     """The best sample of one function ω_b*, and whether that jumps beside it."""
     problem = truth.sampler.problem
@@ -95,7 +95,8 @@ def pieces_from(
     if start is None:
         return best, False
     others = [found for found in map(local, truth.known.values()) if found is not None]
-    end = descend(at, start, others, constraints, steps=STEPS * len(lower), settled=settled)
+    steps = STEPS * len(lower)
+    end = descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
     met = (found for found in map(local, truth.known.values()) if found is not None)
     jumped = any(found.value > end.value and jumps(end, found) for found in met)
     return min(truth.known.values(), key=lambda sample: objective_of(problem, sample)), jumped

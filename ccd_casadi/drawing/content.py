@@ -14,7 +14,8 @@ from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE
 from ccd_casadi.support.arrays import Array
 
-Corner = Literal["best", "lower left", "lower right", "upper left", "upper right"]
+Corner = Literal["best", "lower left", "lower right", "upper left", "upper right", "center left",
+                 "center right", "lower center", "upper center", "center"]  # fmt: skip
 Fact = tuple[str, str, str]  # quantity, value, remark
 INDEX = "index.html"  # of a run's folder
 

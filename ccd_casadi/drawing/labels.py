@@ -1,6 +1,11 @@
 """Words in a figure that do not meet: each label takes the first free place of several."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ccd_casadi.drawing.content import Corner
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -11,7 +16,13 @@ POINT = 3.0  # pt; half a marker
 # places beside a point, in pt, after the one that was asked for
 AROUND = ((0, 7), (8, 3), (-8, 3), (0, -7), (8, -5), (-8, -5), (0, 20), (12, 16), (-12, 16),
           (0, -20), (12, -18), (-12, -18))  # fmt: skip
-SHARES = (0.0, 0.45, 0.75)  # of a line's length where its words may begin
+SHARES = (0.0, 0.2, 0.45, 0.75)  # of a line's length where its words may begin
+CORNERS: tuple[Corner, ...] = (
+    "lower right", "upper right", "lower left", "upper left", "center right", "center left",
+    "lower center", "upper center", "center",
+)  # fmt: skip
+HANDLE, PAD = 32.0, 5.0  # pt; a line's sample in a legend, and its margin
+APART = 2.0  # pt between the points that a curve is looked at by
 BEHIND = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 
 Box = tuple[float, float, float, float]  # left, bottom, right, top in pt
@@ -26,9 +37,9 @@ def inside(axes: "Axes") -> Box:
 class Labels:
     """The labels of one pair of axes, whose ranges are final.
 
-    A label without a free place is left out: it would hide another one, and the data of every
-    figure stand in the table below it. Widths are those of DejaVu Sans by a rule of thumb, as the
-    browser sets a font of its own.
+    A label takes a place off the curves where there is one. Without a place that hides no other
+    label it is left out: the data of every figure stand in the table below it. Widths are those of
+    DejaVu Sans by a rule of thumb, as the browser sets a font of its own.
     """
 
     def __init__(self, axes: "Axes") -> None:
@@ -37,28 +48,63 @@ class Labels:
         self._scale = 72.0 / axes.figure.dpi
         self._inside = inside(axes)
         self._taken: list[Box] = []
+        self._curves = np.empty((0, 2))
 
     def avoid(self, x: float, y: float) -> None:
         """Nothing is to lie over this point."""
         a, b = self._at(x, y)
         self._taken.append((a - POINT, b - POINT, a + POINT, b + POINT))
 
-    def beside(self, x: float, y: float, text: str, wish: tuple[float, float]) -> None:
+    def avoid_curve(self, x: Any, y: Any, joined: bool = True) -> None:
+        """Labels keep off this curve, or its points alone, where they can."""
+        points = self._axes.transData.transform(np.column_stack([x, y])) * self._scale
+        left, bottom, right, top = self._inside
+        shown = np.isfinite(points).all(axis=1)
+        points = np.clip(points[shown], (left - 99.0, bottom - 99.0), (right + 99.0, top + 99.0))
+        if joined and len(points) > 1:  # as many points as are this far apart, along its length
+            along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+            at = np.arange(0.0, along[-1], APART)
+            points = np.column_stack([np.interp(at, along, points[:, k]) for k in range(2)])
+        self._curves = np.vstack([self._curves, points])
+
+    def legend_at(self, entries: Sequence[str], wish: Corner) -> Corner:
+        """Where a legend covers the least, of matplotlib's places; `wish` if that is free."""
+        wide = LETTER * max(map(len, entries)) + HANDLE + 2.0 * PAD
+        tall = LINE * len(entries) + 2.0 * PAD
+        left, bottom, right, top = self._inside
+        x = {"left": left, "right": right - wide, "center": 0.5 * (left + right - wide)}
+        y = {"lower": bottom, "upper": top - tall, "center": 0.5 * (bottom + top - tall)}
+        best, least = wish, np.inf
+        for place in ([] if wish == "best" else [wish]) + list(CORNERS):
+            low, _, side = place.partition(" ")
+            a, b = x[side or "center"], y[low]
+            box = (a, b, a + wide, b + tall)
+            covered = self._covered(box) + 50.0 * sum(_meet(box, one) for one in self._taken)
+            if covered < least:
+                best, least = place, covered
+        return best
+
+    def beside(self, x: float, y: float, text: str, wish: tuple[float, float], colour: str) -> None:
         """A label beside a point, at the offset `wish` in pt if that is free."""
         a, b = self._at(x, y)
         wide = LETTER * len(text)
+        places = []
         for dx, dy in (wish, *AROUND):
             left = a + dx - (0.5 * wide if dx == 0 else wide if dx < 0 else 0.0)
             bottom = b + dy - (LINE if dy < 0 else 0.0)
-            if self._take((left, bottom, left + wide, bottom + LINE)):
-                side = "center" if dx == 0 else "left" if dx > 0 else "right"
-                self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND)
-                return
+            places.append(((left, bottom, left + wide, bottom + LINE), (dx, dy)))
+        found = self._best([box for box, _ in places])
+        if found is not None:
+            dx, dy = places[found][1]
+            side = "center" if dx == 0 else "left" if dx > 0 else "right"
+            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND,
+                        color=colour)  # fmt: skip
 
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes, upright beside a vertical one."""
         left, bottom, right, top = self._inside
         wide = LETTER * len(text)
+        places: list[tuple[Any, ...]] = []
         for share in SHARES:
             for side in (2.0, -2.0):
                 low = side - (LINE if side < 0 else 0.0)
@@ -76,24 +122,36 @@ class Labels:
                     place = ((x - left) / (right - left), value)
                     look = {"ha": "left", "va": _above(side)}
                     offset, coordinates = (0.0, side), self._axes.get_yaxis_transform()
-                if self._take(box):
-                    self._write(text, offset, place, coordinates, **look)
-                    return
+                places.append((box, offset, place, coordinates, look))
+        found = self._best([box for box, *_ in places])
+        if found is not None:
+            _, offset, place, coordinates, look = places[found]
+            self._write(text, offset, place, coordinates, **look)
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
         a, b = self._axes.transData.transform((x, y)) * self._scale
         return float(a), float(b)
 
-    def _take(self, box: Box) -> bool:
-        """Whether the place is free and inside the axes; it is taken then."""
+    def _best(self, boxes: Sequence[Box]) -> int | None:
+        """Which place to take: inside the axes, free of labels, and the least over curves."""
         left, bottom, right, top = self._inside
-        inside = left <= box[0] and box[2] <= right and bottom <= box[1] and box[3] <= top + LINE
-        free = all(
-            box[2] <= a or c <= box[0] or box[3] <= b or d <= box[1] for a, b, c, d in self._taken
-        )
-        if inside and free:
-            self._taken.append(box)
-        return inside and free
+        costs = [
+            self._covered(box)
+            if left <= box[0] and box[2] <= right and bottom <= box[1] and box[3] <= top + LINE
+            and not any(_meet(box, one) for one in self._taken)
+            else np.inf
+            for box in boxes
+        ]  # fmt: skip
+        found = int(np.argmin(costs))
+        if not np.isfinite(costs[found]):
+            return None
+        self._taken.append(boxes[found])
+        return found
+
+    def _covered(self, box: Box) -> float:
+        """How many points of curves lie in a box."""
+        x, y = self._curves.T
+        return float(((box[0] < x) & (x < box[2]) & (box[1] < y) & (y < box[3])).sum())
 
     def _write(
         self, text: str, offset: tuple[float, float], place: tuple[float, float],
@@ -103,6 +161,12 @@ class Labels:
             text, place, xycoords=coordinates, xytext=offset, textcoords="offset points",
             fontsize=SIZE, annotation_clip=False, zorder=6, **look,
         )  # fmt: skip
+
+
+def _meet(one: Box, other: Box) -> bool:
+    return not (
+        one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+    )
 
 
 def _above(dy: float) -> str:

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Lines, Modes, Panel, Picture, Place, Table
+from ccd_casadi.drawing.content import Curve, Lines, Modes, Panel, Picture, Place, Table
 from ccd_casadi.drawing.labels import Labels, inside
 from ccd_casadi.drawing.page import table_html
-from ccd_casadi.drawing.svg import WIDTH, log_axis, new_figure, place, style, to_svg
+from ccd_casadi.drawing.svg import WIDTH, at_both_widths, log_axis, new_figure, place, style, to_svg
 from ccd_casadi.drawing.turntable import modes_html
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEAST_POINTS = 8  # of a curve that values are read off
-LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.12, 0.52, 0.22  # inches around the axes of a panel
+LEFT, RIGHT, BOTTOM, TOP = 0.82, 0.2, 0.52, 0.22  # inches around the axes of a panel
 
 
 def figure_lines(figure: Lines, key: str) -> str:
@@ -38,6 +38,10 @@ def figure_lines(figure: Lines, key: str) -> str:
 
 def _placed(what: Place, width: float, height: float, key: str, title: str) -> str:
     match what:
+        case Panel() if width == WIDTH:
+            return at_both_widths(
+                lambda own, inches: _picture(what, inches, height, own, title), key, width
+            )
         case Panel():
             return _picture(what, width, height, key, title)
         case Modes():
@@ -82,7 +86,7 @@ def _for_cursor(axes: "Axes", panel: Panel, height: float) -> str:
 def _draw(axes: "Axes", panel: Panel) -> None:
     for band in panel.bands:
         axes.fill_between(
-            band.x, band.low, band.high, color=band.colour, alpha=0.18, linewidth=0.0,
+            band.x, band.low, band.high, color=band.colour, alpha=0.4, linewidth=0.6,
             label=band.label or None,
         )  # fmt: skip
     for area in panel.forbidden:
@@ -91,7 +95,8 @@ def _draw(axes: "Axes", panel: Panel) -> None:
         axes.plot(
             curve.x, curve.y, color=curve.colour, linestyle=curve.line or "none",
             marker=curve.marker or None, linewidth=curve.width, label=curve.label or None,
-            markerfacecolor="white" if curve.line else curve.colour, clip_on=not curve.marker,
+            markerfacecolor="white" if curve.line else curve.colour,
+            clip_on=not curve.marker or _leaves(panel, curve),
             gid=f"curve{i}",
         )  # fmt: skip
     axes.set_xlabel(panel.x_label)
@@ -107,15 +112,23 @@ def _draw(axes: "Axes", panel: Panel) -> None:
             [mark.x], [mark.y], mark.marker, color=mark.colour, markersize=5.0, zorder=5,
         )  # fmt: skip
     labels = Labels(axes)
+    for curve in panel.curves:
+        labels.avoid_curve(curve.x, curve.y, joined=bool(curve.line))
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     for mark in panel.marks:
-        labels.beside(mark.x, mark.y, mark.text, mark.offset)
+        labels.beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
-    labelled = any([*(c.label for c in panel.curves), *(b.label for b in panel.bands)])
-    if labelled and panel.legend is not None:
-        axes.legend(loc=panel.legend)
+    labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]
+    named = [label for label in labelled if label]
+    if named and panel.legend is not None:
+        axes.legend(loc=labels.legend_at(named, panel.legend), borderaxespad=0.2)
+
+
+def _leaves(panel: Panel, curve: Curve) -> bool:
+    """Whether a curve goes on beyond the top of its panel."""
+    return panel.y_range is not None and bool(np.nanmax(curve.y, initial=0.0) > panel.y_range[1])
 
 
 def _ranges(axes: "Axes", panel: Panel) -> None:

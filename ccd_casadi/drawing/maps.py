@@ -10,7 +10,9 @@ from ccd_casadi.drawing.svg import (
     COLOUR_MAP,
     CYCLE,
     GREY,
+    NARROW,
     ORANGE,
+    at_both_widths,
     axis_label,
     log_axis,
     new_figure,
@@ -25,14 +27,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAP_WIDTH = 8.4  # inches
+RING, GROUND = "#fdfdfd", "#121212"  # of markers on a map: in both themes, unlike the page's own
 
 
 def figure_landscape(land: Landscape, key: str) -> str:
     """Filled contours of ω_b*(θ) with true samples, paths and the optimum."""
+    return at_both_widths(lambda own, inches: _landscape(land, own, inches), key, MAP_WIDTH)
+
+
+def _landscape(land: Landscape, key: str, width: float) -> str:
     from matplotlib.patches import Rectangle
 
     with style():
-        figure, axes = _map_axes()
+        figure, axes = _map_axes(width)
         axes.grid(False)
         axes.set_facecolor("#eeeeee")
         truths = land.truths.reshape(-1, 3)
@@ -45,14 +52,11 @@ def figure_landscape(land: Landscape, key: str) -> str:
         if land.forbidden is not None and land.forbidden.any():
             _shade(axes, land.first, land.second, land.forbidden.astype(float) - 0.5)
         if len(land.designs):
-            axes.plot(*land.designs.T, ".", color="white", markersize=3.5, markeredgecolor=GREY,
-                      markeredgewidth=0.4, label="sampled designs", linestyle="none")  # fmt: skip
+            axes.plot(*land.designs.T, ".", color=RING, markersize=5.0, markeredgecolor=GROUND,
+                      markeredgewidth=0.6, label="sampled designs", linestyle="none")  # fmt: skip
         if len(truths):
             known = truths[np.isfinite(truths[:, 2])]
-            dots = axes.scatter(
-                known[:, 0], known[:, 1], c=known[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
-                edgecolors="white", linewidths=0.9, label=land.truth_label, zorder=3, clip_on=False,
-            )  # fmt: skip
+            dots = _dots(axes, known, norm, land.truth_label)
             filled = filled or dots
             lost = truths[~np.isfinite(truths[:, 2])]
             if len(lost):
@@ -67,7 +71,7 @@ def figure_landscape(land: Landscape, key: str) -> str:
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
-                      markeredgecolor="white", markeredgewidth=0.9, linestyle="none",
+                      markeredgecolor=RING, markeredgewidth=0.9, linestyle="none",
                       label="verified optimum")  # fmt: skip
         axes.set_xlim(land.first[0], land.first[-1])
         axes.set_ylim(land.second[0], land.second[-1])
@@ -76,13 +80,18 @@ def figure_landscape(land: Landscape, key: str) -> str:
         which = "largest bandwidth ω_b*" if land.bandwidth_hz.size else "bandwidth ω_b"
         _colour_bar(figure, filled, axis_label(which, "Hz"))
         _legend(figure, axes)
-        return to_svg(figure, key, "Landscape of the largest bandwidth over the two parameters")
+        title = "Landscape of the largest bandwidth over the two parameters"
+        return to_svg(figure, key, title, share=_share(width))
 
 
 def figure_sweep(sweep: SweepMap, key: str) -> str:
     """ω_b over (ω_S, ω_T) at one θ; what S_max and S_low forbid is hatched."""
+    return at_both_widths(lambda own, inches: _sweep(sweep, own, inches), key, MAP_WIDTH)
+
+
+def _sweep(sweep: SweepMap, key: str, width: float) -> str:
     with style():
-        figure, axes = _map_axes()
+        figure, axes = _map_axes(width)
         axes.grid(False)
         shown = sweep.bandwidth_hz if sweep.bandwidth_hz.size else sweep.rows[:, 2]
         filled, norm = _contours(axes, sweep.omega_S, sweep.omega_T, sweep.bandwidth_hz, shown)
@@ -94,14 +103,11 @@ def figure_sweep(sweep: SweepMap, key: str) -> str:
                                  colors=BLACK, linewidths=1.1, linestyles=line)  # fmt: skip
                     axes.plot([], [], color=BLACK, linestyle=line, linewidth=1.1, label=label)
         inside = sweep.rows[:, 5] > 0.5
-        colours = {"c": sweep.rows[inside, 2], "cmap": COLOUR_MAP, "norm": norm}
-        dots = axes.scatter(sweep.rows[inside, 0], sweep.rows[inside, 1], s=30, zorder=3,
-                            edgecolors="white", linewidths=0.9, clip_on=False,
-                            label="synthesis, feasible", **colours)  # fmt: skip
+        dots = _dots(axes, sweep.rows[inside], norm, "synthesis, feasible")
         axes.plot(sweep.rows[~inside, 0], sweep.rows[~inside, 1], "x", color=BLACK, markersize=5,
                   clip_on=False, linestyle="none", label="synthesis, infeasible")  # fmt: skip
         axes.plot([sweep.optimum[0]], [sweep.optimum[1]], "*", color=ORANGE, markersize=15,
-                  markeredgecolor="white", markeredgewidth=0.9, zorder=7, clip_on=False,
+                  markeredgecolor=RING, markeredgewidth=0.9, zorder=7, clip_on=False,
                   linestyle="none", label="verified optimum")  # fmt: skip
         log_axis(axes.xaxis, *_ends(sweep.omega_S, sweep.rows[:, 0]))
         log_axis(axes.yaxis, *_ends(sweep.omega_T, sweep.rows[:, 1]))
@@ -109,13 +115,28 @@ def figure_sweep(sweep: SweepMap, key: str) -> str:
         axes.set_ylabel(axis_label("ω_T of the weight on T", "Hz"))
         _colour_bar(figure, filled or dots, "bandwidth ω_b (Hz)")
         _legend(figure, axes)
-        return to_svg(figure, key, "Bandwidth over the two break frequencies at the optimum")
+        title = "Bandwidth over the two break frequencies at the optimum"
+        return to_svg(figure, key, title, share=_share(width))
 
 
-def _map_axes() -> tuple["Figure", "Axes"]:
+def _share(width: float) -> float:
+    """Of the column, in %."""
+    return 100.0 if width == NARROW else 0.0
+
+
+def _dots(axes: "Axes", rows: Array, norm: Any, label: str) -> Any:
+    """Dots (x, y, value) in the map's colours; light and dark rings tell them from any colour."""
+    axes.scatter(rows[:, 0], rows[:, 1], s=62, color=GROUND, zorder=2.9, clip_on=False)
+    return axes.scatter(rows[:, 0], rows[:, 1], c=rows[:, 2], cmap=COLOUR_MAP, norm=norm, s=34,
+                        edgecolors=RING, linewidths=1.1, label=label, zorder=3,
+                        clip_on=False)  # fmt: skip
+
+
+def _map_axes(width: float) -> tuple["Figure", "Axes"]:
     """A map's axes, with room for the colour bar on the right and the legend below."""
-    figure = new_figure(5.4, MAP_WIDTH)
-    return figure, place(figure, 0.75, 1.1, MAP_WIDTH - 2.05, 4.15)
+    figure = new_figure(5.4, width)
+    low = 1.1 if width == MAP_WIDTH else 1.5
+    return figure, place(figure, 0.75, low, width - 2.05, 5.25 - low)
 
 
 def _contours(axes: "Axes", x: Array, y: Array, field: Array, shown: Array) -> tuple[Any, Any]:
@@ -172,7 +193,9 @@ def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
 
 def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
     if filled is not None:
-        beside = place(figure, MAP_WIDTH - 1.15, 1.1, 0.17, 4.15)
+        width, height = figure.get_size_inches()
+        low, tall = (height * v for v in figure.axes[0].get_position().bounds[1::2])
+        beside = place(figure, width - 1.15, low, 0.17, tall)
         bar = figure.colorbar(filled, cax=beside)
         bar.set_label(label)
         bar.outline.set_linewidth(0.5)
@@ -181,7 +204,7 @@ def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:
 
 def _legend(figure: "Figure", axes: "Axes") -> None:
     handles, labels = axes.get_legend_handles_labels()
-    columns = 3 if len(labels) > 4 else 4
+    columns = 2 if figure.get_figwidth() == NARROW else 3 if len(labels) > 4 else 4
     figure.legend(handles, labels, loc="lower center", ncols=columns, frameon=False)
 
 

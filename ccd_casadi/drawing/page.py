@@ -35,19 +35,20 @@ CSS = (
 
 def escape(text: object) -> str:
     """Text for HTML, quotes included; control characters show as a replacement sign."""
-    kept = "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in str(text))
+    kept = "".join(c if c.isprintable() or c in "\n\t\xa0" else "\ufffd" for c in str(text))
     return _escape(kept)
 
 
 def typeset(text: str) -> str:
-    """Words that a terminal shows in ASCII, with the signs that are meant.
+    """Words that a terminal shows in ASCII, with the signs that are meant; units keep their number.
 
-    >>> typeset("less than +-2 %, norm <= 3, 41 um")
-    'less than ±2 %, norm ≤ 3, 41 µm'
+    >>> typeset("less than +-2 %, norm <= 3, 41 um").replace("\xa0", "~")
+    'less than ±2~%, norm ≤ 3, 41~µm'
     """
     for plain, sign in (("+-", "±"), ("<=", "≤"), (">=", "≥")):
         text = text.replace(plain, sign)
-    return re.sub(r"(?<=\d) u(?=[ms]\b)", " µ", text)
+    text = re.sub(r"(?<=\d) u(?=[ms]\b)", " µ", text)
+    return re.sub(r"(?<=\d) (?=(?:%|°|[GMkmµn]?(?:Hz|kg|N|m|s)\b))", "\xa0", text)
 
 
 def table_html(table: Table) -> str:

@@ -48,7 +48,7 @@ def block_html(block: c.Block, key: str) -> str:
         case c.Source(text):
             return f"<pre>{escape(text)}</pre>"
         case c.Bullets(items):
-            return f"<ul>{''.join(f'<li>{escape(words)}</li>' for words in items)}</ul>"
+            return f"<ul>{''.join(f'<li>{escape(typeset(words))}</li>' for words in items)}</ul>"
         case c.Links(pages):
             linked = (f'<li><a href="{escape(to)}">{escape(title)}</a>: {escape(words)}</li>'
                       for to, title, words in pages)  # fmt: skip

@@ -6,7 +6,7 @@ figures live in one document; nothing in it depends on the day it was made.
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from html import escape
 from io import StringIO
@@ -38,6 +38,7 @@ VARIABLES = {light: f"var(--{name})" for name, (light, _) in THEME.items()}
 VARIABLES["#000000"] = "var(--ink)"
 COLOUR_MAP = "viridis"
 WIDTH = 10.0  # inches; a page column of about 950 px shows 10 pt text as 13 px
+NARROW = 4.6  # inches of the same figure on a screen of a telephone
 LONGEST_LABEL = 40
 
 
@@ -58,6 +59,15 @@ def new_figure(height: float, width: float = WIDTH) -> "Figure":
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height))
+
+
+def at_both_widths(draw: Callable[[str, float], str], key: str, width: float) -> str:
+    """A figure of a whole column as drawn at this width, and beside it for a narrow screen.
+
+    `draw(key, inches)`; the page's rules show one of both.
+    """
+    wide, narrow = draw(key, width), draw(f"{key}-n", NARROW)
+    return f'<div class="whole">{wide}</div><div class="narrow">{narrow}</div>'
 
 
 def place(figure: "Figure", left: float, bottom: float, width: float, height: float) -> "Axes":
@@ -123,7 +133,8 @@ def log_axis(axis: Any, low: float, high: float) -> None:
     decades = np.log10(high / low)
     subs = (1.0,) if decades > 2.2 else (1.0, 2.0, 5.0)
     axis.set_major_locator(LogLocator(subs=subs, numticks=max(3, int(min(decades, 8.0)) + 2)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+    plain = low > 0.0009 and high < 20000.0  # one way of writing on one axis
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value, plain)))
     axis.set_minor_locator(NullLocator())
     if decades <= 5.0:
         _minor_ticks(axis, low, high)
@@ -150,15 +161,15 @@ def _minor_ticks(axis: Any, low: float, high: float) -> None:
     axes.add_artist(line)
 
 
-def power_of_ten(value: float) -> str:
-    """Tick label of a logarithmic axis: 0.001 to 10 000 as they are, the others as powers.
+def power_of_ten(value: float, plain: bool = False) -> str:
+    """Tick label of a logarithmic axis: a power of ten, or the number as it is.
 
-    >>> power_of_ten(100.0), power_of_ten(1e-7), power_of_ten(5e6)
-    ('100', '10⁻⁷', '5·10⁶')
+    >>> power_of_ten(100.0, plain=True), power_of_ten(1.0), power_of_ten(1e-7), power_of_ten(5e6)
+    ('100', '1', '10⁻⁷', '5·10⁶')
     """
     if value <= 0.0:
         return ""
-    if 0.0009 < value < 20000.0:
+    if plain or abs(value - 1.0) < 1e-6:
         return f"{value:g}"
     exponent = int(np.floor(np.log10(value) + 1e-9))
     lead = value / 10.0**exponent

@@ -23,12 +23,18 @@ from ccd_casadi.support.worker_process import become_worker
 
 BEHIND = 10  # niceness of what fills the box
 
+Progress = Callable[[str], None]
 Then = Callable[[Any], None]
 Failed = Callable[[BaseException], None]
 
 
-def _prepare(user_code: bool, behind: bool) -> None:
+_words: Any = None  # in a worker: where it tells how far it is
+
+
+def _prepare(user_code: bool, behind: bool, words: Any) -> None:
     """In a worker: one BLAS thread, Ctrl-C left to the parent, and no life beyond it."""
+    global _words
+    _words = words
     if behind and hasattr(os, "nice"):
         os.nice(BEHIND)  # the page comes first
     threadpool_limits(limits=1)
@@ -36,10 +42,15 @@ def _prepare(user_code: bool, behind: bool) -> None:
     become_worker()
 
 
+def _working(given: tuple[Callable[[Any, Progress], Any], Any]) -> Any:
+    work, task = given
+    return work(task, _words.put)
+
+
 class Background:
     """One process for what the user waits for, the others for what makes dragging better.
 
-    `then` and `failed` are called in another thread.
+    `then`, `failed` and `told` are called in another thread.
     """
 
     def __init__(self, workers: int, user_code: bool = True) -> None:
@@ -47,18 +58,30 @@ class Background:
         self._user_code = user_code
         self._pools: dict[str, ProcessPoolExecutor] = {}  # made when they are needed
         self._closed = False
+        self._context = multiprocessing.get_context("spawn")
+        self._words = self._context.SimpleQueue()
+        self._told: Progress = lambda words: None
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _listen(self) -> None:
+        while (words := self._words.get()) is not None:
+            self._told(words)
 
     def _pool(self, name: str) -> ProcessPoolExecutor:
         if name not in self._pools:
-            context = multiprocessing.get_context("spawn")
+            given = (self._user_code, name == "filling", self._words)
             self._pools[name] = ProcessPoolExecutor(
-                self._sizes[name], context, _prepare, (self._user_code, name == "filling")
+                self._sizes[name], self._context, _prepare, given
             )
         return self._pools[name]
 
-    def ask(self, work: Callable[[Any], Any], task: Any, then: Then, failed: Failed) -> Future:
-        """Do what the user waits for; one after the other."""
-        return self._submit("asked", work, task, then, failed)
+    def ask(
+        self, work: Callable[[Any, Progress], Any], task: Any, then: Then, failed: Failed,
+        told: Progress = lambda words: None,
+    ) -> Future:  # fmt: skip
+        """Do what the user waits for, one after the other; `told` hears how far the work is."""
+        self._told = told
+        return self._submit("asked", _working, (work, task), then, failed)
 
     def fill(self, session: Session, problem: CoDesignProblem, told: Callable[[], None]) -> None:
         """Sample a slow plant over its box and fit the surrogate of its modes again and again.
@@ -117,6 +140,7 @@ class Background:
     def close(self) -> None:
         """End what is under way."""
         self._closed = True
+        self._words.put(None)
         for pool in self._pools.values():
             running = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)

@@ -14,11 +14,16 @@ from ccd_casadi.support.units import shown_unit
 STEPS = 1000  # of a slider of θ
 WIDER = 10.0  # the ranges of ω_S and ω_T may be dragged so far beyond those of the case
 DARK = ".bk-input { background-color: #2b3238; color: #e0e0e0; }"  # the theme is of figures only
-STRUCTURES: tuple[Any, ...] = ("h_infinity", "h_infinity_disturbance", "sections")
+STRUCTURES: tuple[Any, ...] = (
+    ("h_infinity", "mixed sensitivity"),
+    ("h_infinity_disturbance", "mixed sensitivity with a disturbance"),
+    ("sections", "fixed structure (sections)"),
+)
 
 
 class Controls:
-    """Widgets for all that `Knobs` says; `changed` is called with True when one is let go."""
+    """Widgets for all that `Knobs` says. `changed` is called with whether one was let go, and
+    whether it is one that a search answers: S_max and the ranges do nothing to one synthesis."""
 
     def __init__(self, case: Case, start: Knobs, changed: Any, dark: bool) -> None:
         units = [shown_unit(p.unit, p.upper) for p in case.theta]
@@ -26,40 +31,49 @@ class Controls:
         self._start, self._theta = start, []
         self.quiet = False  # while they are set from here
         for p, (unit, k), value in zip(case.theta, units, start.theta, strict=True):
-            self._theta.append(Slider(
-                name=f"theta_{p.name}", title=f"{p.name} ({unit})" if unit else p.name,
-                start=k * p.lower, end=k * p.upper, step=k * (p.upper - p.lower) / STEPS,
-                value=k * value, format="0.000",
+            self._theta.append(_slider(
+                f"theta_{p.name}", f"{p.name} ({unit})" if unit else p.name, k * p.lower,
+                k * p.upper, k * (p.upper - p.lower) / STEPS, k * value, "0.000",
             ))  # fmt: skip
         high = max(3.0, 1.2 * start.S_max)
-        self.S_max = Slider(name="S_max", title="S_max", start=1.05, end=high, step=0.005,
-                            value=start.S_max, format="0.000")  # fmt: skip
+        self.S_max = _slider("S_max", "S_max", 1.05, high, 0.005, start.S_max, "0.000")
         self.omega_S = _frequencies("omega_S", "ω_S (Hz), range searched", start.omega_S_hz)
         self.omega_T = _frequencies("omega_T", "ω_T (Hz), range searched", start.omega_T_hz)
-        self.shift = Slider(name="shift", title="resonances known to ± (share)", start=0.0, end=0.2,
-                            step=0.005, value=start.resonance_shift, format="0.000")  # fmt: skip
+        self.shift = _slider("shift", "resonances known to ±", 0.0, 0.2, 0.005,
+                             start.resonance_shift, "0.0%")  # fmt: skip
         self.sampled = Checkbox(name="sampled", label="as sampled: hold and delay",
                                 active=start.sampled)  # fmt: skip
-        self.rate = Slider(name="rate", title="rate (Hz)", start=3.0, end=5.0, step=0.01,
-                           value=float(np.log10(start.rate_hz)), format=_power())  # fmt: skip
-        self.delay = Slider(name="delay", title="delay (µs)", start=0.0,
-                            end=max(1000.0, start.delay_us), step=5.0, value=start.delay_us,
-                            format="0")  # fmt: skip
+        self.rate = _slider("rate", "rate (Hz)", 3.0, 5.0, 0.01, float(np.log10(start.rate_hz)),
+                            _power())  # fmt: skip
+        self.delay = _slider("delay", "delay (µs)", 0.0, max(1000.0, start.delay_us), 5.0,
+                             start.delay_us, "0")  # fmt: skip
         self.structure = Select(name="structure", title="controller", value=start.structure,
                                 options=[*STRUCTURES],
                                 stylesheets=[DARK] if dark else [])  # fmt: skip
         self.always = Checkbox(name="always", label="full search while dragging", active=False)
-        sliders = [*self._theta, self.S_max, self.omega_S, self.omega_T, self.shift, self.rate,
-                   self.delay]  # fmt: skip
-        for slider in sliders:
-            slider.on_change("value", lambda attr, old, new: self._tell(changed, False))
-            slider.on_change("value_throttled", lambda attr, old, new: self._tell(changed, True))
-        self.structure.on_change("value", lambda attr, old, new: self._tell(changed, True))
-        self.sampled.on_change("active", lambda attr, old, new: self._tell(changed, True))
+        of_search = (self.S_max, self.omega_S, self.omega_T)
+        for slider in (*self._theta, *of_search, self.shift, self.rate, self.delay):
+            self._heard(slider, changed, slider in of_search)
+        for chosen, what in ((self.structure, "value"), (self.sampled, "active")):
+            chosen.on_change(what, lambda attr, old, new: self._tell(changed, True, True))
+        self._hide()
 
-    def _tell(self, changed: Any, let_go: bool) -> None:
+    def _heard(self, slider: Any, changed: Any, search: bool) -> None:
+        slider.on_change("value", lambda attr, old, new: self._tell(changed, False, search))
+        slider.on_change("value_throttled", lambda attr, old, new: self._tell(changed, True, True))
+
+    def _tell(self, changed: Any, let_go: bool, search: bool) -> None:
+        if let_go:
+            self._hide()
         if not self.quiet:
-            changed(let_go)
+            changed(let_go, search)
+
+    def _hide(self) -> None:
+        """What does nothing to this kind of controller, or to a loop that is not sampled."""
+        sections = self.structure.value == "sections"
+        for widget in (self.omega_S, self.omega_T, self.always):
+            widget.visible = not sections
+        self.rate.visible = self.delay.visible = bool(self.sampled.active)
 
     def all(self) -> list[Any]:
         """The widgets, from top to bottom."""
@@ -92,8 +106,16 @@ class Controls:
             self.omega_T.value = _logarithms(knobs.omega_T_hz)
             self.structure.value, self.sampled.active = knobs.structure, knobs.sampled
             self.rate.value, self.delay.value = float(np.log10(knobs.rate_hz)), knobs.delay_us
+            self._hide()
         finally:
             self.quiet = False
+
+
+def _slider(
+    name: str, title: str, low: float, high: float, step: float, value: float, form: Any
+) -> Slider:
+    return Slider(name=name, title=title, start=low, end=high, step=step, value=value, format=form,
+                  tooltips=False)  # fmt: skip
 
 
 def _power() -> CustomJSTickFormatter:
@@ -106,7 +128,7 @@ def _frequencies(name: str, title: str, hz: tuple[float, float]) -> RangeSlider:
     reach = float(np.log10(WIDER))
     return RangeSlider(
         name=name, title=title, start=low - reach, end=high + reach, step=0.01, value=(low, high),
-        format=_power(),
+        format=_power(), tooltips=False,
     )  # fmt: skip
 
 

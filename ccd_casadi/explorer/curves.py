@@ -6,7 +6,7 @@ import numpy as np
 
 from ccd_casadi.analysis.loop_figures import step_response
 from ccd_casadi.analysis.loop_view import LoopView, loop_view
-from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
 from ccd_casadi.deployment.given_controller import in_discrete_time
@@ -20,10 +20,8 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.classical_margins import ClassicalMargins, least_margins
 
 POINTS = 180  # of the frequency grid, besides those around resonances
 STEP_POINTS = 240
@@ -37,15 +35,11 @@ AT_REST = Move(NONE, NONE, NONE, NONE, np.zeros((0, 1)), False, 0.0, WINDOW)
 class Curves:
     """Of one design: its loop on the plant looked at, over frequency and over time.
 
-    `loci` (k, p): eigenvalues of L = GK. `margins`: the least of the loops broken one at a time at
-    the plant's inputs. Poles of the loop (of a sampled one ln(z)/T), of K and of G: complex, Hz.
-    `step`: y of the first output (s) after a step of its reference. An unstable loop has no step
-    and no move (`AT_REST`).
+    Poles of the loop (of a sampled one ln(z)/T), of K and of G: complex, Hz. `step`: y of the first
+    output (s) after a step of its reference. An unstable loop has no step and no move (`AT_REST`).
     """
 
     view: LoopView
-    loci: np.ndarray
-    margins: ClassicalMargins
     controller_poles: np.ndarray
     plant_poles: np.ndarray
     poles: np.ndarray
@@ -82,8 +76,9 @@ def curves_of(look: Look) -> Curves | None:
     bandwidth = look.bandwidth_hz if np.isfinite(look.bandwidth_hz) else plant.omega_0 / HZ
     gamma = float(np.nan_to_num(look.figures.certificate.norm_bound))
     bounded = kind_of(problem).bounded(look.weights, gamma, look.bandwidth_hz)
-    view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=False,
-                     special=(look.figures.sensitivity_peak_frequency / HZ,))  # fmt: skip
+    f = look.figures
+    top = (f.sensitivity_peak_frequency / HZ, f.sensitivity_peak)
+    view = loop_view([loop], bounded, bandwidth_hz=bandwidth, points=POINTS, peaks=(top,))
     time, step, move = NONE, NONE, AT_REST
     if loop.stable:
         first = np.eye(len(loop.plant.C))[0]
@@ -91,8 +86,6 @@ def curves_of(look: Look) -> Curves | None:
         step, move = y[:, 0], _move(look, loop, bandwidth)
     return Curves(
         view=view,
-        loci=loci_of(view.open[0], np.inf),
-        margins=least_margins(loop.responses, HZ * view.hz),
         controller_poles=K.poles / HZ,
         plant_poles=loop.plant.poles / HZ,
         poles=loop.poles / HZ,
@@ -105,7 +98,7 @@ def curves_of(look: Look) -> Curves | None:
 def _move(look: Look, loop: Loop, bandwidth_hz: float) -> Move:
     """The default one of robustness, its rigid bodies free where that loop is stable."""
     modal = modal_plant(look.elements.system, Suspension(0.0, 0.0))
-    free = replace(loop, plant=free_plant(modal))
+    free = replace(loop, plant=modal.state_space)
     ((made,),) = moves(
         [loop], [free], [mass_feedforward(modal, 0)], setpoint(LIMITS), axis=0, window=WINDOW,
         bandwidth_hz=bandwidth_hz, doublings=1,

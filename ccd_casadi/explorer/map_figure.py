@@ -5,16 +5,22 @@ from typing import Any
 
 import numpy as np
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
+from bokeh.models import (
+    ColorBar,
+    ColumnDataSource,
+    LinearColorMapper,
+    NumeralTickFormatter,
+    Range1d,
+)
 from bokeh.models.widgets.inputs import Select
 from bokeh.models.widgets.markups import Div
 from bokeh.plotting import figure
 
 from ccd_casadi.cases.sections import Parameter
+from ccd_casadi.drawing.content import Landscape
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.drawing.svg import GREY, ORANGE
 from ccd_casadi.explorer.controls import DARK
-from ccd_casadi.explorer.landscape import Field
 from ccd_casadi.explorer.message import Change
 from ccd_casadi.support.units import shown_unit
 
@@ -41,6 +47,7 @@ class MapFigure:
         self._colours = LinearColorMapper(palette="Viridis256", nan_color="#80808050")
         self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
         self._dots = ColumnDataSource({"x": [], "y": [], "hz": []})
+        self._designs = ColumnDataSource({"x": [], "y": []})
         self._here = ColumnDataSource({"x": [], "y": []})
         self._x, self._y = Range1d(start=0.0, end=1.0), Range1d(start=0.0, end=1.0)
         made: Any = figure(
@@ -51,9 +58,13 @@ class MapFigure:
         made.toolbar.logo = None
         made.image("image", "x", "y", "dw", "dh", source=self._image, color_mapper=self._colours)
         by_value = {"field": "hz", "transform": self._colours}
-        made.scatter("x", "y", source=self._dots, size=6, fill_color=by_value, line_color=GREY)
+        made.scatter("x", "y", source=self._designs, size=3, fill_color="white", line_color=GREY)
+        made.scatter("x", "y", source=self._dots, size=8, fill_color=by_value, line_color="white")
         made.scatter("x", "y", source=self._here, marker="star", size=18, fill_color=ORANGE,
                      line_color="white")  # fmt: skip
+        bar = ColorBar(color_mapper=self._colours, title="ω_b (Hz)", width=10,
+                       formatter=NumeralTickFormatter(format="0.[00]"))  # fmt: skip
+        made.add_layout(bar, "right")
         self._figure, self._words = made, Div()
 
     def root(self) -> Any:
@@ -76,24 +87,29 @@ class MapFigure:
         i, j = self.axes
         return self._units[i][1], self._units[j][1]
 
-    def show(self, found: Field) -> None:
+    def show(self, land: Landscape, words: str) -> None:
         """The landscape over the parameters chosen."""
-        known = np.concatenate([found.field.ravel(), found.samples[:, 2]])
+        x, y, hz = land.truths.T
+        known = np.concatenate([land.bandwidth_hz.ravel(), hz])
         known = known[np.isfinite(known)]
         if known.size:
-            self._colours.low, self._colours.high = float(known.min()), float(known.max()) + 1e-9
+            low, high = float(known.min()), float(known.max())
+            more = 0.5 if high - low < 1e-6 * high else 0.0
+            self._colours.update(low=low - more, high=high + more)
         k, m = self._scales()
-        x0, x1, y0, y1 = k * found.x[0], k * found.x[1], m * found.y[0], m * found.y[1]
+        first, second = k * land.first, m * land.second
         image: dict[str, list[Any]] = {name: [] for name in self._image.data}
-        if found.field.size:
-            places = ([found.field], [x0], [y0], [x1 - x0], [y1 - y0])
+        if land.bandwidth_hz.size:
+            places = ([land.bandwidth_hz.T], [first[0]], [second[0]], [np.ptp(first)],
+                      [np.ptp(second)])  # fmt: skip
             image = dict(zip(("image", "x", "y", "dw", "dh"), places, strict=True))
         self._image.data = image
-        x, y, hz = found.samples.T
         self._dots.data = {"x": k * x, "y": m * y, "hz": hz}
-        for axis, low, high in ((self._x, x0, x1), (self._y, y0, y1)):
-            margin = MARGIN * (high - low)
-            axis.update(start=low - margin, end=high + margin)
+        a, b = land.designs.T
+        self._designs.data = {"x": k * a, "y": m * b}
+        for axis, ends in ((self._x, first), (self._y, second)):
+            margin = MARGIN * float(ends[-1] - ends[0])
+            axis.update(start=float(ends[0]) - margin, end=float(ends[-1]) + margin)
         labels = [f"{self.names[i]} ({self._units[i][0]})".replace(" ()", "") for i in self.axes]
         self._figure.xaxis.axis_label, self._figure.yaxis.axis_label = labels
-        self._words.text = f"<p>{escape(found.words)}</p>"
+        self._words.text = f"<p>{escape(words)}</p>"

@@ -2,30 +2,35 @@
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from bokeh.document import Document
+from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import ColumnDataSource
+from bokeh.models import ColumnDataSource, CustomJS, Range1d
 from bokeh.models.widgets.buttons import Button
 from bokeh.models.widgets.markups import Div
 
+from ccd_casadi.cases.run_folder import read_run
 from ccd_casadi.drawing.page import escape
 from ccd_casadi.explorer.background import Background, Solve
 from ccd_casadi.explorer.controls import Controls
 from ccd_casadi.explorer.curves import curves_of, sampled_of, with_sampled
 from ccd_casadi.explorer.designs import How, Look
-from ccd_casadi.explorer.figures import Drawn, Figures
 from ccd_casadi.explorer.knobs import Knobs
-from ccd_casadi.explorer.landscape import field_of, run_surrogate
+from ccd_casadi.explorer.landscape import landscape_of, run_surrogate
 from ccd_casadi.explorer.map_figure import MapFigure
 from ccd_casadi.explorer.message import Message
 from ccd_casadi.explorer.modes import frequency_error, in_modal_form
-from ccd_casadi.explorer.pins import Pins
+from ccd_casadi.explorer.painter import ON_DARK, PanelFigure, cursor, legend_html
+from ccd_casadi.explorer.panels import EMPTY, FIGURES, LOOKS, OVER_HZ, Drawn, drawn
+from ccd_casadi.explorer.pins import Kept, Pins
 from ccd_casadi.explorer.sections import Designed, anchored, designed
 from ccd_casadi.explorer.session import Session, searched_exactly
 from ccd_casadi.explorer.words import end_words, machine_html, move_words, standing_html
 from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.package_text import package_text
 
 TOGETHER = 4  # ms without a move of a slider, then the moves before are answered at once
 WIDE = ".bk-clearfix { display: block; width: 100%; }"  # a picture takes the width that there is
@@ -39,18 +44,28 @@ class Page:
 
     def __init__(
         self, document: Document, session: Session, background: Background,
-        of_solves: Sequence[str], dark: bool,
+        of_solves: Sequence[str], dark: bool, kept: Kept,
     ) -> None:  # fmt: skip
         self.document, self.session, self.background = document, session, background
-        self._of_solves = of_solves  # their options
+        self._of_solves, self._dark, self._kept = of_solves, dark, kept  # options of solves
         parameters = session.case.theta
-        self.figures = Figures(dark)
+        hz, line = Range1d(start=0.1, end=1e4), cursor()
+        self.figures = [
+            PanelFigure(name, heading, dark, log_x=log_x, log_y=log_y,
+                        x_range=hz if name in OVER_HZ else None,
+                        cursor=line if name in OVER_HZ else None, whole_circles=name == "nyquist")
+            for name, (heading, log_x, log_y) in FIGURES.items()
+        ]  # fmt: skip
         self.controls = Controls(session.case, session.start, self.moved, dark)
-        self.pins = Pins(parameters, self.figures)
+        if kept.knobs is not None:
+            self.controls.put(kept.knobs)
+        self.pins = Pins(parameters, self.figures, kept, dark, session.case.objective.cost_unit)
         self.map = MapFigure(parameters, self.draw_map, dark)
         run = session.run
         self._surrogate = () if run is None else run_surrogate(run.folder)
         self._open, self._scheduled, self._let_go, self._moves = True, False, False, 0
+        self._of_search = False
+        self._first: tuple[str, float] | None = None  # the design at the start, and its ω_b in Hz
         self._seen: list[Look] = []  # to be written into the store
         self._newest: Knobs | None = None  # to be searched, while a search is under way
         self.now: Drawn | None = None
@@ -83,22 +98,29 @@ class Page:
         wrapped = row(*buttons, sizing_mode=fill, styles={"flex-wrap": "wrap"})
         roots: dict[str, list[Any]] = {
             "controls": self.controls.all(),
-            "note_place": [self.note, self.filling],
+            "note_place": [self.note, self.filling, self.output],
             "modes": [self.modes],
-            "pins_place": [wrapped, self.output, self.pins.table],
+            "buttons_place": [wrapped],
+            "pins_place": [self.pins.table],
             "map_place": [self.map.root()],
-        } | {f"{name}_place": [made] for name, made in self.figures.all().items()}
+        } | {f"{made.name}_place": [made.figure] for made in self.figures}
         for name, parts in roots.items():
             for part in parts:
                 if part.sizing_mode is None:
                     part.sizing_mode = fill
             self.document.add_root(column(*parts, name=name, sizing_mode=fill))
+        names = {made.name: made.heading for made in self.figures} | {"landscape": "Landscape"}
+        label = CustomJS(args={"names": names}, code=package_text("explorer/assets/label.js"))
+        self.document.js_on_event(DocumentReady, label)
 
     # drags
 
-    def moved(self, let_go: bool) -> None:
-        """A slider moved: answer soon, once for all that moved meanwhile."""
-        self._let_go = self._let_go or let_go
+    def moved(self, let_go: bool, of_search: bool = False) -> None:
+        """A slider moved: answer soon, once for all that moved meanwhile.
+
+        `of_search`: it is one that a search alone answers.
+        """
+        self._let_go, self._of_search = self._let_go or let_go, self._of_search or of_search
         self._moves += 1
         if not self._scheduled:
             self._scheduled = True
@@ -129,10 +151,12 @@ class Page:
 
     def _answer(self) -> None:
         self._scheduled, let_go, self._let_go = False, self._let_go, False
-        knobs = self.controls.knobs()
+        search = self._of_search and self.session.quick
+        self._of_search = False
+        self._kept.knobs = knobs = self.controls.knobs()
         sections = knobs.structured
         self.design.disabled = not sections
-        full = (let_go or bool(self.controls.always.active)) and not sections
+        full = (let_go or search or bool(self.controls.always.active)) and not sections
         behind = full and self.session.known is not None
         try:
             here = full and not behind
@@ -154,23 +178,29 @@ class Page:
         """Draw a design, and say that this is the answer."""
         sampled = sampled_of(look) if look.knobs.sampled else None
         look = with_sampled(look, sampled)
-        self.now = Drawn(look, curves_of(look), sampled)
-        session, pinned = self.session, [drawn for _, drawn in self.pins.pinned]
-        machine = machine_html(look, session.start.theta, session.reference)
+        curves = curves_of(look)
+        self.now = now = drawn(look, curves, sampled)
+        session = self.session
         self._serial += 1
         answer = {"serial": [self._serial], "theta": [list(look.theta)], "how": [look.how.value]}
-        curves = self.now.curves
+        pinned = self.pins.pinned
+        beside = (pinned[-1][0], pinned[-1][1].look.bandwidth_hz) if pinned else self._first
         words = {
-            "verdict": standing_html(look, curves, sampled), "machine": machine,
-            "move_words": move_words(curves),
-        }  # fmt: skip
-        self._message.send(words, [
-            *self.figures.changes(self.now, pinned),
-            *(self.figures.frame(self.now) if look.how is not How.PRESENT else []),
-            self.map.mark(look.theta),
-            (self.answer, {"data": answer}),
-        ])  # fmt: skip
+            "verdict": standing_html(look, curves, sampled, beside),
+            "machine": machine_html(look, session.start.theta, session.reference),
+        } | {f"say_{made.name}": legend_html(now.panels.get(made.name, EMPTY))
+             for made in self.figures}  # fmt: skip
+        words["say_move"] = move_words(curves)
+        colour, dash = LOOKS[look.standing]
+        colour = ON_DARK.get(colour, colour) if self._dark else colour
+        frame = look.how is not How.PRESENT and curves is not None
+        changes = [change for made in self.figures for change in
+                   made.changes(now.panels.get(made.name, EMPTY), colour, dash, frame)]  # fmt: skip
+        changes += [self.map.mark(look.theta), (self.answer, {"data": answer})]
+        self._message.send(words, changes)
         self._seen.append(look)
+        if self._first is None and look.how is not How.PRESENT:
+            self._first = "the first one", look.bandwidth_hz
 
     def settle(self) -> None:
         """When the answer is on its way: write what was looked at, draw the landscape."""
@@ -188,9 +218,9 @@ class Page:
         run, store = self.session.run, self.session.store.path
         made_for = None if run is None else run.problem
         look = self.now.look
-        self.map.show(
-            field_of(look.problem, look.theta, made_for, self._surrogate, store, self.map.axes)
-        )
+        self.map.show(*landscape_of(
+            look.problem, look.theta, made_for, self._surrogate, store, self.map.axes
+        ))  # fmt: skip
         here, new = self.map.mark(look.theta)
         here.update(**new)
 
@@ -246,9 +276,14 @@ class Page:
         knobs = self.controls.knobs()
         problem = anchored(self.session.problems.at(knobs), self.session.designed_for)
         self.design.disabled = True
-        self.note.text = "<p>designing a controller at this θ …</p>"
+        self._designing("it takes seconds")
         done, failed = self._then(self._designed), self._then(self._failed)
-        self.background.ask(designed, (problem, knobs), done, failed)
+        told = self._then(self._designing)
+        self.background.ask(designed, (problem, knobs), done, failed, told)
+
+    def _designing(self, words: str) -> None:
+        if self.design.disabled:  # not of one that has ended
+            self.note.text = f"<p>designing a controller at this θ: {escape(words)} …</p>"
 
     def _designed(self, found: Designed) -> None:
         self.design.disabled, self.note.text = False, ""
@@ -303,9 +338,21 @@ class Page:
     def _ended(self, code: int) -> None:
         self.solve_button.disabled, self.stop.disabled = False, True
         self._said(f"the solve ended: {end_words(code)}")
+        if code in (0, 4):
+            self._go_to_solved()
         if (self._solved / "report.html").exists():
             place = f"{SOLVED}/{self._solved.name}/report.html"
             self.output.text += f'<p><a href="{place}" target="_blank">the report of it</a></p>'
+
+    def _go_to_solved(self) -> None:
+        """Its design on the sliders, its surrogate in the landscape."""
+        try:
+            run = read_run(self._solved)
+        except UserError:
+            return  # what it ended with is no certified design
+        self.session.run, self._surrogate = run, run_surrogate(run.folder)
+        self.controls.put(replace(self.controls.knobs(), theta=run.theta))
+        self.moved(True)
 
     def close(self) -> None:
         """The page was closed: a solve goes on only while somebody sees it."""
@@ -316,6 +363,6 @@ class Page:
 
 
 def _button(label: str, name: str, action: Callable[[], None]) -> Button:
-    made = Button(label=label, name=name, width=150)
+    made = Button(label=label, name=name, width=132)
     made.on_click(action)
     return made

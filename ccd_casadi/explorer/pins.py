@@ -1,71 +1,117 @@
 """The designs that were pinned: a table of them, and their curves beside the present one's."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from bokeh.models import ColumnDataSource
-from bokeh.models.widgets.tables import DataTable, NumberFormatter, TableColumn
+from bokeh.models.widgets.tables import (
+    CellEditor,
+    DataTable,
+    HTMLTemplateFormatter,
+    NumberFormatter,
+    StringEditor,
+    TableColumn,
+)
 
 from ccd_casadi.cases.sections import Parameter
-from ccd_casadi.explorer.figures import Drawn, Figures
+from ccd_casadi.drawing.svg import AMBER, BROWN, GREEN, ORANGE, PURPLE
+from ccd_casadi.explorer.knobs import Knobs
+from ccd_casadi.explorer.painter import ON_DARK, PanelFigure
+from ccd_casadi.explorer.panels import EMPTY, Drawn
 from ccd_casadi.explorer.words import pin_columns
 from ccd_casadi.support.units import shown_unit
 
 HEIGHT = 150
+COLOURS = (ORANGE, GREEN, PURPLE, AMBER, BROWN)
+DARK = """.slick-cell, .slick-header-column { background: #20262b !important; color: #e0e0e0; }
+.slick-cell.selected { background: #2f4a5e !important; }"""
+LINE = '<span style="color:<%= value %>">▬▬</span>'
+
+
+@dataclass
+class Kept:
+    """What outlives a reload of a tab: where its sliders stand, and its pins by name."""
+
+    knobs: Knobs | None = None
+    pinned: list[tuple[str, Drawn]] = field(default_factory=list)
+    count: int = 0
 
 
 class Pins:
-    """Pinned designs by name, in the order in which they were pinned."""
+    """Pinned designs, in the order in which they were pinned; a name may be changed in its cell."""
 
-    def __init__(self, parameters: Sequence[Parameter], figures: Figures) -> None:
-        self.names, self.figures = [p.name for p in parameters], figures
+    def __init__(
+        self, parameters: Sequence[Parameter], figures: Sequence[PanelFigure], kept: Kept,
+        dark: bool, cost_unit: str,
+    ) -> None:  # fmt: skip
+        self.names, self.figures, self.kept, self._dark = (
+            [p.name for p in parameters], figures, kept, dark,
+        )  # fmt: skip
         units = [shown_unit(p.unit, p.upper) for p in parameters]
         self._scales = [scale for _, scale in units]
-        self.pinned: list[tuple[str, Drawn]] = []
-        self.count = 0
-        self.source = ColumnDataSource(pin_columns(self.names, self._scales, []))
+        self.source = ColumnDataSource(pin_columns(self.names, self._scales, [], []))
+        self.source.on_change("data", lambda attr, old, new: self._renamed(new["design"]))
         thetas = [
-            (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000")
+            (f"theta_{name}", f"{name} ({unit})" if unit else name, "0.0000", 90)
             for name, (unit, _) in zip(self.names, units, strict=True)
         ]
-        heads = [("design", "design", ""), *thetas,
-                 ("S_max", "S_max", "0.000"), ("bandwidth", "ω_b (Hz)", "0.0000"),
-                 ("peak", "‖S‖∞", "0.0000"), ("cost", "hardware cost", "0.0000"),
-                 ("objective", "J", "0.0000"), ("standing", "standing", "")]  # fmt: skip
+        cost = f"hardware cost ({cost_unit})" if cost_unit else "hardware cost"
+        heads = [("colour", "", LINE, 40), ("design", "design", "", 90), *thetas,
+                 ("S_max", "S_max", "0.000", 70), ("bandwidth", "ω_b (Hz)", "0.0000", 90),
+                 ("peak", "‖S‖∞", "0.0000", 80), ("cost", cost, "0.0000", 130),
+                 ("objective", "J", "0.0000", 110), ("standing", "standing", "", 260)]  # fmt: skip
         self.table = DataTable(
-            name="pins", source=self.source, height=HEIGHT, index_position=None,
-            sizing_mode="stretch_width", reorderable=False,
-            columns=[_column(field, title, form) for field, title, form in heads],
+            name="pins", source=self.source, height=HEIGHT, index_position=None, editable=True,
+            sizing_mode="stretch_width", reorderable=False, stylesheets=[DARK] if dark else [],
+            columns=[_column(*head) for head in heads],
         )  # fmt: skip
+        self._show()
+
+    @property
+    def pinned(self) -> list[tuple[str, Drawn]]:
+        """Name and design of each."""
+        return self.kept.pinned
 
     def add(self, drawn: Drawn) -> None:
         """Pin one."""
-        self.count += 1
-        self.pinned.append((f"pin {self.count}", drawn))
+        self.kept.count += 1
+        self.pinned.append((f"pin {self.kept.count}", drawn))
         self._show()
 
     def drop(self) -> None:
         """Take the selected ones away, the last one where none is selected."""
         chosen = set(self._chosen()) or {len(self.pinned) - 1}
-        self.pinned = [pin for i, pin in enumerate(self.pinned) if i not in chosen]
+        self.pinned[:] = [pin for i, pin in enumerate(self.pinned) if i not in chosen]
         self._show()
 
     def selected(self) -> Drawn | None:
-        """The first of those selected."""
-        chosen = self._chosen()
+        """The first of those selected, the last one where none is; None without a pin."""
+        chosen = self._chosen() or ([len(self.pinned) - 1] if self.pinned else [])
         return self.pinned[chosen[0]][1] if chosen else None
 
     def _chosen(self) -> list[int]:
         return [i for i in self.source.selected.indices if i < len(self.pinned)]
 
+    def _renamed(self, names: Sequence[str]) -> None:
+        if len(names) == len(self.pinned):
+            pairs = zip(names, self.pinned, strict=True)
+            self.pinned[:] = [(str(name), drawn) for name, (_, drawn) in pairs]
+
     def _show(self) -> None:
         self.source.selected.indices = []
+        colours = [COLOURS[i % len(COLOURS)] for i in range(len(self.pinned))]
+        shown = [ON_DARK[colour] if self._dark else colour for colour in colours]
         looks = [(name, drawn.look) for name, drawn in self.pinned]
-        self.source.data = pin_columns(self.names, self._scales, looks)
-        self.figures.pin(self.pinned)
+        self.source.data = pin_columns(self.names, self._scales, looks, shown)
+        pinned = list(zip(colours, (drawn.panels for _, drawn in self.pinned), strict=True))
+        for made in self.figures:
+            made.pin([(colour, panels.get(made.name, EMPTY)) for colour, panels in pinned])
 
 
-def _column(field: str, title: str, form: str) -> Any:
-    if not form:
-        return TableColumn(field=field, title=title)
-    return TableColumn(field=field, title=title, formatter=NumberFormatter(format=form))
+def _column(name: str, title: str, form: str, width: int) -> TableColumn:
+    look: dict[str, Any] = {"editor": StringEditor() if name == "design" else CellEditor()}
+    if form:
+        made = HTMLTemplateFormatter(template=form) if "<" in form else NumberFormatter(format=form)
+        look["formatter"] = made
+    return TableColumn(field=name, title=title, width=width, **look)

@@ -14,6 +14,7 @@ from ccd_casadi.explorer.designs import Elements, How, Look, Standing, elements_
 from ccd_casadi.explorer.knobs import Knobs
 from ccd_casadi.fixed_structure import Certificate as SetCertificate
 from ccd_casadi.fixed_structure.channel_structure import controller_of
+from ccd_casadi.fixed_structure.design import Progress
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_system
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
@@ -55,11 +56,11 @@ def anchored(problem: CoDesignProblem, known: CoDesignProblem | None) -> CoDesig
     return replace(problem, controller=taken, start=known.start)
 
 
-def designed(task: tuple[CoDesignProblem, Knobs]) -> Designed:
+def designed(task: tuple[CoDesignProblem, Knobs], tell: Progress) -> Designed:
     """The best certified controller at θ from the problem's anchors, or from many starts."""
     problem, knobs = task
     if not sections_of_problem(problem).anchors:
-        problem = prepared(replace(problem, start=knobs.theta))[0]
+        problem = prepared(replace(problem, start=knobs.theta), progress=tell)[0]
     problem = with_range(problem)
     designs = problem_hash(problem.identity())
     inner = problem_hash({"problem": designs, "inner": problem.inner_identity()})

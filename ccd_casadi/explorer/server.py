@@ -13,8 +13,11 @@ from bokeh.server.server import Server
 from jinja2 import Template
 from tornado.web import StaticFileHandler
 
+from ccd_casadi.drawing.page import theme
 from ccd_casadi.explorer.background import Background
 from ccd_casadi.explorer.page import SOLVED, Page
+from ccd_casadi.explorer.panels import FIGURES
+from ccd_casadi.explorer.pins import Kept
 from ccd_casadi.explorer.session import Session
 
 HOST = "127.0.0.1"
@@ -40,6 +43,7 @@ class Explorer:
         self.session = session
         self.background = Background(workers, user_code)
         self._pages: list[Page] = []
+        self._kept: dict[str, Kept] = {}  # by the tab that the address names
         self._of_solves = ("--workers", str(workers), "--seed", str(seed))
         _require_event_loop()
         token = secrets.token_urlsafe(16)
@@ -65,16 +69,20 @@ class Explorer:
         context = document.session_context
         arguments = getattr(getattr(context, "request", None), "arguments", {})
         dark = arguments.get("dark", [b"0"])[0] == b"1"
+        tab = arguments.get("tab", [b""])[0].decode("ascii", "replace")
+        kept = self._kept.setdefault(tab, Kept()) if tab else Kept()
         document.title = f"Explorer: {self.session.case.path.name}"
         document.template = Template(TEMPLATE.read_text(encoding="utf-8"))
         document.template_variables["case"] = str(self.session.case.path)
         document.template_variables["folder"] = str(self.session.folder)
         document.template_variables["dark"] = dark
+        document.template_variables["css"] = f":root {{ {theme(int(dark))} }}"
+        document.template_variables["figures"] = FIGURES
         shown = 'document.getElementById("lost").hidden = '
         document.js_on_event(ConnectionLost, CustomJS(code=f"{shown}false"))
         document.js_on_event(ClientReconnected, CustomJS(code=f"{shown}true"))
         document.theme = "dark_minimal" if dark else "light_minimal"
-        page = Page(document, self.session, self.background, self._of_solves, dark)
+        page = Page(document, self.session, self.background, self._of_solves, dark, kept)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._gone(page))
 

@@ -1,6 +1,6 @@
 """What the explorer knows while it runs: the case, the store of its looks, pins, files written."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -24,6 +24,7 @@ from ccd_casadi.sampling.store import SampleStore
 from ccd_casadi.sampling.units import unit_of
 from surrogates.files import write_whole
 
+QUICK = 0.4  # s of a full search that a drag of S_max waits for
 SLOW = 0.1  # s that the model may take at a θ before it is solved in the background
 
 
@@ -43,6 +44,7 @@ class Session:
         began = perf_counter()
         first = elements_at(problem, self.start.theta)
         self.slow = perf_counter() - began > SLOW
+        self.search_seconds = np.inf  # of the last full search
         found = lumped(first.system)
         self.reference = 1.0 if found is None else float(np.abs(found.masses).max())
         self.known: KnownModes | None = None
@@ -96,8 +98,14 @@ class Session:
         """The inner problem at θ on the model itself."""
         problem = self.problems.at(knobs)
         look = searched(problem, knobs, elements_at(problem, knobs.theta))
+        self.search_seconds = look.seconds
         self.took(look)
         return look
+
+    @property
+    def quick(self) -> bool:
+        """Whether a full search is over within a drag's patience."""
+        return self.known is None and self.search_seconds < QUICK
 
     def took(self, look: Look) -> None:
         """A full search ended: its weights are those of the syntheses to come."""
@@ -156,7 +164,9 @@ class Session:
         return self.folder / f"{name}_{number}{suffix}"
 
 
-def searched_exactly(task: tuple[CoDesignProblem, Knobs]) -> tuple[Look, str]:
+def searched_exactly(
+    task: tuple[CoDesignProblem, Knobs], tell: Callable[[str], None]
+) -> tuple[Look, str]:
     """A full search on the model of a slow plant, and the pictures of its modes: for a worker."""
     problem, knobs = task
     elements = elements_at(problem, knobs.theta)

@@ -16,23 +16,31 @@ from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.support.units import HZ, number
 
 
-def standing_html(look: Look, curves: Curves | None, sampled: AsSampled | None) -> str:
-    """The verdict, the figures, what it survives, how it was chosen and on which plant."""
+def standing_html(
+    look: Look, curves: Curves | None, sampled: AsSampled | None,
+    beside: tuple[str, float] | None = None,
+) -> str:  # fmt: skip
+    """The verdict, ω_b and the figures, what it survives, how it was chosen and on which plant.
+
+    `beside`: another design's name and its ω_b in Hz, which the bandwidth is compared with.
+    """
     f, on = look.figures, look.elements
     standing = look.standing.value + (f": {look.reason}" if look.reason else "")
     near = look.standing is Standing.NEAR
     if not (on.exact or near or look.standing is Standing.REFUSED):
         standing += f"; on a plant whose frequencies are the model's to {100.0 * on.error:.2g} %"
-    facts = []
+    facts, answer = [], "– Hz"
     if look.standing is not Standing.REFUSED:
         c = f.certificate
         same = "of that plant ≈" if near else "="
-        facts = [
-            f"ω_b {same} {number(look.bandwidth_hz, 5)} Hz",
+        answer = f"{'≈ ' if near else ''}{number(look.bandwidth_hz, 4)} Hz"
+        if beside is not None and np.isfinite(beside[1]):
+            facts = [f"{look.bandwidth_hz - beside[1]:+.3g} Hz against {beside[0]}"]
+        facts += [
             f"‖S‖∞ {same} {number(f.sensitivity_peak, 5)} at "
             f"{number(f.sensitivity_peak_frequency / HZ, 4)} Hz",
             *([] if near else [f"J = {number(look.objective, 6)}"]),
-            f"hardware cost {number(look.cost, 6)}",
+            f"hardware cost {number(look.cost, 6)} {look.problem.cost_unit}".rstrip(),
         ]
         if look.kappa is None:
             facts.append(
@@ -42,11 +50,15 @@ def standing_html(look: Look, curves: Curves | None, sampled: AsSampled | None) 
         else:
             facts.append(f"at most {c.norm:.5g} of a bound on the corners of the plant set")
         if look.active:
-            facts.append(f"binding: {', '.join(look.active)}")
+            binding = ", ".join(look.active).replace("omega", "ω")
+            facts.append(f"binding: {binding}")
     how = f"{look.how.value}; modes: {on.words}"
     if curves is not None:
         how = f"{survival_words(curves)}; {how}"
-    shown = f'<p class="{look.standing.name.lower()}"><b>{escape(standing)}</b></p>'
+    shown = (
+        f'<p class="{look.standing.name.lower()}"><b>{escape(standing)}</b></p>'
+        f'<p class="answer"><b>{escape(answer)}</b> bandwidth ω_b</p>'
+    )
     shown += f"<p>{escape(' · '.join(facts))}</p><p class=how>{escape(how)}</p>"
     if sampled is not None:
         shown += f"<p>{escape(sampled_words(sampled, look.problem.inner.S_max))}</p>"
@@ -55,7 +67,7 @@ def standing_html(look: Look, curves: Curves | None, sampled: AsSampled | None) 
 
 def survival_words(curves: Curves) -> str:
     """The margins of the loop that is drawn, and whether its controller is stable by itself."""
-    m, unstable = curves.margins, curves.controller_poles
+    m, unstable = curves.view.margins, curves.controller_poles
     unstable = unstable[(unstable.real > 1e-9 * np.abs(unstable)) & (unstable.imag >= 0.0)]
     gain = f"gain × {number(m.gain_down, 3)} to {number(m.gain_up, 3)}"
     margins = "the loop drawn is unstable: no margins" if curves.unstable else (
@@ -72,7 +84,7 @@ def move_words(curves: Curves | None) -> str:
     """What the figure of the move shows."""
     if curves is None or curves.unstable:
         return ""
-    return f"the default one of robustness, {curves.move.words}; dashed: its end"
+    return f"the default one of robustness, {curves.move.words}"
 
 
 def sampled_words(sampled: AsSampled, S_max: float) -> str:
@@ -99,11 +111,12 @@ def end_words(code: int) -> str:
 
 
 def pin_columns(
-    names: Sequence[str], scales: Sequence[float], pins: Sequence[tuple[str, Look]]
-) -> dict[str, list[Any]]:
+    names: Sequence[str], scales: Sequence[float], pins: Sequence[tuple[str, Look]],
+    colours: Sequence[str],
+) -> dict[str, list[Any]]:  # fmt: skip
     """The table of pinned designs, a list a column; θ times `scales`, as the sliders show it."""
     looks = [look for _, look in pins]
-    found: dict[str, list[Any]] = {"design": [name for name, _ in pins]}
+    found: dict[str, list[Any]] = {"colour": [*colours], "design": [name for name, _ in pins]}
     for i, name in enumerate(names):
         found[f"theta_{name}"] = [scales[i] * look.theta[i] for look in looks]
     found["S_max"] = [look.knobs.S_max for look in looks]

@@ -42,6 +42,7 @@ class ProofOutcome(StrEnum):
     TOO_MANY_PARAMETERS = "more than four uncertain parameters"
     SEVERAL_CHANNELS = "the plant has several inputs or outputs"
     NOT_MODAL = "a given damping matrix couples the modes"
+    VARIES = "a theta varies, and moves the modes: its range was searched"
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,8 @@ def prove(
     several = any(system.B.shape[1] != 1 or len(system.C) != 1 for system in uncertain.options)
     if several or isinstance(structure, ChannelStructure):
         return without(ProofOutcome.SEVERAL_CHANNELS)
+    if uncertain.ranges:
+        return without(ProofOutcome.VARIES)
     if len(names) > MOST_PARAMETERS:
         return without(ProofOutcome.TOO_MANY_PARAMETERS)
     models = [uncertain.plant(uncertain.nominal, i) for i in range(len(uncertain.options))]

@@ -19,7 +19,12 @@ from ccd_casadi.fixed_structure.loop_problem import (
     LoopProblem,
     plant_of_row,
 )
-from ccd_casadi.fixed_structure.peak_search import closed_on_peaks, frequency_grid, local_peaks
+from ccd_casadi.fixed_structure.peak_search import (
+    closed_on_peaks,
+    frequency_grid,
+    hidden_peaks,
+    local_peaks,
+)
 from ccd_casadi.kernels.loop_curvature import second
 from ccd_casadi.kernels.loop_rows import levels, rows
 from ccd_casadi.support.arrays import Array
@@ -61,10 +66,13 @@ def assess(
     value = levels(np.tile(curves, (P, 1)), every, v, loop, min(depth, -within))
     value = np.where(v[..., None, None] <= end, value, -np.inf)
     peaks = local_peaks(loop, curves, v, value, depth, end)
+    peaks = peaks.and_those(hidden := hidden_peaks(curves, v, value))
     top, closed = closed_on_peaks(loop, peaks)
     # An open end at ω_b is the crossing; one at the lowest frequency is a row of its own.
     low_end = peaks.start < 0.1 * crossing[peaks.row // P]
     whole = closed | ~np.isin(peaks.curve, curves[short]) | low_end
+    sought = np.arange(len(whole)) >= len(whole) - len(hidden.row)
+    whole = np.where(sought, closed, whole)
     curve, row, at = [peaks.curve[whole]], [peaks.row[whole]], [top[whole]]
     low = plants.variable(np.full(len(crossing), problem.low))
     for end_curve, place in ((Curve.S_LOW, low), (Curve.CROSSING, crossing)):

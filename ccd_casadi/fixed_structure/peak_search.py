@@ -14,6 +14,7 @@ from ccd_casadi.kernels.loop_point import Loop
 from ccd_casadi.kernels.loop_rows import close, levels
 from ccd_casadi.support.arrays import Array
 
+HIDDEN = 1e-2  # ln of the share of its bound above which a maximum between grid points is sought
 APART = 1e-8  # relative: grid points that are closer count as one
 CLOSINGS = 40  # of a peak's bracket at most; most need four, a curve's kink all
 FLAT = 1e-9  # slope at a maximum
@@ -93,6 +94,23 @@ def local_peaks(
     inside = np.sort(np.concatenate([inside, found.start[near, None]], axis=1), axis=1)
     level = levels(found.curve[near, None], i[near], inside, loop, -2.0 * CLOSE)
     return split(found, near, inside, level[:, :, 0], P, first)
+
+
+def hidden_peaks(curves: np.ndarray, v: Array, value: Array) -> Brackets:
+    """Steps of the grid near a bound in which a flat maximum may lie that no grid point shows.
+
+    A parabola through a step and the point before it ends with a slope of the other sign.
+    """
+    with np.errstate(invalid="ignore"):
+        slope = np.diff(value, axis=1) / np.diff(np.log(v), axis=1)[:, :, None, None]
+        step, before, after = slope[:, 1:-1], slope[:, :-2], slope[:, 2:]
+        rises = (before > 0.0) & (step > 0.0) & (2.0 * step < before)
+        falls = (after < 0.0) & (step < 0.0) & (2.0 * step > after)
+        shown = (rises & (after <= 0.0)) | (falls & (before >= 0.0))
+        high = np.maximum(value[:, 1:-2], value[:, 2:-1]) > -HIDDEN
+    i, at, c, k = np.nonzero((rises | falls) & ~shown & high)
+    low, end = v[i, at + 1], v[i, at + 2]
+    return Brackets(curves[c], i + k * len(v), end, low, end)
 
 
 def split(

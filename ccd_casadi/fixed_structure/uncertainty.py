@@ -9,7 +9,7 @@ For a proof it is a sum of modes, poles and residues as affine forms of what is 
     G(s) = Σ b_i c_i/(s² + g_i s + k_i) = Σ r_i/(s - p_i) - r_i/(s - q_i),   r = b c/(p - q)
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +21,7 @@ from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
 from ccd_casadi.support.arrays import Array
 
+SLOPES = ("dM", "dK", "dD", "dB", "dC")  # of a modal plant
 UNCOUPLED = 1e-12  # relative: a modal damping matrix with less beside its diagonal is diagonal
 
 
@@ -29,7 +30,9 @@ class UncertainPlant:
     """What may differ from the model; zeros and (1, 1): nothing.
 
     `options`: the same plant with other loads or positions, by their matrices; the model first.
-    `damping` are the least and the largest factor. M_K in N/m scales all of them alike.
+    `damping` are the least and the largest factor. M_K in N/m scales all of them alike. `ranges`
+    are parameters of the model itself, least, the model's, largest; `along` gives an option at
+    their values, with derivatives to θ and, last, to these.
     """
 
     options: tuple[Mechanics, ...]
@@ -39,6 +42,8 @@ class UncertainPlant:
     mode_shift: float = 0.0
     damping: tuple[float, float] = (1.0, 1.0)
     gain: float = 0.0
+    ranges: tuple[tuple[str, float, float, float], ...] = ()
+    along: Callable[[int, Array], Mechanics] | None = None
 
     @cached_property
     def modes(self) -> int:
@@ -56,7 +61,7 @@ class UncertainPlant:
             found.append("damping")
         if self.gain:
             found.append("gain")
-        return tuple(found)
+        return (*found, *(f"theta.{name}" for name, *_ in self.ranges))
 
     @property
     def box(self) -> Array:
@@ -65,6 +70,7 @@ class UncertainPlant:
             "resonance_shift": (-self.resonance_shift, self.resonance_shift),
             "damping": self.damping,
             "gain": (-self.gain, self.gain),
+            **{f"theta.{name}": (low, high) for name, low, _, high in self.ranges},
         }
         found = [ends.get(name, (-self.mode_shift, self.mode_shift)) for name in self.names]
         return np.array(found).reshape(-1, 2).T
@@ -72,11 +78,15 @@ class UncertainPlant:
     @property
     def nominal(self) -> Array:
         """The model's own point."""
-        return np.array([1.0 if name == "damping" else 0.0 for name in self.names])
+        own = {"damping": 1.0} | {f"theta.{name}": value for name, _, value, _ in self.ranges}
+        return np.array([own.get(name, 0.0) for name in self.names])
 
     def plant(self, point: Array, option: int = 0) -> ScaledPlant:
         """The scaled plant at a point of the box; its derivatives are those to θ."""
-        return scale_plant(self._modal(point, option), self.M_K, bare=True)
+        modal, count = self._modal(point, option), len(self.ranges)
+        if count:
+            modal = replace(modal, **{d: getattr(modal, d)[:-count] for d in SLOPES})
+        return scale_plant(modal, self.M_K, bare=True)
 
     def sloped(self, point: Array, option: int = 0) -> ScaledPlant:
         """The same with derivatives to the point itself, one for each of `names`.
@@ -84,13 +94,18 @@ class UncertainPlant:
             ∂k_i = 2 k_i ∂r_i/r_i,   ∂d_i = d_i ∂r_i/r_i,   r_i = (1 + p_common)(1 + p_i)
 
         of flexible modes with stiffness k_i and damping d_i; all d_i are as the damping factor.
+        Those to parameters of the model are the model's own.
         """
         modal, values = self._modal(point, option), np.asarray(point, float)
         flexible = np.flatnonzero(~modal.rigid)
         count, n, m = len(self.names), len(modal.K), modal.B.shape[1]
-        dK, dD, dB = np.zeros((count, n, n)), np.zeros((count, n, n)), np.zeros((count, n, m))
+        dM, dK, dD = np.zeros((3, count, n, n))
+        dB, dC = np.zeros((count, n, m)), np.zeros((count, *modal.C.shape))
+        first = count - len(self.ranges)
+        for whole, d in zip((dM, dK, dD, dB, dC), SLOPES, strict=True):
+            whole[first:] = getattr(modal, d)[len(getattr(modal, d)) - count + first :]
         given = self.options[option].damping_ratio is None  # a matrix, which no shift moves
-        for row, (name, value) in enumerate(zip(self.names, values.tolist(), strict=True)):
+        for row, (name, value) in enumerate(zip(self.names[:first], values.tolist(), strict=False)):
             word, _, number = name.partition(" ")
             if word == "gain":
                 dB[row] = modal.B / (1.0 + value)
@@ -103,15 +118,15 @@ class UncertainPlant:
             dK[row, at, at] = 2.0 * modal.K[at, at] / (1.0 + value)
             if not given:
                 dD[row, at, at] = modal.D[at, at] / (1.0 + value)
-        still = np.zeros((count, n, n))
-        moved = replace(modal, dM=still, dK=dK, dD=dD, dB=dB,
-                        dC=np.zeros((count, *modal.C.shape)))  # fmt: skip
+        moved = replace(modal, dM=dM, dK=dK, dD=dD, dB=dB, dC=dC)
         return scale_plant(moved, self.M_K, bare=True)
 
     def _modal(self, point: Array, option: int) -> ModalPlant:
         values = dict(zip(self.names, np.asarray(point, float).tolist(), strict=True))
         shift, factor = values.get("resonance_shift", 0.0), values.get("damping", 1.0)
         system = self.options[option]
+        if self.along is not None and self.ranges:
+            system = self.along(option, np.asarray(point, float)[-len(self.ranges) :])
         own = tuple(values.get(f"mode_shift {i}", 0.0) for i in range(1, self.modes + 1))
         own = own if any(own) else ()
         modal = modal_plant(system, self.suspension, Perturbation(shift, factor, own))

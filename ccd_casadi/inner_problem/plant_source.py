@@ -13,6 +13,7 @@ from ccd_casadi.analysis.driven_plant import with_motion
 from ccd_casadi.analysis.motor import Motion
 from ccd_casadi.plants.differenced import own_plant
 from ccd_casadi.plants.fixed import fixed_model, with_fixed
+from ccd_casadi.plants.places import Places, placed
 from ccd_casadi.plants.plant import ModelFunction, Plant
 from ccd_casadi.plants.registry import data_option, model_named
 from ccd_casadi.support.errors import PlantError, UserError, described
@@ -23,8 +24,8 @@ from ccd_casadi.support.user_code import limited, require_user_code
 class PlantSource:
     """Where the model comes from: a known name or `file.py:function`, and its options.
 
-    `fixed`: parameters that are not in θ, each with value and unit. `motion`: the move that it is
-    for, and its motors.
+    `fixed`: parameters that are not in θ, each with value and unit. `places`: where its forces and
+    sensors stand, if not at nodes. `motion`: the move that it is for, and its motors.
     """
 
     model: str | None
@@ -34,6 +35,7 @@ class PlantSource:
     seconds: float = 60.0  # that a function may take; no part of what the plant is
     content: str | None = None  # SHA-256 of the file as the case was read; None: as it is now
     fixed: tuple[tuple[str, float, str], ...] = ()
+    places: Places | None = None
     motion: Motion | None = None
 
     @property
@@ -64,6 +66,7 @@ class PlantSource:
             "source": digest,
             "options": options,
             **({"fixed": self.held} if self.fixed else {}),
+            **({"places": vars(self.places)} if self.places else {}),
             **({"motion": repr(self.motion)} if self.motion else {}),
         }
 
@@ -89,6 +92,8 @@ def plant_from(
     """
     if source.motion is not None:
         return _plant_with_motion(source.pinned(), names, lower, upper)
+    if source.places is not None:
+        return _placed_plant(source.pinned(), names, lower, upper)
     if source.model is not None:
         return _shipped_plant(source, names)
     require_user_code(f"{source.file}:{source.function}")
@@ -115,6 +120,23 @@ def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
     assert model is not None
     plant = model.build((*names, *held), **dict(source.options))
     return with_fixed(plant, held) if held else plant
+
+
+@lru_cache(maxsize=8)
+def _placed_plant(
+    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
+) -> Plant:
+    places = source.places
+    assert places is not None
+    at = [i for i, name in enumerate(names) if name not in places.names]
+    own = tuple(item for item in source.fixed if item[0] not in places.names)
+    held = {name: value for name, value in source.held.items() if name in places.names}
+    plant = plant_from(
+        replace(source, places=None, fixed=own), tuple(names[i] for i in at),
+        tuple(lower[i] for i in at), tuple(upper[i] for i in at),
+    )  # fmt: skip
+    whole = placed(plant, places, (*names, *held))
+    return with_fixed(whole, held) if held else whole
 
 
 @lru_cache(maxsize=8)

@@ -23,7 +23,7 @@ from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
-from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 
@@ -103,14 +103,34 @@ def with_channels(problem: CoDesignProblem) -> CoDesignProblem:
 
 def uncertain_plant(problem: CoDesignProblem, theta: Sequence[float]) -> UncertainPlant:
     """The model at θ with every option set, and the box of what may differ from it."""
-    u = sections_of_problem(problem).uncertainty
-    systems = [mechanics(plant_of(problem), theta)]
-    for options in u.options:
-        systems.append(mechanics(plant_of(with_options(problem, options)), theta))
+    u, held = sections_of_problem(problem).uncertainty, problem.source.held
+    options = [with_options(problem, options) for options in ((), *u.options)]
+    wider = [plant_of(_with_ranges(option)) for option in options]
+
+    def along(option: int, values: Array) -> Mechanics:
+        return mechanics(wider[option], (*theta, *values.tolist()))
+
     return UncertainPlant(
-        tuple(systems), problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift,
-        u.damping, u.gain,
+        tuple(mechanics(plant_of(option), theta) for option in options),
+        problem.suspension, problem.weights.M_K, u.resonance_shift, u.mode_shift, u.damping, u.gain,
+        tuple((name, low, held[name], high) for name, low, high in u.ranges), along,
     )  # fmt: skip
+
+
+def _with_ranges(problem: CoDesignProblem) -> CoDesignProblem:
+    """The problem with what varies as the last of its parameters."""
+    ranges = sections_of_problem(problem).uncertainty.ranges
+    if not ranges:
+        return problem
+    names, lower, upper = zip(*ranges, strict=True)
+    source = problem.source
+    return replace(
+        problem,
+        source=replace(source, fixed=tuple(f for f in source.fixed if f[0] not in names)),
+        names=(*problem.names, *names),
+        lower=(*problem.lower, *lower),
+        upper=(*problem.upper, *upper),
+    )
 
 
 def with_options(

@@ -28,7 +28,8 @@ class Uncertainty:
     """What may differ from the model; the defaults are: nothing.
 
     `damping`: least and largest factor. `options`: further option sets of the plant (loads,
-    positions), each what differs from the case's own.
+    positions), each what differs from the case's own. `ranges`: fixed parameters that vary, each
+    with its bounds.
     """
 
     resonance_shift: float = 0.0
@@ -36,6 +37,7 @@ class Uncertainty:
     damping: tuple[float, float] = (1.0, 1.0)
     gain: float = 0.0
     options: tuple[Options, ...] = ()
+    ranges: tuple[tuple[str, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,8 @@ class SectionsProblem(ControllerProblem):
             "anchors": self.anchors,
             "members": self.members,
         }
+        if not self.uncertainty.ranges:  # as stores knew it before
+            del found["uncertainty"]["ranges"]
         if self.shape_ends is not ShapeEnd.CROSSING:  # which stores knew first
             found["shape_ends"] = self.shape_ends.value
         if self.channels:

@@ -74,7 +74,7 @@ def closed_loop(G: StateSpace, K: StateSpace) -> ClosedLoop:
 
 def sensitivity(L: np.ndarray) -> np.ndarray:
     """(1 + L)⁻¹ (k, p, p) of an open loop L = GK (k, p, p)."""
-    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) + L))
+    return 1.0 / (1.0 + L) if L.shape[-1] == 1 else np.linalg.inv(np.eye(L.shape[-1]) + L)
 
 
 def open_alone(L: np.ndarray, i: int) -> np.ndarray:
@@ -84,6 +84,8 @@ def open_alone(L: np.ndarray, i: int) -> np.ndarray:
 
 def largest(response: np.ndarray) -> Array:
     """σ_max (k,) of a response (k, p, m)."""
+    if response.shape[1:] == (1, 1):
+        return np.abs(response[:, 0, 0])
     return np.asarray(np.linalg.norm(response, 2, axis=(1, 2)), dtype=float)
 
 

@@ -82,7 +82,8 @@ def moments(p: np.ndarray, T: float, delay: float) -> tuple[float, np.ndarray, n
 def sampled(G: StateSpace, period: float, delay: float) -> StateSpace:
     """u_k to y_k of a plant without feedthrough behind hold and delay (s); states [x; u_{k-1}; …].
 
-    One exponential over each part of a period: before and after the delayed force changes.
+    One exponential over each part of a period: before and after the delayed force changes. Analytic
+    in the plant's matrices.
     """
     n, m = G.B.shape
     whole, rest = parts(period, delay)

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, sensitivity
+from ccd_casadi.lti.closed_loop import ClosedLoop, closed_loop, largest, sensitivity
 from ccd_casadi.lti.grid import around, frequency_grid
 from ccd_casadi.lti.hold import Sampling, sampled, transfer, tustin
 from ccd_casadi.lti.state_space import StateSpace
@@ -19,6 +19,8 @@ from ccd_casadi.support.arrays import Array
 
 PER_DECADE = 60
 APART = 1e-7  # relative: closer points of the grid differ in gain by rounding alone
+NEAR = 0.9  # of the largest gain on the grid: local maxima below it lie below it between points too
+ZOOMS = 8  # each time eleven points between a maximum's neighbours: the spacing over 5
 
 
 @dataclass(frozen=True)
@@ -97,13 +99,31 @@ class Loop:
         return frequency_grid(low, high, count, around(roots), apart=APART)
 
     @cached_property
+    def peak(self) -> float:
+        """‖S‖∞ of a stable loop: every local maximum on the grid near the largest closed in on."""
+        grid = self.grid()
+        S = largest(self.sensitivity(grid))
+        top = float(S.max())
+        at = np.flatnonzero((S[1:-1] >= S[:-2]) & (S[1:-1] >= S[2:])) + 1
+        at = at[S[at] > NEAR * top]
+        low, high, rows = grid[at - 1], grid[at + 1], np.arange(len(at))
+        for _ in range(ZOOMS if len(at) else 0):
+            points = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 11)
+            found = largest(self.sensitivity(points.ravel())).reshape(points.shape)
+            i = found.argmax(axis=1)
+            top = max(top, float(found.max()))
+            low, high = points[rows, np.maximum(i - 1, 0)], points[rows, np.minimum(i + 1, 10)]
+        return top
+
+    @cached_property
     def as_run(self) -> tuple[StateSpace, StateSpace]:
         """Plant and controller of the loop, in discrete time where it is sampled."""
         if self.sampling is None:
             return self.plant, self.controller
         T, K = self.sampling.period, self.controller
         K = K if K.period else tustin(K, T)
-        return sampled(self.plant, T, self.sampling.delay), replace(K, period=T)
+        K = K if K.period == T else replace(K, period=T)
+        return sampled(self.plant, T, self.sampling.delay), K
 
 
 def over(loop: ClosedLoop, period: float) -> ClosedLoop:

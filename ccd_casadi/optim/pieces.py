@@ -25,6 +25,7 @@ PIECES = 8  # per variable, at most
 BENT = 0.5  # of the largest slope, per share of the box: by what a piece is lowered, at least
 RESTORED = 5  # Newton's steps back to λ <= 0
 INSIDE = 1e-10  # of λ
+HELD = 1e-3  # of the combination of pieces: the share of one that counts
 JUMP = 10.0  # times the slopes on both sides: what is steeper is no kink
 BESIDE = 1e-3  # of the box: so near by no other piece is as steep
 
@@ -55,17 +56,19 @@ def descend(
     *,
     steps: int,
     settled: float,
+    first: float = FIRST,
 ) -> Local:
     """The best point after at most `steps` new ones, where the pieces promise no more, or beside a
     jump of J.
 
     `at` gives None where J is not known; `constraints` λ (m,) and ∇λ (m, n). `settled` is relative
-    to J. `known` are further points that were met before; `start` keeps λ <= 0.
+    to J, `first` the first radius, a share of the box. `known` are further points that were met
+    before; `start` keeps λ <= 0.
     """
     n = start.z.size
     model = _Pieces(at, [start, *known], constraints)
     end = minimise(
-        model, model.iterate(start), np.zeros((n, n)), Radius(FIRST, LEAST, LARGEST), steps=steps,
+        model, model.iterate(start), np.zeros((n, n)), Radius(first, LEAST, LARGEST), steps=steps,
         penalty=model.size, least_gain=settled * abs(start.value),
     )  # fmt: skip
     return end.best.data
@@ -123,6 +126,9 @@ class _Pieces(Model[Local]):
         after = best_step(self, there, H, radius, self.size)
         if after is None:
             return H
+        held, holding = (int((self._shares(one) > HELD).sum()) for one in (step, after))
+        if held != holding:
+            return H  # across a kink that has just been met the slopes tell no curvature
         moved, change = there.x - here.x, self._combined(after) - self._combined(step)
         if not H.any():
             seen = abs(float(moved @ change)) / float(moved @ moved)
@@ -133,11 +139,14 @@ class _Pieces(Model[Local]):
         """Beside a jump."""
         return there.value > here.value and jumps(here.data, there.data)
 
-    def _combined(self, step: Step) -> Array:
+    def _shares(self, step: Step) -> Array:
+        """Of each piece in the combination that holds a step."""
         assert step.rows.hard is not None
         mu = np.where(step.rows.hard, 0.0, step.multipliers)
-        slopes = self.size * step.rows.slopes
-        return np.asarray(mu @ slopes / max(float(mu.sum()), 1e-300))
+        return np.asarray(mu / max(float(mu.sum()), 1e-300))
+
+    def _combined(self, step: Step) -> Array:
+        return np.asarray(self._shares(step) @ (self.size * step.rows.slopes))
 
 
 def _restored(z: Array, constraints: Constraints) -> Array | None:

@@ -214,9 +214,7 @@ def best_step(
     margin = np.zeros(len(rows.value)) if rows.margin is None else rows.margin
     chosen = np.arange(len(rows.value))
     if not model.carried:  # a row that the step cannot lift over its bound is none of it
-        slack = rows.value + margin + radius * np.abs(rows.slopes).sum(1)
-        chosen = np.flatnonzero(slack > 0.0)
-        chosen = chosen[np.argsort(-slack[chosen], kind="stable")[:ROWS]]
+        chosen = _within_reach(rows.value + margin, rows.slopes, radius)
     m, n = len(chosen), len(here.x)
     value, slopes = rows.value[chosen], rows.slopes[chosen]
     elastic = np.ones(m) if rows.hard is None else 1.0 - rows.hard[chosen]
@@ -278,14 +276,24 @@ def _corrected(
     """The second-order correction: the same model with the rows as they are at the trial."""
     rows = model.rows(there, radius)
     offset = rows.value - rows.slopes @ step.change
-    slack = rows.value + radius * np.abs(rows.slopes).sum(1)
-    chosen = np.argsort(-slack, kind="stable")[: min(ROWS, int((slack > 0.0).sum()))]
+    chosen = _within_reach(rows.value, rows.slopes, radius)
     cost = here.gradient + (H - step.hessian) @ step.change
     found = solve_elastic(
         step.hessian, cost, rows.slopes[chosen], offset[chosen], np.ones(len(chosen)),
         *_ends(model, here, radius), step.penalty, radius, _unit(here, 0.0),
     )  # fmt: skip
     return None if found is None else found[0]
+
+
+def _within_reach(value: Array, slopes: Array, radius: float) -> np.ndarray:
+    """The rows that a step can lift over their bounds, those that the shortest one does first.
+
+    Where there are too many these count: a steep row far below its bound must not push out one
+    that holds the step.
+    """
+    away = -value / np.maximum(np.abs(slopes).sum(1), 1e-300)
+    order = np.argsort(away, kind="stable")[:ROWS]
+    return order[away[order] < radius]
 
 
 def _gain(here: Iterate[Data], there: Iterate[Data] | None, penalty: float) -> float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
@@ -68,6 +69,17 @@ class ModalPlant:
     dD: Array
     dB: Array
     dC: Array
+
+    @property
+    def state_space(self) -> StateSpace:
+        """[q; q̇] in SI, velocities in units in which a mode's energy is even."""
+        n, k = len(self.K), np.diag(self.K)
+        scale = np.sqrt(np.where(k > 1e-12, k, 1.0))
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:], A[n:, :n], A[n:, n:] = np.diag(scale), -self.K / scale, -self.D
+        B = np.vstack([np.zeros_like(self.B), self.B])
+        C = np.hstack([self.C / scale, np.zeros_like(self.C)])
+        return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])))
 
 
 def modal_plant(

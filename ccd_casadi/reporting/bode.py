@@ -1,4 +1,4 @@
-"""Bode plots of plant, controller and loop, resonances and anti-resonances marked."""
+"""Bode plots of the loop with its margins drawn in, of plant and controller; resonances marked."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,67 +8,138 @@ from numpy.typing import NDArray
 
 from ccd_casadi.analysis.loop_view import LoopView, phase_deg
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Mark, Panel, Table
-from ccd_casadi.drawing.svg import BLACK, CYCLE
-from ccd_casadi.reporting.loops import bandwidth_level, over_hz
+from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Mark, Panel, Table
+from ccd_casadi.drawing.svg import BLACK, CYCLE, GREEN, GREY
+from ccd_casadi.reporting.loops import bandwidth_level, margin_words, over_hz
+from ccd_casadi.reporting.nyquist import loci_of
 from ccd_casadi.reporting.tables import over_frequency
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import number
+from ccd_casadi.support.units import HZ, number
 
 ZERO = 1e-6  # of a direction's entry that counts as none
 MOST_MARKS = 8  # resonances, and as many anti-resonances, marked in the plot
+TURNS = np.arange(-1980.0, 1981.0, 360.0)  # phases of -1
+Parts = Mapping[str, tuple[np.ndarray, ...]]  # g, k and their product of a channel, by its name
 
 
 def bode(loop: LoopView, channels: Sequence[Channel] = ()) -> Figure:
-    """The Bode plot of one design with its words and numbers."""
-    return Figure(_bode(loop, channels), _caption(loop, channels), (_table(loop),))
+    """The Bode plot of one design with its words and numbers.
 
-
-def _bode(loop: LoopView, channels: Sequence[Channel]) -> Lines:
-    """Plant, controller and L = GK: magnitude and phase, of every one of several scalar channels.
-
-    All singular values, and no phase, of a loop that does not fall apart into such channels.
+    L, then plant and controller, of every one of several scalar channels; of a loop that does not
+    fall apart into such channels eigenvalues of L and singular values.
     """
     parts = scalar_parts(loop, channels)
+    rows: list[tuple[Panel, ...]] = [loop_panels(loop, parts), size_panels(loop, parts)]
+    if parts:
+        rows.append(tuple(
+            over_hz(f"phase of {name} (deg)",
+                    _curves(loop, {key: phase_deg(part[k]) for key, part in parts.items()}),
+                    loop.ends, log_y=False, y_step=90.0, legend=None)
+            for k, name in enumerate(("G", "K"))
+        ))  # fmt: skip
+    title = "Bode plots of the loop, the plant and the controller"
+    lines = Lines(tuple(rows), title, (3.0, 2.9, 2.3)[: len(rows)])
+    return Figure(lines, _caption(loop, channels), (_table(loop),))
+
+
+def loop_panels(
+    loop: LoopView, parts: Parts | None = None, stable: bool = True
+) -> tuple[Panel, Panel]:
+    """|L| and its phase: of one channel the model's in a band of all plants, with crossover and
+    least margins drawn in where it is stable; of several every channel, or every eigenvalue."""
+    several = {name: part[2] for name, part in (parts or {}).items()} if not loop.scalar else {}
+    L = loop.open[:, :, 0, 0] if loop.scalar else loci_of(loop.open[0], np.inf).T
+    sizes, phases = np.abs(L), phase_deg(L.T).T
+    minus_one = TURNS[(phases.min() - 60.0 <= TURNS) & (phases.max() + 60.0 >= TURNS)]
+    size: dict[str, Any] = {"levels": (Level(1.0, "1", colour=GREY),), "legend": "lower left"}
+    phase: dict[str, Any] = {
+        "levels": tuple(Level(turn, "", colour=GREY) for turn in minus_one),
+        "log_y": False, "y_step": 90.0, "legend": None,
+    }  # fmt: skip
+    if several:
+        drawn = [
+            _curves(loop, {name: of(part) for name, part in several.items()})
+            for of in (np.abs, phase_deg)
+        ]
+    elif loop.scalar:
+        label = "the model" if len(L) > 1 else ""
+        drawn = [[Curve(loop.hz, values[0], label)] for values in (sizes, phases)]
+        if len(L) > 1:
+            size["bands"], phase["bands"] = (
+                (Band(loop.hz, values.min(axis=0), values.max(axis=0), "all plants"),)
+                for values in (sizes, phases)
+            )
+        if stable:
+            drawn = [[*own, *more] for own, more in
+                     zip(drawn, _margins(loop, phases[0], size, phase), strict=True)]  # fmt: skip
+    else:
+        drawn = [[Curve(loop.hz, row) for row in values] for values in (sizes, phases)]
+    what = "L" if loop.scalar or several else "λ(L)"
+    return (
+        over_hz(f"|{what}| (–)", drawn[0], loop.ends, **size),
+        over_hz(f"phase of {what} (deg)", drawn[1], loop.ends, **phase),
+    )
+
+
+def _margins(
+    loop: LoopView, phases: Array, size: dict[str, Any], phase: dict[str, Any]
+) -> tuple[list[Curve], list[Curve]]:
+    """Crossover and margins as lines across the gap to -1; their words join the panels."""
+    m, (down, up, at) = loop.margins, loop.margins.places
+    if not np.isfinite(m.crossover):
+        return [], []
+    crossover = Level(m.crossover / HZ, f"crossover {number(m.crossover / HZ, 4)} Hz", True, GREY)
+    size["levels"] += (crossover,)
+    phase["levels"] += (Level(crossover.value, "", True, GREY),)
+    gaps, marks = [], []
+    for factor, place in ((m.gain_down, down), (m.gain_up, up)):
+        hz = place / HZ
+        if np.isfinite(hz) and loop.ends[0] < hz < loop.ends[1]:
+            gaps.append(_gap(hz, 1.0 / factor, 1.0))
+            offset = (6.0, 3.0 if factor < 1.0 else -5.0)
+            marks.append(Mark(hz, 1.0 / factor, f"× {number(factor, 3)}", ".", GREEN, offset))
+    size["marks"] = tuple(marks)
+    hz = at / HZ
+    angle = float(np.interp(np.log(hz), np.log(loop.hz), phases))
+    turn = float(TURNS[np.abs(TURNS - angle).argmin()])
+    words = f"{number(m.phase_deg, 3)}°"
+    phase["marks"] = (Mark(hz, angle, words, ".", GREEN, (6.0, 3.0)),)
+    return gaps, [_gap(hz, angle, turn)]
+
+
+def _gap(hz: float, one: float, other: float) -> Curve:
+    return Curve(np.array([hz, hz]), np.array([one, other]), "", GREEN, width=2.2)
+
+
+def size_panels(loop: LoopView, parts: Parts | None = None) -> tuple[Panel, Panel]:
+    """|G| with its resonances marked, and |K|: every one of several channels, or all singular
+    values."""
+    parts = parts or {}
     G, K = _singular_values(loop.plant), _singular_values(loop.controller)
     at = (bandwidth_level(loop.bandwidth_hz),)
-
-    def panel(label: str, values: Mapping[str, Array], **more: Any) -> Panel:
-        drawn = tuple(
-            Curve(loop.hz, v, name if len(values) > 1 else "", CYCLE[i % len(CYCLE)])
-            for i, (name, v) in enumerate(values.items())
-        )
-        return over_hz(label, drawn, loop.ends, **{"log_y": False, **more})
-
-    gap = (float(G.min()) / 10.0, float(G.max()) * 10.0)  # room for the marks' words
-    title = "Bode plot of the plant, the controller and the loop"
-    if not parts:
-        sigma = [{f"σ{i + 1}": s[:, i] for i in range(s.shape[1])} for s in (G, K)]
-        marks = tuple(_marks(loop, G))
-        top = (
-            panel("plant σ(G) (m/N)", sigma[0], log_y=True, marks=marks, y_range=gap),
-            panel("controller σ(K) (N/m)", sigma[1], log_y=True, levels=at),
-        )
-        return Lines((top,), title, (3.4,))
-    several = len(parts) > 1  # whose resonances are not marked: the words would meet
-    marks = () if several else tuple(_marks(loop, G))
-    look: dict[str, dict[str, Any]] = {
-        "G": {"marks": marks} | ({} if several else {"y_range": gap}),
-        "K": {"levels": at, "legend": None},  # the colours are those of G
-        "L": {"levels": (Level(1.0, "1"),), "legend": None},
-    }
-    sizes: list[Panel] = []
-    phases: list[Panel] = []
-    for k, (name, unit) in enumerate((("G", "m/N"), ("K", "N/m"), ("L", "–"))):
-        values = {channel: part[k] for channel, part in parts.items()}
-        size = {channel: np.abs(v) for channel, v in values.items()}
-        sizes.append(panel(f"|{name}| ({unit})", size, log_y=True, **look[name]))
-        angle = {channel: phase_deg(v) for channel, v in values.items()}
-        phases.append(panel(f"phase of {name} (deg)", angle, y_step=90.0, legend=None))
-    return Lines((tuple(sizes), tuple(phases)), title, (2.9, 2.3))
+    if len(parts) > 1:  # whose resonances are not marked: the words would meet
+        size = [{name: np.abs(part[k]) for name, part in parts.items()} for k in range(2)]
+        look: dict[str, Any] = {}
+    else:
+        size = [{f"σ{i + 1}": s[:, i] for i in range(s.shape[1])} for s in (G, K)]
+        gap = (float(G.min()) / 30.0, float(G.max()) * 30.0)  # room for the marks' words
+        look = {"marks": tuple(_marks(loop, G)), "y_range": gap}
+    named = ("|G|", "|K|") if parts or loop.scalar else ("plant σ(G)", "controller σ(K)")
+    return (
+        over_hz(f"{named[0]} (m/N)", _curves(loop, size[0]), loop.ends, **look),
+        over_hz(f"{named[1]} (N/m)", _curves(loop, size[1]), loop.ends, levels=at, legend=None),
+    )
 
 
-def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> dict[str, tuple[np.ndarray, ...]]:
+def _curves(loop: LoopView, values: Mapping[str, Array]) -> list[Curve]:
+    """Named and in a colour each, where there are several."""
+    return [
+        Curve(loop.hz, v, name if len(values) > 1 else "", CYCLE[i % len(CYCLE)])
+        for i, (name, v) in enumerate(values.items())
+    ]
+
+
+def scalar_parts(loop: LoopView, channels: Sequence[Channel]) -> Parts:
     """g, k and their product of every scalar channel, by a name that says which outputs it moves.
 
     Empty where the loop is no scalar one and does not fall apart into such channels.
@@ -114,6 +185,8 @@ def _caption(loop: LoopView, channels: Sequence[Channel]) -> str:
     )  # fmt: skip
     poles, zeros = (_list(p) for p in (loop.resonances_hz, loop.antiresonances_hz))
     up, down = (" (▲)", " (▼)") if len(channels) < 2 else ("", "")
+    if scalar:
+        what = f"Crossover and, in green, the margins of L.{margin_words(loop)} "
     words = f"{what}Resonances{up} of the plant: {poles}; anti-resonances{down}: {zeros}."
     gain = float(np.linalg.norm(loop.controller[0], 2))
     K = np.linalg.norm(loop.controller, 2, axis=(1, 2))
@@ -133,10 +206,11 @@ def _table(loop: LoopView) -> Table:
     """Magnitudes, and phases of a scalar loop, at some frequencies."""
     special = [*loop.resonances_hz, *loop.antiresonances_hz, loop.bandwidth_hz]
     if loop.plant.shape[1:] == (1, 1):
-        head: tuple[str, ...] = ("Hz", "|G| m/N", "phase deg", "|K| N/m", "phase deg")
-        G, K = np.abs(loop.plant[:, 0, 0]), np.abs(loop.controller[:, 0, 0])
-        phases = [phase_deg(part[:, 0, 0]) for part in (loop.plant, loop.controller)]
-        columns = [G, phases[0], K, phases[1]]
+        head: tuple[str, ...] = (
+            "Hz", "|L|", "phase deg", "|G| m/N", "phase deg", "|K| N/m", "phase deg"
+        )  # fmt: skip
+        responses = (part[:, 0, 0] for part in (loop.open[0], loop.plant, loop.controller))
+        columns = [column for part in responses for column in (np.abs(part), phase_deg(part))]
     else:
         G, K = _singular_values(loop.plant), _singular_values(loop.controller)
         head = (

@@ -33,10 +33,11 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.reporting.facts import theta_words
 from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_panel
 from ccd_casadi.reporting.moves import move_blocks
+from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.sections_page import sections_table
 from ccd_casadi.reporting.tables import over_frequency, over_time, spread
 from ccd_casadi.reporting.verdict import head_of
-from ccd_casadi.support.units import HZ, number
+from ccd_casadi.support.units import HZ, number, shown
 
 POINTS = 900
 PERIODS = 6.0  # of ω_b that the step is shown for
@@ -129,19 +130,18 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
-    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,))
-    bottom = over_hz("σ_max(K) (N/m)", drawn, (low, nyquist))
+    top = sensitivity_panel(curves, (low, nyquist), S_max, (crossing,), f"{named(run, 'S')} (–)")
+    bottom = over_hz(f"{named(run, 'K')} (N/m)", drawn, (low, nyquist))
     title = "Sensitivity and controller: full, reduced and sampled, over frequency"
     table = over_frequency(
         ("Hz", "|S| full", "reduced", "sampled", "|K| full N/m", "reduced N/m", "sampled N/m"),
         hz, *gains, *controllers,
     )  # fmt: skip
+    ends = [shown(each[-1], "N/m") for each in controllers]
     caption = (
         "S of the sampled loop is taken at the sampling instants, with zero-order hold and delay, "
-        f"up to half the sampling rate. There the controller's gain is "
-        f"{controllers[2][-1]:.3g} N/m (reduced: {controllers[1][-1]:.3g}, full: "
-        f"{controllers[0][-1]:.3g}): "
-        "that is what sensor noise and unmodelled resonances meet."
+        f"up to half the sampling rate. There the controller's gain is {ends[2]} (reduced: "
+        f"{ends[1]}, full: {ends[0]}): that is what sensor noise and unmodelled resonances meet."
     )
     return Figure(Lines(((top,), (bottom,)), title, (3.4, 2.4)), caption, (table,))
 
@@ -249,7 +249,7 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
     if item.designed is not None:
         structure, kappa = item.designed
         words = (
-            f"Channel {item.channel.name}: gain {number(gain_of(kappa), 6)} N/m; the sections as "
+            f"Channel {item.channel.name}: gain {shown(gain_of(kappa), 'N/m', 4)}; the sections as "
             "they were designed."
         )
         return Words(words), sections_table(section_words(structure, kappa))
@@ -259,9 +259,9 @@ def _sections(item: ChannelOrders, run: FinishedRun) -> tuple[Block, ...]:
     )
     head = ("section", "zero Hz", "zero ζ", "pole Hz", "pole ζ", "depth dB")
     words = (
-        f"Channel {item.channel.name}: gain {number(found.gain, 6)} N/m at s = 0, "
-        f"{number(found.gain_at_bandwidth, 6)} N/m at ω_b; every section has the gain 1 at s = 0. "
-        "A negative ζ, or a negative frequency of a single root, is one in the right half plane."
+        f"Channel {item.channel.name}: gain {shown(found.gain, 'N/m', 4)} at s = 0, "
+        f"{shown(found.gain_at_bandwidth, 'N/m', 4)} at ω_b; every section has the gain 1 at s = 0."
+        " A negative ζ, or a negative frequency of a single root, is one in the right half plane."
     )
     return Words(words), Table(head, rows)
 

@@ -238,7 +238,7 @@ def _optimality(r: Mapping[str, Any]) -> list[Fact]:
 
 
 def binding(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[str]:
-    """A sentence for everything that binds, with what loosening it would change in J."""
+    """A sentence for everything that binds, with what loosening it would gain."""
     multipliers: dict[str, float] = result["kkt"]["multipliers"]
     names = list(dict.fromkeys([*multipliers, *result["active"]]))
     return [_sentence(problem, name, multipliers.get(name)) for name in names]
@@ -248,8 +248,12 @@ def _sentence(problem: CoDesignProblem, name: str, multiplier: float | None) -> 
     words, step, loosened = _held(problem, name)
     if multiplier is None:
         return f"{words}."
-    gain = number(multiplier * step, 3)
-    return f"{words}; {loosened} would lower J by {gain}, to first order."
+    gain = multiplier * step  # in J, which is nobody's unit
+    worth = [problem.figure.shown(gain / abs(problem.w2), 3)] if problem.w2 else []
+    if problem.w1 > 0.0 and problem.cost_unit:
+        worth.append(f"{gain / problem.w1:.3g} {problem.cost_unit}")
+    value = " or ".join(worth) or f"{number(gain, 3)} of J"
+    return f"{words}; {loosened} is worth {value}, to first order."
 
 
 def _held(problem: CoDesignProblem, name: str) -> tuple[str, float, str]:

@@ -9,12 +9,11 @@ from ccd_casadi.drawing.content import Figure, Lines, Modes, Picture, Place, Sec
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.plants.modal import modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.reporting.loops import S_panel, marked
+from ccd_casadi.reporting.loops import S_panel, margin_words, marked
 from ccd_casadi.reporting.machine import SHOWN_MODES, lumped_machine
 from ccd_casadi.reporting.nyquist import FAR, loci_of, nyquist_panel
 from ccd_casadi.reporting.tables import over_frequency
-from ccd_casadi.support.units import HZ, counted, number
-from ccd_casadi.synthesis.classical_margins import least_margins
+from ccd_casadi.support.units import counted, number
 
 HEIGHT = 3.0  # inches of a row
 
@@ -38,7 +37,7 @@ def glance(
         f"The machine at this design{on}. S stays out of the shaded area: its peak, "
         f"{number(peak, 4)}, is {100.0 * peak / S_max:.4g} % of S_max, so that "
         f"{'L' if view.scalar else 'every eigenvalue of L'} keeps at least {number(1.0 / peak, 3)} "
-        f"from -1 in the Nyquist plot.{_margins(view)} {caption}"
+        f"from -1 in the Nyquist plot.{margin_words(view)} {caption}"
     )
     head, columns = ["Hz", f"largest {view.named('S')}"], [view.sizes[0].max(axis=0)]
     if view.scalar:
@@ -55,19 +54,6 @@ def loci(view: LoopView) -> list[np.ndarray]:
         return list(loci_of(view.open[0]).T)
     L = view.open[:, :, 0, 0]
     return list(np.where(np.abs(L) <= FAR, L, np.nan))
-
-
-def _margins(view: LoopView) -> str:
-    """Of one channel on the model."""
-    if not view.scalar:
-        return ""
-    m = least_margins(view.loop.responses, HZ * view.hz)
-    on = "On the model the" if len(view.open) > 1 else "The"
-    return (
-        f" {on} gain may fall to {number(m.gain_down, 3)} or rise to {number(m.gain_up, 3)} times; "
-        f"the phase margin is {number(m.phase_deg, 3)}° and the delay margin "
-        f"{number(1e6 * m.delay, 3)} µs."
-    )
 
 
 def machine(problem: CoDesignProblem, theta: Sequence[float]) -> Modes | Picture | Table:

@@ -6,7 +6,7 @@ from html import unescape
 from pathlib import Path
 from urllib.parse import quote
 
-from ccd_casadi.drawing.content import INDEX, Links, Page, Section, Table
+from ccd_casadi.drawing.content import INDEX, Links, Page, Section
 from ccd_casadi.drawing.paint import painted
 from ccd_casadi.drawing.stored import write_page
 from ccd_casadi.reporting.sections_page import conclusion_of
@@ -25,6 +25,7 @@ FILES = {
     "case.toml": "the case as it was solved", "samples.sqlite": "every synthesis and design",
     "surrogate.json": "the surrogate", "insight.json": "the figures of insight.html",
     "robustness.json": "the figures of robustness.html", "plant.py": "the plant's own code",
+    "truth.json": "what retraining asks",
 }  # fmt: skip
 
 
@@ -63,14 +64,11 @@ def write_index(folder: Path) -> None:
         (quote(place.relative_to(folder).as_posix()), _title(place), words)
         for place, words in pages.items()
     )
-    files = tuple((n, words) for n, words in FILES.items() if (folder / n).exists())
+    files = tuple((n, n, words) for n, words in FILES.items() if (folder / n).exists())
     name = folder.resolve().name
     lead = conclusion_of(result)
     head = run_head(f"Run: {name}", result, f"{result.get('formulation', '')} formulation", lead)
-    sections = (
-        Section("Pages", (Links(links),)),
-        Section("Files", (Table(("file", "what it is"), files),)),
-    )
+    sections = (Section("Pages", (Links(links),)), Section("Files", (Links(files),)))
     write_whole(folder / INDEX, painted(Page(head, sections, index="")))
 
 

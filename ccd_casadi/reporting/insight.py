@@ -98,7 +98,7 @@ def front_figure(
     ]
     if failed.any():
         curves.append(Curve(cost[failed], hz[failed], "not verified", CYCLE[1], "", "x"))
-    mark = Mark(design[0], design[1], design[2], "s", offset=(8.0, 3.0))
+    mark = Mark(design[0], design[1], design[2], "+", offset=(8.0, 3.0))
     top = Panel("", "bandwidth ω_b (Hz)", tuple(curves), marks=(mark,))
     low, width = np.array(problem.lower), np.subtract(problem.upper, problem.lower)
     theta = (np.array([point.theta for point in front.points]) - low) / width

@@ -1,5 +1,7 @@
 """The landscape of ω_b*(θ) of a run: its data from surrogates and store, its words and tables."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ccd_casadi.drawing.content import Landscape, Table
@@ -43,25 +45,28 @@ def landscape_data(
     processes: tuple[GaussianProcess, ...],
     truths: Truths,
     radius: float = 1.0,
-    centre: tuple[float, ...] | None = None,
+    theta: Sequence[float] = (0.0, 0.0),
+    axes: tuple[int, int] = (0, 1),
 ) -> Landscape:
-    """The landscape over two parameters; `radius` (a share of the box) of the trust region."""
+    """The landscape over two parameters, the others as at θ; `radius` (a share of the box) of the
+    trust region about it."""
     lower, upper = np.array(problem.lower), np.array(problem.upper)
     count = GRID if not processes or len(processes[0].X) <= MANY else COARSER
-    axes = [np.linspace(lower[k], upper[k], count) for k in range(2)]
-    thetas = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+    first, second = (np.linspace(lower[k], upper[k], count) for k in axes)
+    thetas = np.tile(np.asarray(theta, float), (count * count, 1))
+    thetas[:, axes] = np.stack(np.meshgrid(first, second, indexing="ij"), -1).reshape(-1, 2)
     field = np.empty((0, 0))
     if processes:
         field = predicted(problem, processes, thetas, std=False)[0].reshape(count, count)
     forbidden = None
     plant = plant_of(problem)
     if plant.constraint_names:
-        bad = [bool(unmet(problem, theta)) for theta in thetas]
+        bad = [bool(unmet(problem, tuple(place))) for place in thetas]
         forbidden = np.array(bad).reshape(count, count)
     region = None
-    if radius < 1.0 and centre is not None:
-        half = radius * (upper - lower)
-        low, high = np.maximum(lower, centre - half), np.minimum(upper, centre + half)
+    if radius < 1.0:
+        half, at = radius * (upper - lower), np.asarray(theta)
+        low, high = np.maximum(lower, at - half), np.minimum(upper, at + half)
         region = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
     label = "true ω_b*(θ), same colours"
     known = {
@@ -71,14 +76,15 @@ def landscape_data(
     if not processes:
         known, label = best_designs(problem, truths), "best feasible ω_b, same colours"
     single = {s.theta for s in truths.designs} - set(known)
+    i, j = axes
     return Landscape(
-        names=(problem.names[0], problem.names[1]),
-        units=(problem.units[0], problem.units[1]),
-        first=axes[0],
-        second=axes[1],
+        names=(problem.names[i], problem.names[j]),
+        units=(problem.units[i], problem.units[j]),
+        first=first,
+        second=second,
         bandwidth_hz=field,
-        truths=np.array([(*theta, hz) for theta, hz in known.items()]).reshape(-1, 3),
-        designs=np.array(sorted(single)).reshape(-1, 2),
+        truths=np.array([(t[i], t[j], hz) for t, hz in known.items()]).reshape(-1, 3),
+        designs=np.array([(t[i], t[j]) for t in sorted(single)]).reshape(-1, 2),
         truth_label=label,
         forbidden=forbidden,
         region=region,

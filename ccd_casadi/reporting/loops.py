@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.analysis.loop_view import NAMES, LoopView, phase_deg
+from ccd_casadi.analysis.loop_view import NAMES, LoopView
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Area, Band, Curve, Figure, Level, Lines, Mark, Panel, Table
 from ccd_casadi.drawing.svg import BLACK, CYCLE, GREY, ORANGE
@@ -133,42 +133,35 @@ def _gain_panel(views: Sequence[LoopView], i: int, bounds: bool, **more: Any) ->
 
 
 def figure_gains(views: Sequence[LoopView], *, bounds: bool = True) -> Lines:
-    """S over the full width, KS and T below it; of one design L and GS where these are asked."""
+    """S over the full width, KS and T below it; of one design GS where it is bounded."""
     S, *others = gain_panels(views, bounds=bounds)
-    more = _open_loop(views[0]) if len(views) == 1 else []
+    most = views[0].bounded.compliance_max
+    more = [] if len(views) > 1 or most is None else [(compliance_panel(views[0], most),)]
     title = "Largest singular values of S, KS and T over frequency, with their bounds"
-    heights = (3.3, *[2.7] * (1 + len(more)))
-    return Lines(((S,), tuple(others), *more), title, heights)
+    return Lines(((S,), tuple(others), *more), title, (3.3, *[2.7] * (1 + len(more))))
 
 
-def _open_loop(view: LoopView) -> list[tuple[Panel, ...]]:
-    """L of one channel on several plants as a Bode plot, and |GS| where it is bounded."""
-    rows: list[tuple[Panel, ...]] = []
-    at = (Level(view.bandwidth_hz, "", True),)  # as above
-    if view.scalar and len(view.open) > 1:
-        L = view.open[:, :, 0, 0]
-        phase = phase_deg(L.T).T
-        rows.append((
-            _of_plants(view, "|L| (–)", np.abs(L), (Level(1.0, "1", colour=GREY), *at)),
-            _of_plants(view, "phase of L (deg)", phase, (Level(-180.0, "", colour=GREY), *at),
-                       log_y=False, y_step=90.0),
-        ))  # fmt: skip
-    most = view.bounded.compliance_max
-    if most is not None:
-        level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
-        GS = 1e6 * view.sizes[3]
-        rows.append((_of_plants(view, f"{view.named('GS')} (µm/N)", GS, (level,)),))
-    return rows
+def compliance_panel(view: LoopView, most: float) -> Panel:
+    """|GS| of the model in a band of all plants, with its bound in m/N."""
+    GS = 1e6 * view.sizes[3]
+    bands = (Band(view.hz, GS.min(axis=0), GS.max(axis=0), "all plants"),)
+    level = Level(1e6 * most, f"compliance_max {1e6 * most:g} µm/N", colour=GREY)
+    return over_hz(f"{view.named('GS')} (µm/N)", (Curve(view.hz, GS[0], "the model"),), view.ends,
+                   levels=(level,), bands=bands if len(GS) > 1 else (), legend="lower right",
+                   )  # fmt: skip
 
 
-def _of_plants(
-    view: LoopView, label: str, values: np.ndarray, levels: tuple[Level, ...], **more: Any
-) -> Panel:
-    """Values of every plant over frequency: the model's in a band of all."""
-    bands = (Band(view.hz, values.min(axis=0), values.max(axis=0), "all plants"),)
-    return over_hz(label, (Curve(view.hz, values[0], "the model"),), view.ends, levels=levels,
-                   bands=bands if len(values) > 1 else (), legend="lower right",
-                   **more)  # fmt: skip
+def margin_words(view: LoopView) -> str:
+    """Of one channel on the model; empty of several."""
+    if not view.scalar:
+        return ""
+    m = view.margins
+    on = "On the model the" if len(view.open) > 1 else "The"
+    return (
+        f" {on} gain may fall to {number(m.gain_down, 3)} or rise to {number(m.gain_up, 3)} times; "
+        f"the phase margin is {number(m.phase_deg, 3)}° and the delay margin "
+        f"{number(1e6 * m.delay, 3)} µs."
+    )
 
 
 def forbidden(

@@ -33,7 +33,7 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted, number
+from ccd_casadi.support.units import counted, number, shown
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
@@ -69,7 +69,7 @@ def move_parts(
     panels, words, columns, heads = [], [], [1e3 * time], ["ms"]
     for name, made in zip(ways, found, strict=True):
         error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
-        panels.append(_over_plants(
+        panels.append(over_plants(
             1e3 * time, error, f"error, {name} (µm)", legend="upper right",
             levels=(Level(1e3 * end, "end of the move", True, GREY),),
         ))  # fmt: skip
@@ -150,7 +150,7 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     steps = [loop_figures.force_step(loop, times) for loop in loops]
     t = steps[0][0]
     y = 1e6 * np.array([step[1] for step in steps])
-    panel = _over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
+    panel = over_plants(1e3 * t, y, "y after a step of 1 N (µm)", log_x=True, legend="upper left")
     head = ("ms", "µm model", "µm least", "µm largest") if len(y) > 1 else ("ms", "µm")
     on = f"{counted(len(y), 'plant')} of the set, until they rest" if len(y) > 1 else (
         "the stage, until it rests"
@@ -160,7 +160,7 @@ def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
     return Figure(lines, words, (over_time(head, 1e3 * t, *_columns(y)),))
 
 
-def _over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
+def over_plants(ms: Array, values: Array, label: str, **more: object) -> Panel:
     """The model's in a band of all."""
     several = len(values) > 1
     curve = Curve(ms, values[0], "the model" if several else "")
@@ -192,17 +192,17 @@ def _words(name: str, made: Sequence[Move]) -> str:
 
 def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    shown = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
+    drawn = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
     error, force = [], []
     for way, colour in zip(found.ways, COLOURS, strict=False):
-        if way not in shown:
+        if way not in drawn:
             continue
         m = way.move
         at = np.unique(np.linspace(0, len(m.time) - 1, DRAWN).astype(int))
         ms = 1e3 * m.time[at]
         error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
         force.append(Curve(ms, m.force[at, 0], "", colour))
-    end = Level(1e3 * found.profile.duration, "end of the setpoint", vertical=True)
+    end = Level(1e3 * found.profile.duration, "setpoint ends", vertical=True)
     lines = Lines(
         ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
          (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),
@@ -215,12 +215,15 @@ def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
          1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
         for way in found.ways for m in (way.move,)
     )  # fmt: skip
+    ends = []
+    for way in found.ways:
+        m = way.move
+        when = "does not settle" if np.isinf(m.settled) else f"settles {shown(m.settled, 's')} in"
+        ends.append(f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}")
     caption = (
-        "Settled: from the start until the error stays within "
-        f"{number(1e6 * found.window)} µm; last error: the largest over the last quarter of "
-        f"{number(1e3 * found.ways[0].move.time[-1])} ms, the amplitude of a limit cycle if there "
-        "is one. On the plant with its soft suspension, hold and delay exact (robustness lets the "
-        "rigid bodies go where that loop is stable)."
+        f"{'; '.join(ends)}. Settled is what stays within {shown(found.window, 'm')}; the last "
+        "error of the table is the largest over the last quarter, the amplitude of a limit cycle "
+        "if there is one. The plant has its soft suspension, hold and delay are exact."
     )
     return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
 

@@ -13,12 +13,14 @@ SHOWN = (-3.2, 1.6)  # of the real axis
 FAR = 30.0  # |L| beyond which a locus leaves the drawing
 
 
-def nyquist_panel(loci: Sequence[np.ndarray], S_max: float, height: float) -> Panel:
+def nyquist_panel(
+    loci: Sequence[np.ndarray], S_max: float, height: float = 3.0, others: str = GREEN
+) -> Panel:
     """Loci (k,) complex, the first the model's; beside one other panel of this height in inches."""
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     circle = np.exp(1j * angle)
     curves = [
-        Curve(line.real, line.imag, colour=GREEN if i else BLUE, width=1.0 if i else 1.6)
+        Curve(line.real, line.imag, colour=others if i else BLUE, width=1.0 if i else 1.6)
         for i, line in reversed(list(enumerate(loci)))
     ]
     disk = -1.0 + circle / S_max

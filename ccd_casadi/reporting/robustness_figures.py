@@ -17,7 +17,13 @@ SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
 
 
-def gains(found: Study, caption: str) -> Figure:
+def named(run: FinishedRun, name: str) -> str:
+    """`|S|` of a loop with one input and output, `σ_max(S)` of others."""
+    scalar = run.plant.B.shape[1] == run.plant.C.shape[0] == 1
+    return f"|{name}|" if scalar else f"σ_max({name})"
+
+
+def gains(run: FinishedRun, found: Study, caption: str) -> Figure:
     """S and T in one panel, GS and KS in one each; some frequencies, the peaks among them."""
     hz, shown = found.hz, found.gains * np.array([[1.0], [1.0], [1e6], [1.0]])
     ends = (float(hz[0]), float(hz[-1]))
@@ -27,8 +33,8 @@ def gains(found: Study, caption: str) -> Figure:
         return over_hz(label, drawn, ends)
 
     rows = (
-        (panel("σ_max (–)", (0, "S"), (1, "T")),),
-        (panel("σ_max(GS) (µm/N)", (2, "")), panel("σ_max(KS) (N/m)", (3, ""))),
+        (panel(f"{named(run, 'S')}, {named(run, 'T')} (–)", (0, "S"), (1, "T")),),
+        (panel(f"{named(run, 'GS')} (µm/N)", (2, "")), panel(f"{named(run, 'KS')} (N/m)", (3, ""))),
     )
     special = hz[found.gains.argmax(axis=1)].tolist()
     table = over_frequency(("Hz", "S", "T", "GS µm/N", "KS N/m"), hz, *shown, special=special)
@@ -137,7 +143,7 @@ def move(found: Move, caption: str) -> Figure:
     shown = found.time <= shown_until(found)
     pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
     t = 1e3 * found.time[pick]
-    end = Level(1e3 * found.duration, "end of the setpoint", vertical=True)
+    end = Level(1e3 * found.duration, "setpoint ends", vertical=True)
     unit, scale = shown_unit("m", found.peak_error)
     window = (
         Level(scale * found.window, "window", colour=GREY),

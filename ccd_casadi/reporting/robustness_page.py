@@ -187,11 +187,12 @@ def _margins(found: Study) -> Section:
 
 
 def _gains(run: FinishedRun, found: Study) -> Section:
-    names = ("σ_max(S)", "σ_max(T)", "σ_max(GS) µm/N", "σ_max(KS) N/m")
+    shapes = (("S", ""), ("T", ""), ("GS", "m"), ("KS", "N/m"))
     tops = [
-        (name, number((1e6 if "µm" in name else 1.0) * peak), _place(omega))
-        for name, (peak, omega) in zip(names, found.peaks, strict=True)
-    ]
+        (figures.named(run, name),
+         shown(peak, unit, 5) + "/N" * (name == "GS") if unit else number(peak), _place(omega))
+        for (name, unit), (peak, omega) in zip(shapes, found.peaks, strict=True)
+    ]  # fmt: skip
     n, d = found.noise, found.demands
     # noise is linear: by itself it is told for 1 nm/√Hz, as nobody has a metre of it
     share = 1e-9 if d.sensor == 1.0 else 1.0
@@ -206,8 +207,8 @@ def _gains(run: FinishedRun, found: Study) -> Section:
     facts = tuple((name, ", ".join(number(float(v), 4) for v in values), unit)
                   for name, values, unit in rms)  # fmt: skip
     drawn = figures.gains(
-        found, "Sensitivity, complementary sensitivity, position by a force at the actuators (GS), "
-        "and force by sensor noise (KS).",
+        run, found, "Sensitivity, complementary sensitivity, position by a force at the actuators "
+        "(GS), and force by sensor noise (KS).",
     )  # fmt: skip
     white = (Heading("White noise (one-sided density)"), Facts(facts)) if facts else ()
     body = (drawn, Facts(tuple(tops)), Words(found.statics.words), *white)

@@ -18,7 +18,7 @@ from ccd_casadi.reporting.facts import (
     loop_facts,
     theta_words,
 )
-from ccd_casadi.support.units import HZ, counted, number
+from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
@@ -150,7 +150,7 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
         *loop_facts(r),
-        ("Largest |KS|", f"{number(r['KS_max'], 4)} N/m", ""),
+        ("Largest |KS|", shown(r["KS_max"], "N/m", 4), ""),
         ("Certificate", "passed" if certificate["passed"] else "FAILED",
          f"poles left of {number(certificate['max_real_pole'], 4)} 1/s on {on}, "
          f"at most {number(certificate['norm'], 6)} of a bound"),
@@ -172,7 +172,8 @@ def _asked_of(own: Mapping[str, Any]) -> str:
     if own["bandwidth_ratio"] > 1.0:
         asked.append(f"at least {own['bandwidth_ratio']:g} ω_b")
     if "M_K" in own:
-        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {own['M_K']:g} N/m")
+        unit = shown(own["M_K"], "N/m")
+        asked.append(f"|W_KS KS| {number(own['weighted_KS'], 4)} with M_K = {unit}")
     return "; ".join(asked)
 
 
@@ -190,9 +191,9 @@ def controller_blocks(result: Mapping[str, Any]) -> tuple[Words, Table]:
     controller = result["controller"]
     found = [SectionWords(**item) for item in controller["sections"]]
     channels = controller.get("channels", ())
-    gains = [f"{own['name']}: gain {number(own['gain'], 6)} N/m" for own in channels]
+    gains = [f"{own['name']}: gain {shown(own['gain'], 'N/m', 4)}" for own in channels]
     if "gain" in controller:
-        gains = [f"Gain {number(controller['gain'], 6)} N/m"]
+        gains = [f"Gain {shown(controller['gain'], 'N/m', 4)}"]
     words = (
         f"{', '.join(gains)}, order {controller['order']}, stable but for "
         "the integrator, every section of gain 1 at s = 0 (the integrator's: at high frequency)."

@@ -137,7 +137,7 @@ def _parts(folder: Path, case: Case, problem: CoDesignProblem, solution: "Soluti
     parts = design_parts(problem, own, theta, K, view, result)
     if isinstance(verified, VerifiedSections):
         table = bandwidths_table(verified)
-        parts["loop"] = lambda: [Section("Closed loop on every plant", (table, gains(view())))]
+        parts["loop"] = lambda: _loop(own, theta, K, view(), table)
     elif isinstance(verified, VerifiedDesign):
         truths = read_truths(folder / "samples.sqlite", problem)
         parts |= {
@@ -178,8 +178,9 @@ def design_parts(
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_section(own, theta, K),
     }
+    parts["loop"] = lambda: _loop(own, theta, K, view())
     if "proof" not in result:  # of mixed sensitivity
-        return parts | {"loop": lambda: _loop(own, theta, K, view())}
+        return parts
     return parts | {
         "controller": lambda: [Section("The controller", controller_blocks(result))],
         "limits": lambda: (
@@ -187,7 +188,6 @@ def design_parts(
             if "costs" in result
             else []
         ),
-        "loop": lambda: [Section("Closed loop on every plant", (gains(view()),))],
     }
 
 
@@ -247,13 +247,16 @@ def stage_sections(
 
 
 def _loop(
-    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView
+    problem: CoDesignProblem, theta: Sequence[float], K: StateSpace, loop: LoopView, *more: Table
 ) -> list[Section]:
     channels = split(scaled_plant(problem, theta), K)
+    plots = Section("Loop, plant and controller", (bode(loop, channels),))
+    if loop.bounded.asked:  # of a fixed structure
+        return [Section("Closed loop on every plant", (*more, gains(loop))), plots]
     return [
         Section("Closed loop: S, KS and T against their bounds", (gains(loop),)),
         Section("What limits the bandwidth", limit_blocks(loop)),
-        Section("Plant and controller", (bode(loop, channels),)),
+        plots,
     ]
 
 

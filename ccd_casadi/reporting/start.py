@@ -83,7 +83,7 @@ def _side(
 
 def _panels(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> tuple[tuple[Panel, ...], ...]:
     """S over the plants and the poles of the loops."""
-    ends = sides[0].loop.ends
+    ends, named = sides[0].loop.ends, sides[0].loop.named
     S = [Curve(s.loop.hz, s.loop.gains[0], s.name, s.colour) for s in sides]
     G = [Curve(s.loop.hz, largest(s.loop.plant), s.name, s.colour) for s in sides]
     poles = tuple(Curve(*s.roots, s.name, s.colour, line="", marker="x") for s in sides)
@@ -93,8 +93,8 @@ def _panels(problem: CoDesignProblem, sides: tuple[_Side, ...]) -> tuple[tuple[P
         levels=(Level(0.0, "unstable below", colour=GREY),), y_range=(-0.1, 1.1),
     )  # fmt: skip
     return (
-        (sensitivity_panel(S, ends, problem.inner.S_max, at),),
-        (over_hz("σ_max(G) (m/N)", G, ends), pole_map),
+        (sensitivity_panel(S, ends, problem.inner.S_max, at, f"{named('S')} (–)"),),
+        (over_hz(f"{named('G')} (m/N)", G, ends), pole_map),
     )
 
 

@@ -126,6 +126,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        checks = ", ".join(result.get("checks", {})).replace("_", " ")
-        return f"all checks passed: {checks}"
+        return "no line of the verdict is against it"
     return f"with warnings: {', '.join(warned)}"

@@ -32,7 +32,7 @@ _MOVE = (
     ("acceleration", _DEFAULT.limits.acceleration, "m/s²"),
     ("jerk", _DEFAULT.limits.jerk, "m/s³"),
     ("snap", _DEFAULT.limits.snap, "m/s⁴"),
-    ("window", _DEFAULT.window, "m; settled when the error stays within"),
+    ("window", _DEFAULT.window, "m; the error has to stay within it"),
 )
 
 
@@ -41,7 +41,7 @@ def add_move_options(arguments: argparse.ArgumentParser) -> None:
     for name, default, unit in _MOVE:
         arguments.add_argument(
             f"--{name}", type=positive, default=default, metavar="X",
-            help=f"of the move, {unit}; default {default:g}",
+            help=f"{name} of the move, {unit}; default {default:g}",
         )  # fmt: skip
 
 

@@ -8,11 +8,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ccd_casadi.cases.run_folder import FinishedRun
-from ccd_casadi.codesign.loops_off_model import Controller, Loop, LoopsOffModel, loops_off_model
+from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.survival import damping_range, excess_of, growth_of, shift_range
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.lti.hold import Sampling
+from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import scale_plant
@@ -108,7 +109,7 @@ def _loops(run: FinishedRun, system: Mechanics) -> LoopsOffModel:
     """The loops of which the verdict of a solve reads its ranges."""
     at = run.sampled
     sampling = None if at is None else Sampling(1.0 / at.period, 1e6 * at.delay)
-    return loops_off_model(system, run.problem.suspension, Controller(run.controller, sampling))
+    return loops_off_model(system, run.problem.suspension, run.controller, sampling)
 
 
 def _ends(

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis.loop_view import loop_view
-from ccd_casadi.analysis.move import Move, free_plant, mass_feedforward, moves
+from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.result import at_solve
@@ -153,7 +153,7 @@ def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move,
     ahead = mass_feedforward(modal, demands.axis)
     loop = loop_of(run)
     found = moves(
-        [loop], [replace(loop, plant=free_plant(modal))],
+        [loop], [replace(loop, plant=modal.state_space)],
         (None,) if ahead is None else (None, ahead), profile, axis=demands.axis,
         window=demands.window, bandwidth_hz=run.figures.bandwidth / HZ,
     )  # fmt: skip

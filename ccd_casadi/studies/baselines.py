@@ -8,21 +8,31 @@ are those of the problem's anchors.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ccd_casadi.cases.case import Case, load_case
+from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.codesign.design_entries import figures_dict
 from ccd_casadi.codesign.sections_entries import active_of, design_dict
 from ccd_casadi.fixed_structure import SectionsDesign
 from ccd_casadi.inner_problem.controller_problem import ControllerProblem, MixedSensitivityProblem
-from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_design, true_inner
-from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.inner_problem.problem import (
+    CoDesignProblem,
+    plant_of,
+    scaled_plant,
+    true_design,
+    true_inner,
+)
+from ccd_casadi.inner_problem.sections_bandwidth import require_bandwidth, sections_value
 from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.inner_problem.sweep import active_constraints, evaluate
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import UserError
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures, sweep, synthesise
 
@@ -155,6 +165,21 @@ class SectionsBaseline(Baseline):
     def controller(self, theta: tuple[float, ...], design: AnyDesign) -> StateSpace:
         assert design.controller is not None
         return design.controller
+
+
+def case_to_compare(path: Path, command: str) -> tuple[Case, CoDesignProblem]:
+    """A case whose methods can be compared: it counts the bandwidth, and lists no values.
+
+    Raises UserError of one line that names the `command` where it is another.
+    """
+    case = load_case(path)
+    problem = problem_of(case)
+    require_bandwidth(problem, command)
+    for name, _ in problem.listed:
+        words = f"{command} needs a range; give fixed, as the case.toml of a finished solve does"
+        raise UserError(f"{path}: theta.{name}.values: {words}")
+    plant_of(problem)
+    return case, problem
 
 
 def baseline_of(problem: CoDesignProblem) -> Baseline:

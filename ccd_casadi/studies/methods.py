@@ -32,7 +32,8 @@ def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             best = entry.objective
             found.append((entry.syntheses, best, entry.bandwidth / HZ))
     if found:
-        found.append((method.trace[-1].syntheses, *found[-1][1:]))
+        spent_in_all = method.figures.get("syntheses", 0)  # what the last improvement took not
+        found.append((max(method.trace[-1].syntheses, spent_in_all), *found[-1][1:]))
     spent, objective, bandwidth = np.array(found, float).reshape(-1, 3).T
     return spent, objective, bandwidth
 

@@ -63,9 +63,9 @@ def _shared(result: argparse.ArgumentParser, without_effect: Sequence[str]) -> N
         "--workers", "worker processes (default: all cores)", metavar="N", type=whole(1),
         default=usable_cores(),
     )  # fmt: skip
-    add("--seed", "default: 0", metavar="N", type=whole(0), default=0)
-    add("--quiet", "no progress, no summary", action="store_true")
-    words = "refuse a case that names a plant function: it is code of who wrote it"
+    add("--seed", "seed of all random numbers (default: 0)", metavar="N", type=whole(0), default=0)
+    add("--quiet", "print no progress and no summary", action="store_true")
+    words = "refuse a case whose plant is a Python function, which is code of its author"
     add("--no-user-code", words, action="store_true")
 
 

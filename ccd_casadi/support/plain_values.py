@@ -2,7 +2,7 @@
 
 from base64 import b64decode, b64encode
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from itertools import repeat
 from math import isfinite
@@ -54,8 +54,9 @@ def _rounded(item: Any) -> Any:
 
 
 def restored(kind: Any, data: Any) -> Any:
-    """Its inverse for a type as it is annotated. Raises KeyError, TypeError or ValueError where
-    `plain` cannot have written that.
+    """Its inverse for a type as it is annotated; a field that is not there has its default.
+
+    Raises KeyError, TypeError or ValueError where `plain` cannot have written that.
 
     >>> restored(tuple[float, ...], [1.5, "inf"])
     (1.5, inf)
@@ -81,7 +82,8 @@ def restored(kind: Any, data: Any) -> Any:
         return {str(key): restored(args[1], item) for key, item in dict(data).items()}
     if is_dataclass(kind):
         hints, build = get_type_hints(kind), cast(Any, kind)
-        return build(**{f.name: restored(hints[f.name], data[f.name]) for f in fields(kind)})
+        there = [f for f in fields(kind) if f.name in data or f.default is MISSING]
+        return build(**{f.name: restored(hints[f.name], data[f.name]) for f in there})
     if issubclass(kind, Enum):
         return kind[data]
     if kind is float:

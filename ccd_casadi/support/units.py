@@ -4,17 +4,23 @@ import math
 from typing import Any
 
 HZ = 2.0 * math.pi  # rad/s in one hertz
+LARGE = (("G", 1e-9), ("M", 1e-6), ("k", 1e-3))
 
 
 def shown_unit(unit: str, largest: float) -> tuple[str, float]:
     """The unit to show values up to this size in, and the factor to it: the one rule for the eye.
 
-    Lengths and times get the SI prefix with which the largest is 1 or more; what has another unit
-    keeps it.
+    Lengths, times, forces and stiffnesses get the SI prefix with which the largest is 1 or more;
+    what has another unit keeps it.
 
     >>> shown_unit("m", 4e-3), shown_unit("s", 2e-5), shown_unit("kg", 4e-3)
     (('mm', 1000.0), ('µs', 1000000.0), ('kg', 1.0))
+    >>> shown_unit("N/m", 3.6e7)
+    ('MN/m', 1e-06)
     """
+    if unit in ("N", "N/m") and abs(largest) >= 1e4:
+        prefix, factor = next(one for one in LARGE if abs(largest) * one[1] >= 1.0)
+        return prefix + unit, factor
     if unit not in ("m", "s") or largest == 0.0:
         return unit, 1.0
     for prefix, factor in (("", 1.0), ("m", 1e3), ("µ", 1e6)):

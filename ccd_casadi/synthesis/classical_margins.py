@@ -25,6 +25,7 @@ class ClassicalMargins:
 
     `phase_deg`: least change of phase, either way, at |L| = 1; `delay`: least lag there in s;
     `crossover`: the first such frequency in rad/s. All are inf where |L| does not cross 1.
+    `places`: where gain_down, gain_up and phase_deg are, rad/s; inf where there is no such margin.
     """
 
     gain_down: float
@@ -32,6 +33,7 @@ class ClassicalMargins:
     phase_deg: float
     delay: float
     crossover: float
+    places: tuple[float, float, float] = (np.inf, np.inf, np.inf)
 
 
 def classical_margins(
@@ -47,18 +49,30 @@ def classical_margins(
     (2.0, 1.232819, 27.1416)
     """
     L = response(omega)
-    real = response(_crossings(lambda w: response(w).imag, L.imag, omega)).real
-    gains = -1.0 / real[real < 0.0]
+    turned = _crossings(lambda w: response(w).imag, L.imag, omega)
+    real = response(turned).real
+    gains, turned = -1.0 / real[real < 0.0], turned[real < 0.0]
+    low, high = gains < 1.0, gains > 1.0
     crossover = _crossings(lambda w: np.abs(response(w)) - 1.0, np.abs(L) - 1.0, omega)
     # the lag that takes L to -1; a margin of lead is what is left of a whole turn
     lags = np.mod(np.angle(-response(crossover)), 2.0 * np.pi)
+    phases = np.degrees(np.minimum(lags, 2.0 * np.pi - lags))
     return ClassicalMargins(
-        gain_down=float(gains[gains < 1.0].max(initial=0.0)),
-        gain_up=float(gains[gains > 1.0].min(initial=np.inf)),
-        phase_deg=float(np.degrees(np.minimum(lags, 2.0 * np.pi - lags)).min(initial=np.inf)),
+        gain_down=float(gains[low].max(initial=0.0)),
+        gain_up=float(gains[high].min(initial=np.inf)),
+        phase_deg=float(phases.min(initial=np.inf)),
         delay=float((lags / crossover).min(initial=np.inf)),
         crossover=float(crossover.min(initial=np.inf)),
+        places=(
+            _at_least(-gains[low], turned[low]),
+            _at_least(gains[high], turned[high]),
+            _at_least(phases, crossover),
+        ),
     )
+
+
+def _at_least(values: Array, places: Array) -> float:
+    return float(places[values.argmin()]) if values.size else np.inf
 
 
 def least_margins(respond: Responses, omega: Array) -> ClassicalMargins:
@@ -77,12 +91,16 @@ def least_margins(respond: Responses, omega: Array) -> ClassicalMargins:
 
 def least_of(each: Sequence[ClassicalMargins]) -> ClassicalMargins:
     """Of several loops the margins nearest to instability, and the lowest crossover."""
+    down = max(each, key=lambda m: m.gain_down)
+    up = min(each, key=lambda m: m.gain_up)
+    phase = min(each, key=lambda m: m.phase_deg)
     return ClassicalMargins(
-        gain_down=max(m.gain_down for m in each),
-        gain_up=min(m.gain_up for m in each),
-        phase_deg=min(m.phase_deg for m in each),
+        gain_down=down.gain_down,
+        gain_up=up.gain_up,
+        phase_deg=phase.phase_deg,
         delay=min(m.delay for m in each),
         crossover=min(m.crossover for m in each),
+        places=(down.places[0], up.places[1], phase.places[2]),
     )
 
 

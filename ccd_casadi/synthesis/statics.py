@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.support.units import HZ, metres
+from ccd_casadi.support.units import HZ, metres, shown
 
 DIFFERENTIATOR = 0.1  # |K(0)| under this share of |K(jω_b)| holds little at rest
 # |p|/ω_b of a controller's slowest pole below which it is an integrator: rounding, or an hour
@@ -52,8 +52,8 @@ class Statics:
                 f"1 N moves it {low}."
             )
         found = (
-            f"Static stiffness K(0) = {self.stiffness:.3g} N/m: a constant force of 1 N moves the "
-            f"stage {metres(self.compliance)} (GS at 0 Hz), {low}."
+            f"Static stiffness K(0) = {shown(self.stiffness, 'N/m')}: a constant force of 1 N "
+            f"moves the stage {metres(self.compliance)} (GS at 0 Hz), {low}."
         )
         if self.differentiates:
             found += (

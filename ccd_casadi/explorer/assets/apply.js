@@ -1,7 +1,10 @@
 // In the browser alone: sent back they would be heard here as changes. What somebody zoomed stays.
 if (message.content == null) return
 const [words, changes, numbers] = message.content
-for (const [id, html] of Object.entries(words)) document.getElementById(id).innerHTML = html
+for (const [id, html] of Object.entries(words)) {
+  const place = document.getElementById(id)
+  if (place.said !== html) place.innerHTML = place.said = html
+}
 const unpacked = value => value?.count == null
   ? Array.isArray(value) ? value.map(unpacked) : value
   : new Float64Array(numbers.buffer, numbers.byteOffset + 8 * value.from, value.count)

@@ -54,10 +54,7 @@ class InterpolatedModes:
                 "correct the table, or rigid_below_hz"
             )
         self.table, self.rigid = table, int(counts[0])
-        damping = table.zeta[:, self.rigid :]
-        if damping.size and damping.min() <= 0.0:
-            raise PlantError("a flexible mode has no damping; give a damping ratio above 0")
-        self.ratio = float(damping.flat[0]) if damping.size and np.ptp(damping) == 0.0 else None
+        self.ratio = _common_ratio(table, self.rigid)
         tried = [self._fitted(frame) for frame in frames(table, self.rigid)]
         best = min(range(len(tried)), key=lambda i: tried[i][2].response)
         self.frame, members, self.left_out = tried[best]
@@ -90,18 +87,6 @@ class InterpolatedModes:
                 np.array([item[3] for item in along]),
             ),
         )
-
-    def row(self, index: int) -> Mechanics:
-        """The modal model of one sample as it stands in the table."""
-        table, r, n = self.table, self.table.omega.shape[1], len(self.table.names)
-        lam = np.where(np.arange(r) < self.rigid, 0.0, table.omega[index] ** 2)
-        D = np.zeros((r, r))
-        if self.ratio is None:
-            D = np.diag(2.0 * table.zeta[index] * np.sqrt(lam))
-        B, C = table.inputs[index].copy(), table.outputs[index].T.copy()
-        M, K = np.eye(r), np.diag(lam)
-        none = tuple(np.zeros((n, *part.shape)) for part in (M, D, K, B, C))
-        return Mechanics(M, D, K, B, C, self.ratio, none)  # type: ignore[arg-type]
 
     def nearest(self, theta: Sequence[float]) -> tuple[int, float]:
         """The nearest sample, and how far it is (the largest share of the table's range)."""
@@ -185,6 +170,25 @@ class InterpolatedModes:
         s = (DAMPED + 1j) * np.geomspace(0.3 * low, 1.2 * high, FREQUENCIES)
         inverse = np.linalg.inv(K + (s**2)[:, None, None] * np.eye(len(K)))
         return np.asarray(C @ inverse @ B)
+
+
+def row_of(table: ModalTable, rigid: int, index: int) -> Mechanics:
+    """The modal model of one sample as it stands in the table, whose first `rigid` modes are."""
+    r, n, ratio = table.omega.shape[1], len(table.names), _common_ratio(table, rigid)
+    lam = np.where(np.arange(r) < rigid, 0.0, table.omega[index] ** 2)
+    D = np.zeros((r, r)) if ratio is not None else np.diag(2.0 * table.zeta[index] * np.sqrt(lam))
+    B, C = table.inputs[index].copy(), table.outputs[index].T.copy()
+    M, K = np.eye(r), np.diag(lam)
+    none = tuple(np.zeros((n, *part.shape)) for part in (M, D, K, B, C))
+    return Mechanics(M, D, K, B, C, ratio, none)  # type: ignore[arg-type]
+
+
+def _common_ratio(table: ModalTable, rigid: int) -> float | None:
+    """The damping ratio of every flexible mode, None where they differ."""
+    damping = table.zeta[:, rigid:]
+    if damping.size and damping.min() <= 0.0:
+        raise PlantError("a flexible mode has no damping; give a damping ratio above 0")
+    return float(damping.flat[0]) if damping.size and np.ptp(damping) == 0.0 else None
 
 
 def fit_entry(theta: Array, values: Array) -> Surrogate:

@@ -54,8 +54,6 @@ def read_modal_table(path: Path) -> ModalTable:
     for prefix, what in (("in:", "actuator"), ("out:", "sensor")):
         if not groups[prefix]:
             raise PlantError(f"{path}: has no column {prefix}NAME; add one for each {what}")
-    if not theta_names:
-        raise PlantError(f"{path}: has no column of theta; add one for each parameter")
     samples: dict[tuple[float, ...], list[dict[str, float]]] = {}
     for row in rows:
         samples.setdefault(tuple(row[name] for name in theta_names), []).append(row)

@@ -8,7 +8,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.plants.imported.interpolation import InterpolatedModes, fit_entry
+from ccd_casadi.plants.imported.interpolation import InterpolatedModes, fit_entry, row_of
 from ccd_casadi.plants.imported.matrices import reduced_table
 from ccd_casadi.plants.imported.modal_table import ModalTable, read_modal_table
 from ccd_casadi.plants.plant import Mechanics, Plant
@@ -48,11 +48,15 @@ def plant_of_table(
 
     Raises PlantError where the table's parameters are not those of the case.
     """
+    if names and not table.names:
+        raise PlantError(f"{source}: has no column of theta; add one for each parameter")
     if sorted(names) != sorted(table.names):
         raise PlantError(
             f"{source} has the parameters {', '.join(table.names)}, the case "
             f"{', '.join(names)}; make them agree"
         )
+    if not names:
+        return _one_sample(table, rigid_below_hz)
     order = [table.names.index(name) for name in names]
     table = _reordered(table, order)
     try:
@@ -77,7 +81,23 @@ def plant_of_table(
 
 
 def _nearest_row(modes: InterpolatedModes, theta: Sequence[float]) -> Mechanics:
-    return modes.row(modes.nearest(theta)[0])
+    return row_of(modes.table, modes.rigid, modes.nearest(theta)[0])
+
+
+def _one_sample(table: ModalTable, rigid_below_hz: float) -> Plant:
+    """A table without parameters: one model, whose forces and sensors [places] may move."""
+    rigid = int((table.omega[0] < 2.0 * np.pi * rigid_below_hz).sum())
+    found, none = row_of(table, rigid, 0), ca.MX.sym("theta", 0)
+    return Plant(
+        names=(),
+        constraint_names=table.constraint_names,
+        evaluate=lambda theta: found,
+        hardware=ca.Function(
+            "hardware", [none], [float(table.cost[0]), ca.DM(table.constraints[0])]
+        ),
+        outputs=table.outputs.shape[2],
+        inputs=table.inputs.shape[2],
+    )
 
 
 def _notes(

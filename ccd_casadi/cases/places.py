@@ -1,0 +1,50 @@
+"""[places] of a case: nodes read from their file, and its places as the plant takes them."""
+
+import csv
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+from ccd_casadi.cases.checks import shown
+from ccd_casadi.cases.sections import PlacesSection
+from ccd_casadi.plants.places import Places, names_in
+
+Fail = Callable[[str, str], Exception]
+
+
+def checked_places(section: PlacesSection, folder: Path, fail: Fail) -> PlacesSection:
+    """The section with its nodes as numbers, so that a run's own case needs no other file."""
+    if section == PlacesSection():
+        return section
+    for name in ("nodes", "actuators"):
+        if not getattr(section, name):
+            raise fail(f"places.{name}", "is missing; add it")
+    if (section.quiet or section.damped) and not section.axes:
+        raise fail("places.axes", "is false, and quiet and damped modes are of axes; give true")
+    rows = section.nodes
+    if isinstance(rows, str):
+        try:
+            text = (folder / rows).read_text(encoding="utf-8-sig")
+            rows = tuple(tuple(map(float, row)) for row in list(csv.reader(text.splitlines()))[1:])
+        except (OSError, ValueError, csv.Error) as error:
+            words = f"{shown(section.nodes)}: {error}; name a CSV file of numbers after a header"
+            raise fail("places.nodes", words) from None
+    numbers = tuple(tuple(map(float, row)) for row in rows)
+    if not numbers or len({len(row) for row in numbers}) != 1 or len(numbers[0]) not in (1, 2, 3):
+        raise fail("places.nodes", "are not rows of as many coordinates, 1 to 3; correct them")
+    return replace(section, nodes=numbers)
+
+
+def place_names(section: PlacesSection) -> tuple[str, ...]:
+    """The parameters that it names."""
+    return names_in((*section.actuators, *section.sensors, section.present))
+
+
+def places_of(section: PlacesSection) -> Places | None:
+    """Its places as plain values; None where the case has none."""
+    if section == PlacesSection():
+        return None
+    values = {item.name: getattr(section, item.name) for item in fields(Places)}
+    for name in ("actuators", "sensors"):
+        values[name] = tuple(map(tuple, values[name]))
+    return Places(**values)

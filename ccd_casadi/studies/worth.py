@@ -1,0 +1,142 @@
+"""What co-design gains over the sequential way, from a few true designs and their derivatives."""
+
+from collections.abc import Mapping
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ccd_casadi.cases.case import Case
+from ccd_casadi.codesign.front_learners import Learner
+from ccd_casadi.codesign.outer_problem import OuterFailure, solve_program
+from ccd_casadi.codesign.run import outer_of
+from ccd_casadi.inner_problem.constraints import unmet
+from ccd_casadi.inner_problem.objective import objective
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
+from ccd_casadi.plants.plant import hardware_cost
+from ccd_casadi.reporting.facts import cost_words, theta_words
+from ccd_casadi.reporting.landscape import predicted
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.studies.sequential import design_hardware
+from ccd_casadi.support.errors import UserError
+from ccd_casadi.support.units import HZ, number
+from surrogates import design
+
+SECONDS = 20.0  # after which no further round begins
+STARTS = 8  # of IPOPT, on the hardware and on the surrogates
+LOOKS = 8  # true inner problems over the box for each parameter
+SETTLED = 1e-3  # of |J|: a round that gains less, as expected, is the last
+LOOKED = 256  # θ at which the surrogates are asked what they leave open
+SIGMAS = 2.0  # above what they predict
+
+
+def worth(case: Case, sampler: Sampler, seed: int = 0) -> dict[str, Any]:
+    """The sequential design, then rounds of surrogate, IPOPT and truth; the figures of worth.json.
+
+    Raises UserError where too few designs are certified to learn from, or none is feasible.
+    """
+    began = perf_counter()
+    rule = HZ * case.baseline.first_resonance_hz
+    hardware = design_hardware(
+        sampler.problem, rule, starts=STARTS, seed=seed, workers=sampler.workers
+    )
+    outer = outer_of(sampler).prepared(seed)
+    sampler, problem = outer.sampler, outer.problem
+    count = len(problem.names)
+    spread = design("sobol", *box(problem), LOOKS * count, seed)
+    known = sampler.bandwidths(np.array([hardware.theta, problem.start]), "first designs")
+    for i in range(0, len(spread), 2 * count):
+        if perf_counter() - began < 0.5 * SECONDS:
+            known += sampler.bandwidths(spread[i : i + 2 * count], "a look over the box")
+    best = min(known, key=lambda sample: _value(problem, sample))
+    learner = outer.learner(LOOKS // 2 * len(outer.bounds[0]), seed)
+    learner.begin(None)
+    feasible = [sample for sample in known if sample.feasible]
+    learner.learn(np.array([learner.point(sample) for sample in feasible]), feasible)
+    while True:
+        before, starts = _value(problem, best), design("sobol", *learner.bounds, STARTS, seed)
+        if np.isfinite(before):
+            starts = np.vstack([starts, learner.point(best)])
+        try:
+            expected = solve_program(learner.program(), starts).best
+        except OuterFailure:  # the surrogates expect a feasible design nowhere
+            break
+        new = sampler.bandwidths(outer.theta_of(expected.x), "the best expected")[0]
+        best = min(best, new, key=lambda sample: _value(problem, sample))
+        level = SETTLED * abs(_value(problem, best))
+        true = abs(_value(problem, new) - expected.objective) <= level
+        if (true and before - _value(problem, best) <= level) or perf_counter() - began > SECONDS:
+            break
+        rows = [expected.x, learner.point(new)] if new.feasible else [expected.x]
+        learner.learn(np.array(rows), [new] * len(rows))
+    if not np.isfinite(_value(problem, best)):
+        raise UserError(f"no feasible design was found: {known[0].shortfall}")
+    entries: list[dict[str, Any]] = [
+        {
+            "theta": dict(zip(problem.names, sample.theta, strict=True)),
+            "units": dict(zip(problem.names, problem.units, strict=True)),
+            "hardware_cost": hardware_cost(plant_of(problem), sample.theta),
+            "cost_unit": problem.cost_unit,
+            "bandwidth_hz": sample.bandwidth / HZ,
+        }
+        for sample in (known[0], best)
+    ]
+    old, co = entries
+    left = _left_open_hz(problem, learner, _value(problem, best), seed)
+    return {
+        "sequential": old,
+        "co_design": co,
+        "hardware_cost_percent": 100.0 * (co["hardware_cost"] / old["hardware_cost"] - 1.0),
+        "bandwidth_percent": 100.0 * (co["bandwidth_hz"] / old["bandwidth_hz"] - 1.0),
+        "left_open_percent": 100.0 * left / old["bandwidth_hz"],
+        "first_resonance_hz": hardware.first_resonance / HZ,
+        "resonance_met": hardware.met,
+        "syntheses": sampler.syntheses,
+        "seconds": perf_counter() - began,
+    }
+
+
+def _value(problem: CoDesignProblem, sample: BandwidthSample) -> float:
+    """J; infinite where the design is not feasible."""
+    good = sample.feasible and not unmet(problem, sample.theta)
+    return objective(problem, sample.theta, sample.value) if good else np.inf
+
+
+def _left_open_hz(problem: CoDesignProblem, learner: Learner, best: float, seed: int) -> float:
+    """How much more than at J = `best` the surrogates expect where they are most hopeful.
+
+    Never less than their error at samples that were left out.
+    """
+    error = SIGMAS * learner.processes[0].loo.rms / HZ
+    thetas = design("sobol", *box(problem), LOOKED, seed)
+    hz, deviation = predicted(problem, learner.processes, thetas, std=True)
+    hopeful = zip(thetas, HZ * (hz + np.hypot(SIGMAS * deviation, error)), strict=True)
+    values = [
+        objective(problem, theta, omega)
+        for theta, omega in hopeful
+        if np.isfinite(omega) and not unmet(problem, theta)
+    ]
+    return max(error, (best - min(values, default=best)) / (HZ * abs(problem.w2) or np.inf))
+
+
+def worth_words(found: Mapping[str, Any]) -> list[str]:
+    """The answer first, then both designs and what it has cost."""
+    answer = "The sequential hardware has no feasible controller; co-design has one."
+    if np.isfinite(found["bandwidth_percent"]):
+        answer = (
+            f"Co-design changes the hardware cost by {found['hardware_cost_percent']:+.1f} % and "
+            f"the bandwidth by {found['bandwidth_percent']:+.1f} %; the surrogates leave "
+            f"{found['left_open_percent']:.1f} % more open."
+        )
+    old, co = (
+        f"{theta_words(each)}: {cost_words(each)}, {number(each['bandwidth_hz'])} Hz"
+        for each in (found["sequential"], found["co_design"])
+    )
+    met = "" if found["resonance_met"] else ", the highest in the box: the rule is not met"
+    return [
+        f"answer        {answer}",
+        f"sequential    {old}; first resonance {number(found['first_resonance_hz'], 4)} Hz{met}",
+        f"co-design     {co}",
+        f"cost          {found['syntheses']} syntheses, {found['seconds']:.1f} s",
+    ]

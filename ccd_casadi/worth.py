@@ -1,0 +1,45 @@
+"""`python -m ccd_casadi.worth CASE.toml`: what co-design gains over the sequential way, in seconds.
+
+Writes worth.json: hardware first by a rule of thumb, the best design found, what is left open.
+"""
+
+import argparse
+from collections.abc import Sequence
+
+from ccd_casadi.support.command_line import ExitCode, parser, run, run_folder
+from ccd_casadi.support.process_pool import PATIENCE, Workers
+from ccd_casadi.support.terminal import say
+
+
+def command(options: argparse.Namespace) -> ExitCode:
+    """The command itself."""
+    from ccd_casadi.sampling.sampler import Sampler
+    from ccd_casadi.sampling.store import SampleStore
+    from ccd_casadi.studies.baselines import case_to_compare
+    from ccd_casadi.studies.worth import worth, worth_words
+    from ccd_casadi.support.json_files import clean, write_json
+    from ccd_casadi.support.versions import versions
+
+    case, problem = case_to_compare(options.case, "worth")
+    out = options.out or options.case.with_name(options.case.stem + "_worth")
+    folder = run_folder(options.case, out)
+    with (
+        Workers(options.workers, PATIENCE) as workers,
+        SampleStore(folder / "samples.sqlite") as store,
+    ):
+        found = worth(case, Sampler(problem, store, workers, quiet=options.quiet), options.seed)
+    answer = found | {"seed": options.seed, "versions": versions()}
+    write_json(folder / "worth.json", clean(answer))
+    if not options.quiet:
+        say("\n".join([*worth_words(found), f"file          {folder / 'worth.json'}"]))
+    return ExitCode.DONE
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    arguments = parser("ccd_casadi.worth", "What co-design gains over the sequential way.")
+    return run(command, arguments, argv, needs=["ccd_casadi.studies.worth"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,70 @@
+"""The documentation: its size, links to it, every public name, messages as in the code."""
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+USERS = sorted(page for page in DOCS.rglob("*.md") if "development" not in page.parts)
+MENTIONS = ("README.md", "CONTRIBUTING.md", "pyproject.toml", "Makefile", "ccd_casadi/**/*.py",
+            "surrogates/**/*.py", "benchmarks/*.py", "examples/**/*.md", "runs/*.toml",
+            "tests/*.py")  # fmt: skip
+CELL = re.compile(r"^\| `(.+?)` \|", re.MULTILINE)
+
+
+def test_the_pages_for_users_are_few_and_short() -> None:
+    assert len(USERS) <= 25
+    assert sum(len(page.read_text().split()) for page in USERS) <= 31_000
+
+
+@pytest.mark.parametrize("package", ["ccd_casadi", "surrogates"])
+def test_every_public_name_is_on_the_reference_page(package: str) -> None:
+    stub = ast.parse((ROOT / package / "__init__.pyi").read_text())
+    page = (DOCS / "reference.md").read_text().splitlines()
+    for node in ast.walk(stub):
+        if isinstance(node, ast.ImportFrom):
+            for name in node.names:
+                assert f"::: {node.module}.{name.name}" in page
+
+
+def test_a_page_has_one_name_in_the_navigation_and_on_itself() -> None:
+    nav = re.findall(r"^ +- (.+): (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    for name, page in nav[1:]:  # but Home
+        title = re.search(r"^# (.+)$", (DOCS / page).read_text(), re.MULTILINE)
+        assert title is not None
+        assert title[1].strip() == name.strip('"')
+
+
+def test_every_page_that_is_named_elsewhere_is_there() -> None:
+    for pattern in MENTIONS:
+        for file in ROOT.glob(pattern):
+            for named in re.findall(r"\bdocs/[\w/]+\.(?:md|png)", file.read_text()):
+                assert (ROOT / named).exists(), f"{file}: {named}"
+
+
+@cache
+def strings() -> str:
+    """Every string of the packages, … for what is put in."""
+
+    def each() -> Iterator[str]:
+        for package in ("ccd_casadi", "surrogates"):
+            for file in (ROOT / package).rglob("*.py"):
+                for node in ast.walk(ast.parse(file.read_text())):
+                    if isinstance(node, ast.JoinedStr):
+                        parts = (getattr(part, "value", None) for part in node.values)
+                        yield "".join(part if isinstance(part, str) else "…" for part in parts)
+                    elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                        yield node.value
+
+    return "\n".join(each())
+
+
+@pytest.mark.parametrize("message", CELL.findall((DOCS / "troubleshooting.md").read_text()))
+def test_every_message_is_one_of_the_code(message: str) -> None:
+    for part in filter(None, map(str.strip, message.split("…"))):
+        assert part in strings()

@@ -1,0 +1,179 @@
+"""Sections of several channels: deployed as they are, judged as one loop; solved to the end."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from case_documents import TWO_MASS
+
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_folder import FinishedRun
+from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.deployment.files import deployment_dict
+from ccd_casadi.deployment.outcome import Deployment
+from ccd_casadi.deployment.pipeline import deploy
+from ccd_casadi.deployment.sampled import sampled_figures
+from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.drawing.paint import painted
+from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
+from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_plant
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.lti.hold import sampled
+from ccd_casadi.reporting.deploy_page import deploy_page
+from ccd_casadi.solve import main as solve_main
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED
+
+GANTRY = """
+def gantry(theta, load=0.0):
+    m, c = theta["m"], 0.5 * load
+    return {
+        "mass": [[m + load, c, 0, 0], [c, 2 * m + load, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        "stiffness": [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1.4e6, 0], [0, 0, 0, 2.1e6]],
+        "damping_ratio": 0.02, "input": [[1, 0], [0, 1], [0.1, 0], [0, 0.1]],
+        "output": [[1, 0, 0.1, 0], [0, 1, 0, 0.1]], "hardware_cost": m}
+"""
+CASE = """
+[plant]
+function = "gantry.py:gantry"
+[theta.m]
+lower = 9.9
+upper = 10.1
+start = 10.0
+unit = "kg"
+[objective]
+w1 = 1.0
+w2 = -0.05
+WEIGHTS
+[controller]
+structure = "sections"
+biquads = 0
+roll_off = 1
+starts = 2
+weighted_level = 12.0
+CHANNELS
+[loop]
+rate_hz = 8000.0
+delay_us = 60.0
+[robust]
+gain = 0.02
+plants = ["loaded.toml"]
+[sampling]
+points = 2
+[outer]
+box_points = 0
+direct_starts = 2
+"""
+DIAGONALS = """[controller.channel.sum]
+outputs = [1, 1]
+[controller.channel.difference]
+outputs = [1, -1]"""
+HAND = {"gain": 3e3, "integrator": HZ, "lead 1 zero": 0.1 * HZ, "lead 1 pole": 150.0 * HZ,
+        "roll-off real": 300.0 * HZ}  # fmt: skip
+
+
+def written(folder: Path, channels: str = "") -> Path:
+    """A gantry whose axes a load couples; channels along its diagonals are coupled without it."""
+    (folder / "gantry.py").write_text(GANTRY)
+    (folder / "loaded.toml").write_text("load = 0.5\n")
+    weights = "[weights]" + TWO_MASS.read_text().split("[weights]")[1]
+    path = folder / "case.toml"
+    text = (
+        CASE.replace("WEIGHTS", weights)
+        .replace("CHANNELS", channels)
+        .replace("M_K = 2e7", "M_K = 1e6")
+    )
+    path.write_text(text.replace("S_max = 1.75", "S_max = 2.5").replace("S_low = 0.03",
+                                                                        "S_low = 0.2"))  # fmt: skip
+    return path
+
+
+def run_by_hand(folder: Path, harder: float = 1.0) -> FinishedRun:
+    """A run whose controller is tuned by hand; that of the second channel `harder` times."""
+    case = load_case(written(folder, DIAGONALS))
+    problem = problem_of(case)
+    structure = structure_of(problem)
+    assert isinstance(structure, ChannelStructure)
+    kappa = np.log([HAND[name.split(": ")[1]] for name in structure.names])
+    kappa[structure.slices[1].start] += np.log(harder)
+    plant, K = scaled_plant(problem, problem.start), structure.state_space(kappa)
+    figures = measure(plant, K, problem.weights, gamma=UNBOUNDED, omega_low=HZ)
+    result = {"status": "verified", "theta": dict(zip(problem.names, problem.start, strict=True))}
+    return FinishedRun(folder, case, problem, problem.start, plant, problem.weights, K, figures,
+                       result, kappa=kappa)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def by_hand(tmp_path_factory: pytest.TempPathFactory) -> tuple[FinishedRun, Deployment]:
+    run = run_by_hand(tmp_path_factory.mktemp("gantry"))
+    return run, deploy(run, Timing())
+
+
+def test_what_runs_are_the_channels_sections_by_tustin(
+    by_hand: tuple[FinishedRun, Deployment],
+) -> None:
+    run, found = by_hand
+    K, omega = found.realisation.system, np.geomspace(1.0, 0.9 * np.pi * 8000.0, 50)
+    s = 2j * 8000.0 * np.tan(0.5 * omega / 8000.0)
+    C = run.controller
+    exact = [C.C @ np.linalg.solve(x * np.eye(len(C.A)) - C.A, C.B) + C.D for x in s]
+    assert K.response(omega) == pytest.approx(np.array(exact), rel=1e-6, abs=1e-6)
+    assert [item.channel.name for item in found.orders] == ["sum", "difference"]
+    words = deployment_dict(run, found, 0)["channels"]
+    assert [item["sections"]["gain"] for item in words] == pytest.approx([3e3, 3e3])
+    assert [item["order"] for item in words] == [3, 3]
+
+
+def test_the_whole_loop_is_judged_on_the_whole_set(
+    by_hand: tuple[FinishedRun, Deployment], tmp_path: Path
+) -> None:
+    run, found = by_hand
+    assert found.passed, found.shortfalls
+    assert {getattr(item.at, "option", 0) for item in found.members} == {0, 1}
+    uncertain = uncertain_plant(run.problem, run.theta)
+    for option in (0, 1):  # in between, by plants of one's own
+        for gain in (-0.02, 0.007, 0.02):
+            plant = uncertain.plant(np.array([gain]), option).plant_si()
+            held = sampled(plant, 1.0 / 8000.0, 60e-6)
+            figures = sampled_figures(closed_loop(held, found.realisation.system).S)
+            assert figures.stable
+            assert figures.sensitivity_peak <= found.worst.figures.sensitivity_peak * (1.0 + 1e-3)
+    page = painted(deploy_page(run, found))
+    assert "Channel sum: gain 3000\xa0N/m" in page
+    assert "Channel difference: 3 states, as designed" in page
+
+
+def test_one_channel_that_is_too_fast_is_told(tmp_path: Path) -> None:
+    found = deploy(run_by_hand(tmp_path, harder=4.0), Timing())
+    assert not found.passed
+    assert found.worst.badness > found.target.peak
+
+
+@pytest.mark.slow
+def test_a_solve_runs_to_its_end_and_deploys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    options = ["--formulation", "direct", "--workers", "1", "--out", str(run)]
+    assert solve_main([str(written(tmp_path)), *options]) == 0
+    printed = capsys.readouterr().out
+    assert "order 6, gain 1: " in printed
+    result = json.loads((run / "result.json").read_text())
+    assert result["status"] == "verified"
+    assert result["proof"]["outcome"] == "several_channels"
+    assert [item["name"] for item in result["controller"]["channels"]] == ["1", "2"]
+    assert "1: lead" in (run / "report.html").read_text()
+    assert deploy_main([str(run), "--quiet"]) == 0
+    deployed = json.loads((run / "deploy" / "deploy.json").read_text())
+    assert deployed["robust"]["worst"]["sensitivity_peak"] <= 2.5 * (1.0 + 1e-3)
+    if shutil.which("cc"):
+        command = ["cc", "-std=c99", "-O2", "-ffp-contract=off", "-o", "test", "controller.c",
+                   "controller_test.c"]  # fmt: skip
+        subprocess.run(command, cwd=run / "deploy", check=True)
+        subprocess.run(["./test"], cwd=run / "deploy", check=True)

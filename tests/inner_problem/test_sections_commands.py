@@ -1,0 +1,316 @@
+"""Every command on one run with a controller of fixed structure: a PID, sampled."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from case_documents import SECTIONS_TABLES
+from contradictions import contradictions
+from helpers import problem
+
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.run_folder import read_run
+from ccd_casadi.codesign.post_optimal import sections_responses
+from ccd_casadi.compare import main as compare_main
+from ccd_casadi.deploy import main as deploy_main
+from ccd_casadi.deployment.given_controller import as_it_runs
+from ccd_casadi.deployment.pipeline import deploy
+from ccd_casadi.deployment.timing import Timing
+from ccd_casadi.fixed_structure import Bounds, Structure
+from ccd_casadi.fixed_structure.design import problem_for
+from ccd_casadi.fixed_structure.starts import at_random, kept
+from ccd_casadi.fixed_structure.structure import state_space
+from ccd_casadi.gap import main as gap_main
+from ccd_casadi.inner import main as inner_main
+from ccd_casadi.inner_problem import sections_robustness
+from ccd_casadi.inner_problem.problem import scaled_plant
+from ccd_casadi.inner_problem.sections_bandwidth import sections_value
+from ccd_casadi.insight import main as insight_main
+from ccd_casadi.limitations.basis import Basis
+from ccd_casadi.limitations.of_problem import limits_of_problem
+from ccd_casadi.lti.hold import sampled, tustin
+from ccd_casadi.robustness import main as robustness_main
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.solve import main as solve_main
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.closed_loop import measure
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, synthesise
+from surrogates.retrain import main as retrain_main
+
+COMMON = ["--quiet", "--workers", "1"]
+
+QUICK = f"""
+[plant]
+model = "two_mass"
+[theta.m1]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[theta.m2]
+lower = 58.0
+upper = 60.0
+start = 59.0
+unit = "kg"
+[objective]
+w1 = 0.0995
+w2 = -0.9950
+[inner]
+S_max = 1.75
+{SECTIONS_TABLES}
+[loop]
+rate_hz = 8000.0
+delay_us = 80.0
+[robust]
+gain = 0.02
+[sampling]
+points = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """quick.toml and its run; what a test writes goes elsewhere."""
+    place = tmp_path_factory.mktemp("sections")
+    (place / "quick.toml").write_text(QUICK)
+    assert solve_main([str(place / "quick.toml"), "--out", str(place / "run"), *COMMON]) == 0
+    return place
+
+
+def test_its_verdict_agrees_with_itself(folder: Path) -> None:
+    problem = problem_of(load_case(folder / "run" / "case.toml"))
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert contradictions(result, problem) == []
+    assert {"races", "samples", "rounds"} <= set(result["spent"])
+
+
+def test_a_run_holds_the_controller_and_its_page(folder: Path) -> None:
+    run = folder / "run"
+    result = json.loads((run / "result.json").read_text())
+    controller = json.loads((run / "controller.json").read_text())
+    assert controller["sections"]["loop"] == {
+        "rate_hz": 8000.0, "delay_us": 80.0, "method": "tustin"
+    }  # fmt: skip
+    assert len(controller["A"]) == result["controller"]["order"] == 4
+    page = (run / "report.html").read_text()
+    for words in ("Nyquist", "roll-off", "What limits the bandwidth", "mass feedforward"):
+        assert words in page
+    # more plants, or hold and delay, can only cost: the climbs start from the design itself
+    for easier in ("on_model_hz", "continuous_hz"):
+        assert result["costs"][easier] >= result["bandwidth_hz"] * (1.0 - 1e-3)
+
+
+def test_no_controller_exceeds_what_the_run_says(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = json.loads((folder / "run" / "result.json").read_text())
+    bound = result["gap"]["bandwidth_bound_hz"]
+    assert bound >= result["costs"]["on_model_hz"] >= result["bandwidth_hz"]
+    assert (
+        f"no controller of any order exceeds {bound:.2f} Hz"
+        in (result["verdict"]["optimal"]["words"])
+    )
+    assert gap_main([str(folder / "run")]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["gap"]["relative"] == pytest.approx(result["gap"]["relative"])
+    assert result["bandwidth_hz"] < answer["gap"]["inside_hz"] < bound
+
+
+def test_the_loop_of_a_run_lies_in_the_discs_of_its_bandwidth_and_no_multiplier_sees_it(
+    folder: Path,
+) -> None:
+    """T of the design in v = (2/T) tan(ωT/2): ∫ h T dv = 0, as for the T of every controller."""
+    run = read_run(folder / "run")
+    (limits,) = limits_of_problem(run.problem, run.theta)
+    sampling, bandwidth = run.problem.controller.sampling, HZ * run.result["bandwidth_hz"]
+    v = np.geomspace(1e-3, 1e9, 200_000)
+    omega = limits.omega(v)
+    plant = sampled(run.plant.plant_si(), sampling.period, sampling.delay)
+    L = plant.swept(omega)[:, 0, 0] * tustin(run.controller, sampling.period).swept(omega)[:, 0, 0]
+    T, inside = L / (1.0 + L), omega < 0.99 * np.pi * sampling.rate_hz
+    m_S, m_T = limits.radii(v, v, bandwidth)
+    share = np.maximum(np.abs(1.0 - T) / m_S, np.abs(T) / m_T)[inside].max()
+    assert 0.5 < share < 1.0 + 1e-3
+    at = limits.variable(bandwidth)
+    basis = Basis((0.5 * at, 2.0 * at, 2.0 * at), (), 10.0 * at, 1, limits.beyond)
+    h = basis.values(v)
+    seen = np.trapezoid((h * T[:, None]).real, v, axis=0)
+    assert np.abs(seen).max() < 1e-3 * np.trapezoid(np.abs(h * T[:, None]), v, axis=0).max()
+
+
+def test_fresh_draws_survive_what_was_designed_for_and_nothing_more(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = read_run(folder / "run")
+    monkeypatch.setattr(sections_robustness, "FRESH", 40)
+    for more, survived in ((1.0, 40), (1.05, 0)):
+        bandwidth = more * HZ * run.result["bandwidth_hz"]  # on the set
+        made = SimpleNamespace(controller=run.controller, bandwidth=bandwidth)
+        drawn = sections_robustness.fresh_yield(run.problem, run.theta, made)
+        assert drawn is not None
+        assert (drawn.survived, drawn.draws) == (survived, 40)
+
+
+def test_inner_and_deploy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert inner_main([str(folder / "quick.toml"), "--theta", "m1=59,m2=59", *COMMON]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "verified"
+    assert answer["gamma_opt"] is None
+
+    result = json.loads((folder / "run" / "result.json").read_text())
+    assert deploy_main([str(folder / "run"), "--out", str(folder / "deploy"), *COMMON]) == 0
+    deployed = json.loads((folder / "deploy" / "deploy.json").read_text())
+    assert (deployed["rate_hz"], deployed["delay"]) == pytest.approx((8000.0, 8e-5))
+    assert deployed["sampled"]["bandwidth_hz"] >= result["bandwidth_hz"] * (1.0 - 1e-6)
+    assert deployed["sampled"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+    # the whole set that the case names, with its ends, and none above S_max
+    gains = [member["gain"] for member in deployed["robust"]["members"]]
+    assert min(gains) == pytest.approx(-0.02)
+    assert max(gains) == pytest.approx(0.02)
+    assert deployed["robust"]["worst"]["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+
+
+def test_a_rate_that_only_the_nominal_plant_stands_is_not_verified(folder: Path) -> None:
+    """At half the rate that the loop was designed for, the plant of the largest gain tells."""
+    run = read_run(folder / "run")
+    found = deploy(run, Timing(rate_hz=4000.0))
+    nominal = max(found.sampled.sensitivity_peak, run.problem.inner.S_max)
+    assert found.stable
+    assert not found.passed
+    assert found.worst.figures.sensitivity_peak > nominal
+    assert "gain +2 %" in found.shortfalls[0]
+
+
+def test_a_run_that_is_not_verified_deploys_as_such(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = Path(shutil.copytree(folder / "run", tmp_path / "run"))
+    result = json.loads((run / "result.json").read_text())
+    result |= {"status": "not_verified", "reason": "failed: robust"}
+    (run / "result.json").write_text(json.dumps(result))
+    assert deploy_main([str(run), *COMMON]) == 4
+    assert "failed: robust" in capsys.readouterr().err
+    assert deploy_main([str(run), *COMMON, "--unverified"]) == 4
+    deployed = json.loads((run / "deploy" / "deploy.json").read_text())
+    assert deployed["status"] == "not_verified"
+
+
+def test_robustness_is_of_the_loop_as_it_runs(folder: Path) -> None:
+    """Of the sampled one, and as deploy has it."""
+    run, out = folder / "run", folder / "robustness"
+    assert robustness_main([str(run), "--samples", "3", "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "robustness.json").read_text())
+    assert found["period"] == pytest.approx(1.0 / 8000.0)
+    assert found["survives"]
+    assert found["sensitivity_peak"] <= 1.75 * (1.0 + 1e-3)
+    assert len(found["move"]["runs"]) == 2
+    without, ahead = found["move"]["runs"]
+    assert ahead["peak_error"] < without["peak_error"]
+    finished = read_run(run)
+    assert as_it_runs(finished).figures.bandwidth != finished.figures.bandwidth
+
+
+@pytest.mark.slow
+def test_insight_draws_the_front_of_the_runs_own_function(folder: Path) -> None:
+    out = folder / "insight"
+    assert insight_main([str(folder / "run"), "--points", "2", "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "insight.json").read_text())
+    result = json.loads((folder / "run" / "result.json").read_text())
+    points = found["front"]["points"]
+    assert all(point["status"] == "verified" for point in points)
+    fastest = max(point["bandwidth_hz"] for point in points)
+    assert fastest == pytest.approx(result["bandwidth_hz"], rel=1e-3)
+    assert "S_max" in (out / "insight.html").read_text()
+
+
+def test_responses_against_differences(folder: Path) -> None:
+    """dω_b*/dS_max, and dJ*/dp at a θ whose bounds hold it, by two other designs."""
+    run = read_run(folder / "run")
+    made = sections_value(run.problem, run.theta)
+    sample = BandwidthSample(
+        run.theta, made.bandwidth, made.gradient, np.nan, np.nan, (), "", 0.0, 1
+    )
+    found = sections_responses(run.problem, sample, made)
+    by_name = {item.parameter: item for item in found.responses}
+    h = 1e-3
+    ends = []
+    for sign in (1.0, -1.0):
+        inner = replace(run.problem.inner, S_max=run.problem.inner.S_max + sign * h)
+        ends.append(sections_value(replace(run.problem, inner=inner), run.theta).bandwidth)
+    slope = (ends[0] - ends[1]) / (2.0 * h)
+    assert found.determined
+    assert by_name["S_max"].bandwidth == pytest.approx(slope, rel=1e-3)
+    assert by_name["S_max"].objective == pytest.approx(run.problem.w2 * slope, rel=1e-3)
+    for name, value in zip(run.problem.names, run.theta, strict=True):
+        assert value == pytest.approx(60.0, rel=1e-9)  # the bound, as near as it was reached
+        i = run.problem.names.index(name)
+        J = run.problem.w1 + run.problem.w2 * made.gradient[i]
+        assert by_name[f"{name} upper"].objective == pytest.approx(J, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_retraining_goes_on_from_the_runs_samples(folder: Path) -> None:
+    out = folder / "retrained"
+    before = json.loads((folder / "run" / "result.json").read_text())
+    assert retrain_main([str(folder / "run"), "--out", str(out), "--budget", "6", *COMMON]) == 0
+    after = json.loads((out / "result.json").read_text())
+    assert after["status"] == "verified"
+    assert after["objective"] == pytest.approx(before["objective"], rel=1e-3)
+    assert after["anchors"] == before["anchors"]
+    assert "Nyquist" in (out / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_compare_sets_the_methods_side_by_side(folder: Path) -> None:
+    case = folder / "compared.toml"
+    case.write_text(QUICK + "[baseline]\nstarts = 1\nsteps = [0.1]\nfirst_resonance_hz = 150.0\n")
+    out = folder / "compared"
+    assert compare_main([str(case), "--out", str(out), *COMMON]) == 0
+    found = json.loads((out / "compare.json").read_text())
+    methods, best = found["methods"], found["conclusions"]["best_objective"]
+    assert "steepest_descent" not in methods
+    for name in ("nested", "lifted", "direct", "steepest_descent_total"):
+        assert methods[name]["status"] == "verified"
+        assert methods[name]["objective"] == pytest.approx(best, rel=1e-3)
+    assert methods["sequential"]["objective"] >= best
+    assert "Left out" in (out / "report.html").read_text()
+
+
+def test_no_structure_has_a_stacked_norm_below_gamma_opt() -> None:
+    """γ_opt is a bound for every stabilising controller; some at random, of order 6."""
+    rng, structure, case = np.random.default_rng(3), Structure(biquads=1), problem()
+    weights = case.weights.at(600.0 * HZ, 40.0 * HZ)
+    bounds = Bounds(S_max=2.0, S_low=0.1, omega_low=HZ)
+    for theta in ((55.0, 55.0), (70.0, 58.0)):
+        plant = scaled_plant(case, theta)
+        least = synthesise(plant, weights, omega_low=HZ).figures.gamma_opt
+        inside = problem_for([plant], structure, bounds)
+        draws = np.exp(rng.uniform(-3.0, -0.5, 40))
+        stable = kept(inside, at_random(inside, draws, rng))
+        assert len(stable) > 3
+        for kappa in stable:
+            K = state_space(structure, structure.in_units(kappa, plant.omega_0, plant.force))
+            found = measure(plant, K, weights, gamma=UNBOUNDED, omega_low=weights.omega_T)
+            stacked = found.certificate.norm if found.certificate.stable else np.inf
+            assert stacked >= least * (1.0 - 1e-6)
+
+
+def test_a_changed_controller_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    changed = folder / "changed"
+    shutil.copytree(folder / "run", changed)
+    controller = json.loads((changed / "controller.json").read_text())
+    controller["sections"]["kappa"][0] += 3.0  # 20 times the gain
+    (changed / "controller.json").write_text(json.dumps(controller))
+    assert deploy_main([str(changed), *COMMON]) == 2
+    assert "not certified" in capsys.readouterr().err
+    result = json.loads((changed / "result.json").read_text())
+    result["anchors"][0].append(0.0)
+    (changed / "result.json").write_text(json.dumps(result))
+    shutil.copy(folder / "run" / "controller.json", changed / "controller.json")
+    assert insight_main([str(changed), *COMMON]) == 2
+    assert "anchors" in capsys.readouterr().err

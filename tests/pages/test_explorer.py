@@ -1,0 +1,332 @@
+"""The explorer without its page: sliders as problems, certified looks, their curves, the store."""
+
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccd_casadi import inner
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.explorer.background import Solve
+from ccd_casadi.explorer.curves import as_sampled, curves_of, sampled_of, with_sampled
+from ccd_casadi.explorer.designs import How, Standing, elements_at, judged, present
+from ccd_casadi.explorer.knobs import Problems, case_at, knobs_of
+from ccd_casadi.explorer.landscape import landscape_of
+from ccd_casadi.explorer.modes import KnownModes, fit_modes, frequency_error, in_modal_form, plan
+from ccd_casadi.explorer.panels import drawn
+from ccd_casadi.explorer.session import Session
+from ccd_casadi.explorer.words import (
+    end_words,
+    machine_html,
+    move_words,
+    standing_html,
+    survival_words,
+)
+from ccd_casadi.lti.closed_loop import closed_loop
+from ccd_casadi.plants.plant import Mechanics
+from ccd_casadi.reporting.bode import loop_panels
+from ccd_casadi.reporting.machine import lumped, lumped_svg
+from ccd_casadi.reporting.true_samples import read_truths
+from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.synthesis import Outcome
+
+CASE = Path("runs/two_mass.toml")
+EQUAL = 1e-9  # relative: the same figures by another way
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    made = Session(load_case(CASE), tmp_path_factory.mktemp("explored"))
+    yield made
+    made.store.close()
+
+
+@pytest.fixture(scope="module")
+def searched_look(session):
+    return session.full(session.start)
+
+
+def asked_of_inner(capsys, theta, *options):
+    """What the command `inner` prints at θ."""
+    words = ",".join(f"{name}={value!r}" for name, value in zip(("m1", "m2"), theta, strict=True))
+    code = inner.main([str(CASE), "--theta", words, "--quiet", *options])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def same(look, found):
+    """Every figure of a look equals that of `inner`."""
+    f = look.figures
+    pairs = [
+        (look.bandwidth_hz, "bandwidth_hz"), (f.sensitivity_peak, "sensitivity_peak"),
+        (f.sensitivity_low, "sensitivity_low"), (f.gamma, "gamma"), (f.gamma_opt, "gamma_opt"),
+        (f.omega_S / HZ, "omega_S_hz"), (f.omega_T / HZ, "omega_T_hz"),
+        (look.cost, "hardware_cost"), (look.objective, "objective"),
+    ]  # fmt: skip
+    return all(value == pytest.approx(found[name], rel=EQUAL) for value, name in pairs)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"S_max": 1.6, "omega_T_hz": (30.0, 500.0), "theta": (60.0, 58.0)},
+        {"resonance_shift": 0.02},
+        {"structure": "h_infinity_disturbance", "omega_S_hz": (20.0, 900.0)},
+        {"structure": "sections", "sampled": True, "rate_hz": 8000.0, "delay_us": 50.0},
+    ],
+)
+def test_sliders_and_the_case_they_make_are_one_problem(change):
+    case = load_case(CASE)
+    knobs = replace(knobs_of(case), **change)
+    assert Problems(case).at(knobs) == problem_of(case_at(case, knobs))
+
+
+def test_twenty_designs_at_random_are_those_of_inner(session, capsys):
+    rng = np.random.default_rng(0)
+    case = session.case
+    problem = session.problems.at(session.start)
+    lower, upper = np.array(problem.lower), np.array(problem.upper)
+    for number in range(20):
+        theta = tuple(map(float, lower + rng.uniform(size=2) * (upper - lower)))
+        knobs = replace(session.start, theta=theta)
+        if number < 2:  # a full search, as when a slider is let go
+            _, found = asked_of_inner(capsys, theta)
+            assert same(session.full(knobs), found)
+            continue
+        box = case.inner.omega_S_hz, case.inner.omega_T_hz
+        hz = [float(np.exp(rng.uniform(*np.log(pair)))) for pair in box]
+        options = ("--omega-s-hz", repr(hz[0]), "--omega-t-hz", repr(hz[1]))
+        code, found = asked_of_inner(capsys, theta, *options)
+        look = present(problem, knobs, elements_at(problem, theta), (HZ * hz[0], HZ * hz[1]))
+        assert (look.standing is Standing.REFUSED) == (code != 0)
+        if code == 0:
+            assert same(look, found)
+            assert (look.standing is Standing.KEPT) == found["feasible"]
+
+
+def test_a_search_keeps_its_bounds_and_its_curves_show_it(searched_look):
+    look, c = searched_look, curves_of(searched_look)
+    assert look.how is How.SEARCHED
+    assert look.standing is Standing.KEPT
+    assert c.view.gains[0].max() == pytest.approx(look.figures.sensitivity_peak, rel=1e-6)
+    # what the certificate says of each of them
+    assert (c.view.gains <= c.view.bounds * (1.0 + 1e-9)).all()
+    assert c.view.gains[0][c.view.hz == look.bandwidth_hz] == pytest.approx(2**-0.5, rel=1e-6)
+    assert c.poles.real.max() < 0.0
+    # the distance of L from -1 is 1/|S|
+    near = np.abs(1.0 + c.view.open[0, :, 0, 0])
+    known = np.isfinite(near)
+    assert near[known] * c.view.gains[0][known] == pytest.approx(np.ones(known.sum()), rel=1e-6)
+    assert abs(c.step[-1] - 1.0) < 0.05
+    assert c.move.feedforward
+    assert (
+        np.abs(c.move.error[c.move.time > 1.5 * c.move.duration]).max()
+        < 1e-2 * np.abs(c.move.error).max()
+    )
+
+
+def test_a_bound_that_is_missed_is_said_so(session, searched_look):
+    stricter = replace(session.start, S_max=1.5)
+    look = session.live(stricter)  # at the weights that suit a larger S_max
+    assert look.standing is Standing.MISSED
+    assert "S_max = 1.5" in look.reason
+    assert curves_of(look) is not None
+
+
+def test_what_is_not_certified_says_why_and_has_no_bandwidth(searched_look):
+    failed = replace(searched_look.figures, outcome=Outcome.UNSTABLE_LOOP)
+    standing, reason = judged(searched_look.problem, failed)
+    look = replace(searched_look, figures=failed, standing=standing, reason=reason)
+    assert standing is Standing.REFUSED
+    assert reason == Outcome.UNSTABLE_LOOP.value
+    assert np.isnan(look.bandwidth_hz)
+    assert sampled_of(look) is None
+    assert curves_of(replace(look, controller=None)) is None
+
+
+def test_hold_and_delay_take_their_share_of_the_margin(searched_look):
+    late = [
+        sampled_of(replace(searched_look, knobs=replace(searched_look.knobs, delay_us=delay)))
+        for delay in (0.0, 100.0)
+    ]
+    assert all(found.stable for found in late)
+    assert searched_look.figures.sensitivity_peak < late[0].peak < late[1].peak
+    for found in late:
+        assert found.gain.max() <= found.peak * (1.0 + 1e-6)
+
+
+def test_the_standing_is_that_of_the_worst_that_was_judged(searched_look):
+    """Certified, and unstable as it would run: "certified, keeps its bounds" is not what it is."""
+    order = list(Standing)
+    for rate, delay, worst in ((1e5, 0.0, Standing.KEPT), (1e4, 100.0, Standing.MISSED),
+                               (3162.0, 300.0, Standing.REFUSED)):  # fmt: skip
+        knobs = replace(searched_look.knobs, rate_hz=rate, delay_us=delay)
+        loose = replace(searched_look.problem.inner, S_max=1.01 * searched_look.problem.inner.S_max)
+        problem = replace(searched_look.problem, inner=loose)
+        for before in (Standing.KEPT, Standing.MISSED, Standing.NEAR, Standing.REFUSED):
+            look = replace(searched_look, knobs=knobs, standing=before, problem=problem)
+            found = as_sampled(look.plant, look.controller, rate, delay)
+            after = with_sampled(look, found)
+            assert after.standing == max(before, worst, key=order.index)
+    assert "unstable as sampled at 3162 Hz" in after.reason
+    assert np.isnan(after.bandwidth_hz)
+
+
+def test_another_plant_than_the_models_own_certifies_nothing(session, searched_look):
+    own = elements_at(searched_look.problem, searched_look.theta)
+    for error, kept in ((0.0, True), (0.01, True), (0.05, False), (np.inf, False)):
+        near = replace(own, error=error, words="a plant nearby")
+        point = searched_look.figures.omega_S, searched_look.figures.omega_T
+        look = present(searched_look.problem, searched_look.knobs, near, point)
+        assert (look.standing is Standing.KEPT) == kept
+        assert (look.standing is Standing.NEAR) != kept
+        assert np.isfinite(look.objective) == kept  # no J of one θ's mass and another's bandwidth
+        words = standing_html(look, curves_of(look), None)
+        assert ("certified, keeps its bounds" in words) == kept
+        assert ("a plant nearby" in words) == (error > 0.0) or kept
+
+
+def test_the_margins_told_are_where_stability_ends(session, searched_look):
+    assert "K by itself is stable" in survival_words(curves_of(searched_look))
+    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # K is unstable there
+    c, G, K = curves_of(look), look.plant.plant_si(), look.controller
+
+    def stable(factor):
+        loop = closed_loop(G, replace(K, C=factor * K.C, D=factor * K.D))
+        return np.linalg.eigvals(loop.A).real.max() < 0.0
+
+    for gain, inwards in (
+        (c.view.margins.gain_down, 1.0 + 1e-6),
+        (c.view.margins.gain_up, 1.0 - 1e-6),
+    ):
+        assert stable(gain * inwards)
+        assert not stable(gain / inwards)
+    assert "UNSTABLE (poles at 143.1 Hz)" in survival_words(c)
+    assert "feedforward" in move_words(c)
+    alone = replace(c, move=replace(c.move, feedforward=False))
+    assert "without feedforward" in move_words(alone)
+
+
+def test_margins_are_drawn_where_the_loop_has_them(session):
+    look = session.full(replace(session.start, theta=(55.0, 55.0)))  # with a margin downwards too
+    view = curves_of(look).view
+    size, phase = loop_panels(view)
+
+    def L(hz):
+        G, K = view.loop.responses(HZ * np.array([hz]))
+        return complex((G @ K)[0, 0, 0])
+
+    (crossover,) = (level.value for level in phase.levels if level.vertical)
+    assert abs(L(crossover)) == pytest.approx(1.0, rel=1e-9)
+    assert len(size.marks) == 2
+    for mark in size.marks:
+        assert L(mark.x) == pytest.approx(-mark.y, rel=1e-6)  # where the gain alone decides
+    (mark,) = phase.marks
+    assert abs(L(mark.x)) == pytest.approx(1.0, rel=1e-9)
+    turned = (mark.y - np.degrees(np.angle(L(mark.x)))) % 360.0
+    assert min(turned, 360.0 - turned) < 1.0  # read off the grid's straight pieces
+    gap = phase.curves[-1].y
+    assert abs(gap[0] - gap[1]) == pytest.approx(view.margins.phase_deg, abs=1.0)
+    drawn_too = drawn(look, curves_of(look), None).panels
+    assert drawn_too["L"].marks == size.marks  # what a page shows is what the explorer shows
+
+
+def test_every_look_is_in_the_store_and_a_search_is_a_true_sample(session, searched_look):
+    live = session.live(replace(session.start, theta=(60.0, 66.0)))
+    session.keep([live, searched_look])
+    problem = searched_look.problem
+    truths = read_truths(session.store.path, problem)
+    places = {s.theta for s in truths.designs}
+    assert {live.theta, searched_look.theta} <= places
+    known = dict(zip(map(tuple, truths.theta.tolist()), truths.bandwidth_hz, strict=True))
+    assert known[searched_look.theta] == pytest.approx(searched_look.bandwidth_hz, rel=EQUAL)
+    assert np.isnan(known.get(live.theta, np.nan))  # one synthesis is no ω_b*(θ)
+    drawn, _ = landscape_of(problem, searched_look.theta, None, (), session.store.path, (0, 1))
+    assert searched_look.theta in {(x, y) for x, y, _ in drawn.truths.tolist()}
+
+
+def test_a_saved_case_is_the_one_on_the_sliders(session):
+    knobs = replace(session.start, theta=(61.5, 58.25), S_max=1.625)
+    first, second = session.save(knobs), session.save(knobs)
+    assert first != second
+    case = load_case(first)
+    assert knobs_of(case) == knobs
+    assert problem_of(case) == session.problems.at(knobs)
+
+
+def test_masses_and_springs_are_read_from_the_matrices(session, searched_look):
+    system = searched_look.elements.system
+    found = lumped(system)
+    assert found.masses.tolist() == list(searched_look.theta)
+    ((i, j, stiffness),) = found.springs  # nothing holds it to the ground
+    assert (i, j) == (0, 1)
+    assert stiffness == pytest.approx(2.0 * sum(m**4 for m in searched_look.theta))
+    assert (found.driven, found.measured) == ((0,), (0,))
+    svg = lumped_svg(found, searched_look.modal, 70.0)
+    assert svg.count("<rect") == 2
+    assert "mode 1" in svg
+    grounded = lumped(replace(system, K=system.K + np.diag([0.0, 1e6])))
+    assert (1, -1, pytest.approx(1e6)) in grounded.springs
+    other = family((1.0, 1.0))  # in modal coordinates there are no masses to draw
+    assert lumped(other) is None
+    look = replace(searched_look, elements=replace(searched_look.elements, system=other))
+    assert "<table>" in machine_html(look, session.start.theta, 1.0)
+
+
+def family(theta):
+    """Three modes, a rigid and two flexible ones, that move smoothly with θ."""
+    a, b = theta
+    B = np.array([[1.0, 1.0], [a**0.3, -(b**0.1)], [0.4 * b, 0.4 * b]])
+    lam = np.diag([0.0, 1e6 * a**1.5 / b, 4e6 * b**0.5])
+    none = tuple(np.zeros((0, *shape)) for shape in ((3, 3), (3, 3), (3, 3), (3, 2), (2, 3)))
+    return Mechanics(np.eye(3), np.zeros((3, 3)), lam, B, B.T.copy(), 0.01, none)
+
+
+def test_the_surrogate_of_the_modes_is_as_good_as_it_says(tmp_path):
+    lower, upper = (0.5, 1.0), (2.0, 3.0)
+    known = KnownModes(lower, upper, "a plant")
+    thetas = plan(lower, upper)
+    for theta in thetas[:32]:
+        known.exact[theta] = family(theta)
+    assert in_modal_form(family(thetas[0]))
+    assert known.due(0)
+    assert not known.due(32)
+    elements = known.at(thetas[40])
+    assert not elements.exact
+    assert "nearest exact" in elements.words
+    known.surrogate = fit_modes(list(known.exact), list(known.exact.values()))
+    away = [frequency_error(known.at(t).system, family(t)) for t in thetas[32:64]]
+    assert max(away) < 20.0 * known.surrogate.errors.max() + 1e-9
+    assert max(away) < 0.01
+    for theta in thetas[32:36]:
+        near, exact = known.at(theta), family(theta)
+        assert not near.exact
+        assert pytest.approx(exact.B, rel=0.01, abs=0.01) == near.system.B
+    assert known.at(thetas[0]).exact
+    known.save(tmp_path)
+    again = KnownModes(lower, upper, "a plant")
+    again.load(tmp_path, family(thetas[0]))
+    assert again.exact.keys() == known.exact.keys()
+    assert again.exact[thetas[3]].K.tolist() == known.exact[thetas[3]].K.tolist()
+    other = KnownModes(lower, upper, "another plant")
+    other.load(tmp_path, family(thetas[0]))
+    assert not other.exact
+
+
+def test_a_solve_tells_its_lines_and_how_it_ended(tmp_path):
+    said, codes, over = [], [], threading.Event()
+
+    def ended(code):
+        codes.append(code)
+        over.set()
+
+    solve = Solve(tmp_path / "none.toml", tmp_path / "out", ["--workers", "1"], said.append, ended)
+    assert over.wait(300.0)
+    assert codes == [2]
+    assert "none.toml: there is no such file" in said[0]
+    assert "not verified" in end_words(4)
+    solve.stop()  # there is nothing left to stop

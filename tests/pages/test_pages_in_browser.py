@@ -1,0 +1,145 @@
+"""The pages of a run in a real browser: quiet, readable narrow and dark, whole in print, linked."""
+
+import shutil
+
+import pytest
+
+from ccd_casadi.deploy import main as deploy
+from ccd_casadi.drawing.content import Head, Lines, Page, Section, Steps, Table
+from ccd_casadi.drawing.paint import painted
+from ccd_casadi.insight import main as insight
+from ccd_casadi.robustness import main as robustness
+
+WIDTHS, SCHEMES = (1300, 390), ("light", "dark")
+HEAVIEST = 1.5e6  # bytes of a page
+# Numbers that are broken over two lines: of a text node's own boxes there is more than one height.
+SPLIT = r"""() => {
+  const found = [], walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT)
+  for (let node; node = walk.nextNode();) {
+    if (node.parentElement.closest("pre, script, style, svg, .meta, details:not([open])")) continue
+    for (const m of node.data.matchAll(/[-+\u2212]?\d[\d.]*(e[-+]?\d+)?/g)) {
+      const range = document.createRange()
+      range.setStart(node, m.index)
+      range.setEnd(node, m.index + m[0].length)
+      if (new Set([...range.getClientRects()].map(box => Math.round(box.top))).size > 1)
+        found.push(m[0])
+    }
+  }
+  return found
+}"""
+# Contrast to the page's ground, the least of all words and of all curves in the figures.
+CONTRAST = r"""() => {
+  const light = colour => {
+    const c = colour.match(/[\d.]+/g).slice(0, 3).map(v => v / 255)
+      .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    return 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2] + 0.05
+  }
+  const ground = light(getComputedStyle(document.documentElement).backgroundColor)
+  const least = (selector, property) => Math.min(...[...document.querySelectorAll(selector)]
+    .map(each => light(getComputedStyle(each)[property]))
+    .map(v => Math.max(v, ground) / Math.min(v, ground)))
+  return {words: least("svg text", "fill"), curves: least("[id*='-curve'] path", "stroke")}
+}"""
+
+
+def complaints(page):
+    """A list to which what the page complains of is added."""
+    heard = []
+    page.on("console", lambda said: heard.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    return heard
+
+
+def looked_at(browser, pages, schemes=SCHEMES):
+    """Every page at both widths in the themes, and printed."""
+    for scheme in schemes:
+        context = browser.new_context(color_scheme=scheme)
+        page = context.new_page()
+        heard = complaints(page)
+        for place in pages:
+            page.goto(place.as_uri())
+            for width in WIDTHS:
+                page.set_viewport_size({"width": width, "height": 900})
+                assert page.evaluate("document.documentElement.scrollWidth") <= width, place
+                assert page.evaluate(SPLIT) == [], (place, width)
+            found = page.evaluate(CONTRAST)
+            if page.locator("svg text").count():
+                assert found["words"] >= 4.5, (place, scheme)
+                assert found["curves"] >= 3.0, (place, scheme)
+            page.emulate_media(media="print")
+            page.set_viewport_size({"width": 680, "height": 960})  # A4 without its margins
+            assert page.evaluate(SPLIT) == [], place
+            assert page.evaluate(CONTRAST)["words"] >= 4.5  # on white, whatever the theme is
+            assert page.pdf().startswith(b"%PDF")
+            page.emulate_media(media="screen")
+        assert not heard
+        context.close()
+
+
+def test_the_pages_of_a_run_are_read_on_any_screen_and_on_paper(browser, solved):
+    folder = solved("lifted")
+    page = browser.new_page()
+    page.goto((folder / "index.html").as_uri())
+    page.get_by_role("link", name="Co-design of").click()
+    assert page.url == (folder / "report.html").as_uri()
+    assert (folder / "report.html").stat().st_size < HEAVIEST
+    page.get_by_role("link", name="Loop, plant and controller").click()  # of the contents list
+    top = page.get_by_role("heading", name="Loop, plant and controller").bounding_box()["y"]
+    assert -1.0 <= top < 200.0
+    looked_at(browser, [folder / "report.html"], ["dark"])  # the rest is behind slow
+
+
+def test_one_cursor_reads_all_curves_over_frequency(browser, solved):
+    page = browser.new_page(viewport={"width": 1300, "height": 900})
+    page.goto((solved("lifted") / "report.html").as_uri())
+    place = page.locator("svg[aria-label='At a glance: |S| (–)']")
+    place.scroll_into_view_if_needed()
+    place.hover()
+    shown = page.locator("svg .readout:visible")
+    words = [text for text in shown.all_text_contents() if text]
+    assert len({text.split(" · ")[0] for text in words}) == 1  # one frequency
+    for name in ("|S|", "|KS|", "|T|", "|G|", "|K|", "|L|", "phase of L"):
+        assert any(f" {name} " in f" {text.replace(' · ', ' ')} " for text in words), name
+    by_name = {text.split(" · ")[1].rsplit(" ", 1)[0]: text.rsplit(" ", 1)[1] for text in words}
+    # read off different pictures: |L| = |G| |K|
+    product = float(by_name["|G|"]) * float(by_name["|K|"])
+    assert float(by_name["|L|"]) == pytest.approx(product, rel=0.03)
+
+
+@pytest.mark.slow
+def test_every_page_of_a_run(browser, solved, tmp_path):
+    folder = shutil.copytree(solved("lifted"), tmp_path / "run")
+    quiet = [str(folder), "--quiet"]
+    robustness(quiet)
+    deploy(quiet)
+    insight([*quiet, "--points", "3", "--workers", "1"])
+    page = browser.new_page()
+    page.goto((folder / "index.html").as_uri())
+    linked = page.locator("li a").evaluate_all("links => links.map(link => link.href)")
+    pages = sorted(folder.rglob("*.html"))
+    assert sorted([*linked, (folder / "index.html").as_uri()]) == [p.as_uri() for p in pages]
+    assert len(pages) == 5
+    looked_at(browser, pages)
+
+
+def test_a_slider_shows_one_step_at_a_time(browser, tmp_path):
+    steps = tuple((f"step {i}", Lines(((Table(("",), ((i,),)),),), "")) for i in range(4))
+    place = tmp_path / "page.html"
+    section = Section("Steps", (Steps(steps, 1, "first to last"),))
+    head = Head("a page", "good", "", "", "", "")
+    place.write_text(painted(Page(head, (section,))), encoding="utf-8")
+    page = browser.new_page()
+    heard = complaints(page)
+    page.goto(place.as_uri())
+    shown = page.locator(".step:visible")
+    assert [text.split() for text in shown.all_inner_texts()] == [["step", "1", "1"]]
+    slider = page.locator("input[type=range]")
+    slider.focus()
+    for key, expected in (("End", "3"), ("ArrowLeft", "2"), ("Home", "0")):
+        page.keyboard.press(key)
+        assert [text.split()[-1] for text in shown.all_inner_texts()] == [expected]
+    page.emulate_media(media="print")
+    assert not slider.is_visible()
+    assert shown.count() == 1
+    assert not heard
+    page.close()

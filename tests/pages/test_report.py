@@ -1,0 +1,456 @@
+"""The run report: sound HTML without outside resources, every figure complete, in every case."""
+
+import base64
+import hashlib
+import re
+import shutil
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+import pytest
+from commands import changed
+
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.sections import Case
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import formulation_of
+from ccd_casadi.codesign.run import co_design
+from ccd_casadi.codesign.verified import Solution
+from ccd_casadi.deployment.channels import split
+from ccd_casadi.drawing.content import (
+    Curve,
+    Head,
+    Landscape,
+    Lines,
+    Page,
+    Panel,
+    Section,
+    Table,
+    ThetaPath,
+    Words,
+)
+from ccd_casadi.drawing.lines import figure_lines
+from ccd_casadi.drawing.maps import figure_landscape
+from ccd_casadi.drawing.page import table_html
+from ccd_casadi.drawing.paint import block_html, painted
+from ccd_casadi.inner_problem.design_loops import design_view
+from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant, true_inner
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.report import main as report_command
+from ccd_casadi.reporting.bode import bode
+from ccd_casadi.reporting.landscape import caption_landscape
+from ccd_casadi.reporting.lifted_maximum import inner_maximum
+from ccd_casadi.reporting.solve_page import solve_page, write_report
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+from ccd_casadi.support.units import number
+from surrogates.gaussian_process import mean_at_many
+
+HZ = 2.0 * np.pi
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+HOSTILE_UNIT = r'kg</td><script>alert(1)</script>"&$\\frac$'
+HOSTILE_STEM = 'a <img src=x onerror=alert(2)> & "b"'
+COMMON = """
+[objective]
+w1 = 0.1
+w2 = -1.0
+[weights]
+M_S = 2.0
+A_S = 1e-4
+c_K = 1e4
+omega_K_hz = 100.0
+M_K = 1e7
+A_l = 1.0
+A_u = 1e-2
+[inner]
+S_max = 1.9
+S_low = 0.05
+omega_low_hz = 1.0
+omega_S_hz = [10.0, 1000.0]
+omega_T_hz = [25.0, 1000.0]
+"""
+PLANTS = """
+import casadi as ca
+SPRING = ca.DM([[1, -1], [-1, 1]])
+
+def line(m, k, end):
+    return {"mass": ca.diag(ca.vertcat(m, end)), "stiffness": k * SPRING, "damping_ratio": 0.02,
+            "input": ca.DM([1, 0]), "output": ca.DM([[1, 0]]), "hardware_cost": m + end}
+
+def one(theta):
+    return line(theta["m"], 2e7, 20.0)
+
+def two(theta):
+    return line(theta["m"], 2e7, theta["e"])
+
+def three(theta):
+    plant = line(theta["m"], 2e7 * theta["k"], 20.0 + theta["o"])
+    return plant | {"constraints": {"room <b>": theta["m"] + theta["o"] - 34.0}}
+
+def mimo(theta):
+    a, b = theta["a"], theta["b"]
+    K = ca.SX(3, 3)
+    K[:2, :2] += 2e7 * a * SPRING
+    K[1:, 1:] += 2e7 * b * SPRING
+    return {"mass": ca.diag(ca.vertcat(20 * a, 8 * b, 10)), "stiffness": K, "damping_ratio": 0.02,
+            "input": ca.DM([[1, 0], [0, 0], [0, 1]]), "output": ca.DM([[1, 0, 0], [0, 0, 1]]),
+            "hardware_cost": a + b}
+"""
+
+
+def parameter(name: str, low: float, high: float, unit: str = "") -> str:
+    return f"[theta.{name}]\nlower = {low}\nupper = {high}\nunit = '{unit}'\n"
+
+
+TWO = parameter("m", 10, 20, "kg") + parameter("e", 15, 25, "kg")
+CASES = {  # name: function, parameters, sampling and outer, formulation
+    "one": ("one", parameter("m", 10, 20, "kg"), "points = 4\n[outer]\nbox_points = 4", "nested"),
+    "three": (
+        "three",
+        parameter("m", 10, 20, HOSTILE_UNIT) + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
+        "points = 2\n[outer]\nbox_points = 4\nmax_refinements = 0\ntolerance = 1e-9",
+        "nested",
+    ),
+    "three_lifted": (
+        "three",
+        parameter("m", 10, 20, "kg") + parameter("k", 0.5, 1.5) + parameter("o", 0, 15),
+        "lifted_points = 12\n[outer]\nbox_points = 4\nstarts = 2\nmax_refinements = 1",
+        "lifted",
+    ),
+    "two_nested": ("two", TWO, "points = 3\n[outer]\nbox_points = 4\nstarts = 4", "nested"),
+    "two_direct": ("two", TWO, "[outer]\nbox_points = 4\ndirect_starts = 1", "direct"),
+    "one_direct": (
+        "one",
+        parameter("m", 10, 20, "kg"),
+        "[outer]\nbox_points = 4\ndirect_starts = 1",
+        "direct",
+    ),
+    "mimo": (
+        "mimo",
+        parameter("a", 0.5, 1.5) + parameter("b", 0.5, 1.5),
+        "lifted_points = 12\n[outer]\nbox_points = 4\nstarts = 2\nmax_refinements = 1",
+        "lifted",
+    ),
+}
+
+
+HEAVY = ("three", "two_nested", "one_direct")  # of these kinds of page others are there too
+
+
+@cache
+def run(name: str) -> tuple[Path, Case, CoDesignProblem, Solution, str]:
+    """A solved case and its report; two_mass is the shipped case, lifted, with a short look."""
+    folder = Path(mkdtemp())
+    if name in CASES:
+        function, theta, rest, formulation = CASES[name]
+        (folder / "plants.py").write_text(PLANTS)
+        path = folder / f"{HOSTILE_STEM}.toml"
+        head = f'[plant]\nfunction = "plants.py:{function}"\n'
+        path.write_text(head + theta + COMMON + "[sampling]\n" + rest + "\n")
+    else:
+        formulation = "lifted"
+        path = changed(folder, more="\n[outer]\nbox_points = 4\n")
+    case = load_case(path)
+    problem = problem_of(case)
+    with SampleStore(folder / "samples.sqlite") as store, Workers(1, 2.0) as workers:
+        sampler = Sampler(problem, store, workers)
+        solution = co_design(sampler, formulation_of(case, formulation), 0)
+    written = write_report(folder, case, problem, solution)
+    return folder, case, problem, solution, written.read_text(encoding="utf-8")
+
+
+ALL = [
+    pytest.param(name, marks=pytest.mark.slow) if name in HEAVY else name
+    for name in ("two_mass", *CASES)
+]
+
+
+class Document(HTMLParser):
+    """Every tag closed in order; keeps tags with attributes, ids, and texts by open tag."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[tuple[str, ...], str]] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if data.strip():
+            self.texts.append((tuple(self.open), data.strip()))
+
+
+def figures(text: str) -> list[str]:
+    return re.findall(r"<figure>.*?</figure>", text, flags=re.DOTALL)
+
+
+def test_report_is_one_file_of_moderate_size() -> None:
+    folder, *_ = run("two_mass")
+    assert (folder / "report.html").stat().st_size < 1_000_000
+    assert not (folder / "report.html.part").exists()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_html_is_well_formed_and_asks_for_nothing(name: str) -> None:
+    text = run(name)[4]
+    document = Document(text)
+    tags = {tag for tag, _ in document.tags}
+    assert not tags & {"link", "img", "iframe", "object", "image", "foreignobject"}
+    scripts = re.findall(r"<script>(.*?)</script>", text, flags=re.DOTALL)
+    for script in scripts:  # nothing else may run
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in text.split("</head>")[0]
+    assert len(scripts) == sum(tag == "script" for tag, _ in document.tags)
+    ids = [attrs["id"] for _, attrs in document.tags if "id" in attrs]
+    assert len(ids) == len(set(ids))
+    for _, attrs in document.tags:
+        assert not any(key.startswith("on") or key == "src" for key in attrs)
+        target = attrs.get("href")
+        assert target in (None, "index.html") or (target[0] == "#" and target[1:] in ids)
+    assert set(re.findall(r"url\(([^)]*)\)", text)) <= {f"#{i}" for i in ids}
+    outside = re.sub(r"<pre>.*?</pre>|<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert "://" not in outside
+    assert "@import" not in text
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_figure_has_units_a_caption_and_data(name: str) -> None:
+    found = figures(run(name)[4])
+    assert len(found) >= 3
+    for figure in found:
+        svg = figure[: figure.index("<figcaption>")]
+        words = re.findall(r"<text[^>]*>([^<]*)</text>", svg)
+        labels = [word for word in words if re.search(r" \(.+\)$", word)]
+        panels = svg.count("-axes_")
+        assert panels >= 1
+        assert len(labels) >= 2 * panels - svg.count("QuadMesh")
+        caption = re.search(r"<figcaption>(.*?)</figcaption>", figure, flags=re.DOTALL)
+        assert caption is not None
+        assert re.search(r"\d", caption[1])
+        assert not re.search(r"\bnan\b|\binf\b|None", caption[1])
+        assert figure.count("<details>") == 1
+        assert figure.count("<tr>") > 2
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_page_says_what_the_result_says(name: str) -> None:
+    _, case, problem, solution, text = run(name)
+    result = solution.result
+    good = result["status"] == "verified"
+    assert (f'class="badge {"good" if good else "bad"}"') in text
+    assert number(result["bandwidth_hz"]) in text
+    assert all(key in text for key in (*problem.names, "KKT", "Certificate", result["formulation"]))
+    for version in result["versions"].values():
+        assert version in text
+    assert re.search(r"<pre>\[plant\]", text)
+    assert case.path.suffix == ".toml"
+
+
+def test_what_binds_is_said_in_words() -> None:
+    text = run("two_mass")[4].replace("\xa0", " ")
+    assert "m1 is at its lower bound, 55 kg; moving the bound outwards by 0.15 kg is worth" in text
+    said = re.search(r"raising S_max by 1 % is worth ([\d.]+) Hz or ([\d.]+) kg", text)
+    assert said is not None  # the same gain of J = w1 f + w2 ω_b in either unit
+    hz, kg = map(float, said.groups())
+    assert 0.9950 * 2.0 * np.pi * hz == pytest.approx(0.0995 * kg, rel=0.01)
+
+
+def test_unverified_result_says_why() -> None:
+    *_, solution, text = run("three")
+    assert solution.result["status"] == "not_verified"
+    assert "✕ not verified" in text
+    assert "Failed: prediction" in text
+    assert "UNVERIFIED" in text
+
+
+def test_hostile_names_and_units_are_escaped() -> None:
+    text = run("three")[4]
+    assert "<script>alert" not in text
+    assert "<img" not in text
+    assert "alert(1)" in text  # it is shown, as text
+    assert "&lt;img src=x" in text
+    assert "room <b>" not in text
+
+
+def test_infeasible_run_has_a_page_too(tmp_path: Path) -> None:
+    _, case, problem, solution, _ = run("one")
+    kept = ("formulation", "syntheses", "seconds", "seed", "versions")
+    result = {key: solution.result[key] for key in kept}
+    result |= {"status": "infeasible", "reason": "S_max cannot be met by <0.1>"}
+    nothing = FormulationResult(None, None, (), (), None, False, "")
+    text = painted(solve_page(tmp_path, case, problem, Solution(result, nothing, None)))
+    Document(text)
+    assert "S_max cannot be met by &lt;0.1&gt;" in text
+
+
+@pytest.mark.parametrize("name", ["one", "two_mass"])
+def test_a_page_is_drawn_again_from_its_folder_alone(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, *_, first = run(name)
+    again = tmp_path / "run"
+    again.mkdir()
+    shutil.copy(folder / "report.json", again)
+
+    def refused(*given: object, **named: object) -> None:
+        raise AssertionError("a page that is there computes nothing")
+
+    for computing in (
+        "synthesis.synthesis.synthesise", "analysis.move.simulate", "lti.loop.constant_drive",
+        "inner_problem.problem.plant_of", "lti.state_space.StateSpace.response",
+    ):  # fmt: skip
+        monkeypatch.setattr(f"ccd_casadi.{computing}", refused)
+    for _ in range(2):
+        assert report_command([str(again), "--quiet"]) == 0
+        assert (again / "report.html").read_text(encoding="utf-8") == first
+
+
+def test_a_run_without_one_gets_a_report_of_its_design(
+    two_mass_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(two_mass_run, tmp_path / "run"))
+    for name in ("report.html", "report.json"):
+        (folder / name).unlink(missing_ok=True)
+
+    def refused(*given: object, **named: object) -> None:
+        raise AssertionError("nothing is designed")
+
+    for place in ("synthesis.synthesis", "reporting.loops", "reporting.start"):
+        monkeypatch.setattr(f"ccd_casadi.{place}.synthesise", refused)
+    assert report_command([str(folder), "--quiet"]) == 0
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    Document(text)
+    for heading in (
+        "At a glance",
+        "The design",
+        "Loop, plant and controller",
+        "A move",
+        "Provenance",
+    ):
+        assert f"<h2>{heading}</h2>" in text
+    assert "how the design was found was not kept" in text
+    assert report_command([str(folder), "--quiet"]) == 0
+    assert (folder / "report.html").read_text(encoding="utf-8") == text
+
+
+def test_a_foreign_or_damaged_report_json_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "report.json"
+    for text, said in (
+        ("{", "is no report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
+        ('{"format": 1, "pages": {"../a.html": {}}}', "names what is no page"),
+        ('{"format": 1, "pages": {"a.html": {"head": 3}}}', "is not what a page shows"),
+    ):  # fmt: skip
+        place.write_text(text)
+        assert report_command([str(tmp_path)]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_mimo_shows_its_channels_or_all_singular_values() -> None:
+    problem = run("mimo")[2]
+    K = StateSpace(-100.0 * np.eye(2), np.eye(2), 1e5 * np.eye(2), np.zeros((2, 2)))
+    for theta, apart in (((0.5, 0.5), True), ((0.9, 1.3), False)):  # masses 10, 4, 10 kg or not
+        plant = scaled_plant(problem, theta)
+        weights = problem.weights.at(HZ * 50.0, HZ * 100.0)
+        loop = design_view(problem, theta, K, weights=weights, gamma=1.0, bandwidth_hz=50.0)
+        text = block_html(bode(loop, split(plant, K)), "k")
+        assert ("channel 1, outputs +" in text) == apart
+        assert ("phase of G" in text) == apart
+        assert ("plant σ(G) (m/N)" in text) != apart
+
+
+def test_paper_frequencies_are_marked() -> None:
+    text = run("two_mass")[4].replace("\xa0", " ")
+    assert "Resonances (▲) of the plant: 183.6 Hz; anti-resonances (▼): 129.8 Hz" in text
+
+
+def test_other_problems_in_the_store_are_left_out() -> None:
+    folder, case, problem, solution, _ = run("two_mass")
+    other = replace(problem, weights=replace(problem.weights, M_K=1e7))
+    text = painted(solve_page(folder, case, other, solution))
+    assert "Too few syntheses" in text
+
+
+def test_lifted_maximum_is_the_surrogates_and_near_the_truth() -> None:
+    _, _, problem, solution, _ = run("two_mass")
+    processes = solution.outcome.surrogates
+    rng = np.random.default_rng(0)
+    X = rng.uniform(processes[0].lower, processes[0].upper, (200, 4))
+    for process in processes:
+        off = np.abs(mean_at_many(process, X) - process.predict(X)).max()
+        assert off <= 1e-7 * process.output_scale
+    thetas = rng.uniform(problem.lower, problem.upper, (6, 2))
+    best = inner_maximum(problem, processes, thetas)
+    assert best.bandwidth == pytest.approx(processes[0].predict(best.x), rel=1e-4)
+    assert (processes[1].predict(best.x) <= np.log(problem.inner.S_max) + 1e-3).all()
+    truth = [true_inner(problem, tuple(theta)).bandwidth for theta in thetas]
+    assert best.bandwidth == pytest.approx(np.array(truth), rel=0.03)
+
+
+def test_figures_are_deterministic_and_keep_the_callers_style() -> None:
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    x = np.linspace(1.0, 10.0, 5)
+    panel = Panel("time (s)", "cost ($a$ & <b>) (–)", (Curve(x, x**2, "J"),), log_y=True)
+    drawn = [figure_lines(Lines(((panel,),), "<t>"), "k") for _ in range(2)]
+    assert drawn[0] == drawn[1]
+    assert "cost ($a$ &amp; &lt;b&gt;)" in drawn[0]
+    assert 'aria-label="&lt;t&gt;: cost' in drawn[0]
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_landscape_takes_several_paths_and_unknown_letters() -> None:
+    axis = np.linspace(0.0, 1.0, 5)
+    field = axis[:, None] + axis
+    field[0, 0] = np.nan
+    ways = np.array([[0.1, 0.2], [0.9, 0.8]])
+    land = Landscape(
+        ("a", "b"), ("天", "x" * 90), axis, axis, field, np.array([[0.5, 0.5, 1.0]]),
+        np.empty((0, 2)), forbidden=field > 1.5, region=(0.2, 0.6, 0.2, 0.6),
+        paths=tuple(ThetaPath(name, ways) for name in ("ours", "theirs")), optimum=(0.9, 0.8),
+    )  # fmt: skip
+    svg = figure_landscape(land, "two")
+    Document(svg)
+    assert all(word in svg for word in ("ours", "theirs", "天", "…"))
+
+
+def test_a_slope_that_the_surrogate_may_err_by_is_not_told() -> None:
+    """It was told as a fact, eight times the true one, at an optimum that the samples missed."""
+    axis = np.linspace(0.0, 1.0, 5)
+    field = axis[:, None] ** 2 + 0.0 * axis  # the steepest step is 7/16 Hz
+    land = Landscape(("a", "b"), ("", ""), axis, axis, field, np.empty((0, 3)), np.empty((0, 2)))
+    for error, told in ((0.2, True), (0.25, False)):
+        words = caption_landscape(land, 1.0, lifted=False, error_hz=error)
+        assert ("steepest" in words) is told
+
+
+def test_tables_round_and_escape() -> None:
+    html = table_html(Table(("<a>", "n"), (("&", 1.0 / 3.0), ("x", float("nan")))))
+    Document(html)
+    assert "&lt;a&gt;" in html
+    assert "&amp;" in html
+    assert '<td class="n">0.33333</td>' in html
+    assert '<td class="n">–</td>' in html
+    head = Head("t", "good", "", "", "", "")
+    Document(painted(Page(head, (Section("<h>", (Words("x"),)),))))

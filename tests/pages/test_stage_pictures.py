@@ -1,0 +1,286 @@
+"""Pictures of the stage: surfaces closed and to scale, drawings true to θ, pages that stay safe."""
+
+import base64
+import hashlib
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from ccd_casadi.case_studies.rib_stage import COARSE, Geometry, PointMass, RibStage, mode_shapes
+from ccd_casadi.case_studies.rib_stage.drawing import TALLER, draw_stages, drawing
+from ccd_casadi.case_studies.rib_stage.geometry import LOWER, UPPER, mass
+from ccd_casadi.drawing.content import Block, Head, Page, Section, Words
+from ccd_casadi.drawing.paint import block_html, painted
+from ccd_casadi.drawing.pictures import ModeShape, ModeShapes
+from ccd_casadi.drawing.turntable import (
+    HEIGHT,
+    MARGIN,
+    REACH,
+    WIDTH,
+    box_scale,
+    camera,
+    colours,
+    data,
+    still,
+)
+from ccd_casadi.reporting.machine import mode_shape_figure, table_modes
+
+Array = np.ndarray
+A = (1e-3, 3e-3, 8e-3, 8e-3, 16.806e-3, 67.5e-3)
+B = (1e-3, 3e-3, 4.2446e-3, 4.0588e-3, 11.917e-3, 74.974e-3)
+STAGE = RibStage(order=COARSE)
+HOSTILE = '</text><script>alert(1)</script>"&'
+
+
+@cache
+def modes_figure() -> str:
+    return block_html(mode_shape_figure(mode_shapes(STAGE, A)), "f")
+
+
+def page(*blocks: Block) -> str:
+    return painted(Page(Head("t", "good", "", "", "", ""), (Section("s", blocks),)))
+
+
+def svgs(html: str) -> list[ElementTree.Element]:
+    return [ElementTree.fromstring(t) for t in re.findall(r"<svg.*?</svg>", html, re.DOTALL)]
+
+
+def volume(surface: ModeShapes) -> float:
+    """By the divergence theorem, of flat quads."""
+    a, b, c, d = surface.points[surface.faces].transpose(1, 0, 2)
+    return float(np.einsum("ij,ij->", (a + c) / 2.0, np.cross(c - a, d - b)) / 6.0)
+
+
+def assert_closed(quads: Array) -> None:
+    """Every edge is run through once each way."""
+    edges = [(q[i], q[(i + 1) % 4]) for q in quads.tolist() for i in range(4)]
+    assert len(edges) == len(set(edges))
+    assert {(b, a) for a, b in edges} == set(edges)
+
+
+# ---- surfaces ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("theta", [A, B, UPPER], ids=["a", "b", "thick"])
+def test_the_surface_is_closed_and_encloses_the_material(theta) -> None:
+    surface = mode_shapes(STAGE, theta, 1)
+    assert_closed(surface.faces)
+    expected = mass(STAGE.geometry, theta) / STAGE.geometry.material.density
+    assert volume(surface) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_surface_counts_its_faces() -> None:
+    rib, bay = 1, 4  # cells a rib and a bay along an axis; the centre rib is two halves
+    across = 6 * rib + 4 * bay
+    below, walls, edge = across**2, 16 * 4 * bay, 4 * across * 2
+    assert len(mode_shapes(STAGE, A, 1).faces) == 2 * below + walls + edge == 1400
+
+
+# ---- projection and painting ------------------------------------------------------------------
+
+
+def test_camera_looks_from_where_it_says() -> None:
+    x, y, z = np.eye(3)
+    # from the front (-y): x to the right, z up, the near side towards us
+    assert camera(np.array([x, y, z]), -90.0, 0.0) == pytest.approx(
+        np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), abs=1e-15
+    )
+    half = np.sqrt(0.5)
+    assert camera(z[None], 17.0, 45.0) == pytest.approx(np.array([[0, half, half]]))
+    turned = camera(np.eye(3), 33.0, -21.0)
+    assert turned @ turned.T == pytest.approx(np.eye(3))
+
+
+@pytest.mark.parametrize("elevation", [-90.0, -20.0, 0.0, 38.0, 90.0])
+def test_a_moved_box_stays_inside_its_frame_however_it_is_turned(elevation: float) -> None:
+    size, reach = np.array([0.3, 0.3, 0.02]), 0.024
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size / 2
+    corners[:, 2] += reach * np.sign(corners[:, 2])
+    scale = box_scale(size, reach, elevation)
+    spans = [np.abs(scale * camera(corners, a, elevation)).max(axis=0) for a in range(0, 360, 5)]
+    right, up, _ = np.max(spans, axis=0)
+    assert right <= WIDTH / 2 - MARGIN + 1e-9
+    assert up <= HEIGHT / 2 - MARGIN + 1e-9
+    assert right > WIDTH / 2 - MARGIN - 1 or up > HEIGHT / 2 - MARGIN - 1
+
+
+def test_still_picture_leaves_out_back_faces_and_paints_near_last() -> None:
+    points = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0],
+                       [-1, -1, 0.1], [1, -1, 0.1], [1, 1, 0.1], [-1, 1, 0.1]], float)  # fmt: skip
+    quads = np.array([[4, 5, 6, 7], [0, 1, 2, 3], [0, 3, 2, 1]])  # above, below, below from below
+    moves = np.zeros((8, 3))
+    moves[:4, 2] = 1.0
+    mode = ModeShape(moves, 1.0, (1,))
+    svg = still(ModeShapes(points, quads, (mode,)), mode, 'a "b" <c>')
+    root = ElementTree.fromstring(svg)
+    paths = root.findall(".//path")
+    assert root.get("aria-label") == 'a "b" <c>'
+    assert len(paths) == 2  # one of three looks away
+    # all of the lower face moves by 8 % of the width and comes above the other, which rests
+    first, last = (p.get("color") for p in paths)
+    brightness = [int(c[i : i + 2], 16) for c in (first, last) for i in (1, 3, 5)]
+    rest, most = colours(np.array([0.0, 1.0]))
+    ratio = np.array(brightness[:3]) / rest
+    assert np.ptp(ratio[[0, 2]]) < 0.03  # the light dims all three alike
+    assert np.array(brightness[3:]) / most == pytest.approx(np.full(3, ratio[0]), abs=0.03)
+    numbers = [int(v) for v in re.findall(r"-?\d+", paths[0].get("d", ""))]
+    corner = camera(np.array([[-1.0, -1.0, 0.05]]), -62.0, 44.0)[0]
+    scale = box_scale(np.array([2.0, 2.0, 0.1]), 2 * REACH, 44.0)
+    assert numbers[:2] == [round(10 * scale * corner[0]), round(-10 * scale * corner[1])]
+
+
+# ---- mode shapes ------------------------------------------------------------------------------
+
+
+def test_modes_have_names_in_words_and_pairs_are_one() -> None:
+    modes = mode_shapes(STAGE, A, 6).modes
+    words = ["twist", "saddle x² − y²", "bowl", "bent tilt", "second bowl", "second twist"]
+    assert [m.words for m in modes] == words
+    assert [m.numbers for m in modes] == [(1,), (2,), (3,), (4, 5), (6,), (7,)]
+    hertz = [m.frequency for m in modes]
+    assert hertz == pytest.approx([264.0, 826.4, 916.6, 950.6, 1535.0, 1567.9], abs=0.1)
+    # a mode that the model leaves out is shown all the same
+    few = mode_shapes(RibStage(order=COARSE, outputs="corners"), A, 8).modes
+    assert [m.numbers[0] for m in few] == [1, 2, 3, 4, 6, 7, 8, 10]
+    assert few[-1].frequency == pytest.approx(1740, abs=20)
+
+
+def test_corners_do_not_see_the_saddle() -> None:
+    rows = table_modes(mode_shapes(STAGE, A, 3)).rows
+    assert rows[0][4] > 0.95  # the twist is largest there
+    assert rows[1][4] < 1e-9
+    assert rows[2][3] == pytest.approx(2.796, abs=1e-3)
+
+
+def test_lopsided_stage_has_pictures_without_symmetry() -> None:
+    stage = RibStage(Geometry(point_masses=(PointMass(0.1, 0.12, 0.05),)), order=COARSE)
+    html = block_html(mode_shape_figure(mode_shapes(stage, A, 10)), "f")
+    found = re.findall(r"<p>(\d+): bending, ", html)
+    assert found == [str(i) for i in range(1, 11)]
+    assert "A1" not in html
+
+
+def test_mode_figure_is_sound_small_and_holds_the_script_s_data() -> None:
+    html = modes_figure().replace("\xa0", " ")
+    pictures = svgs(html)
+    assert len(pictures) == 7  # six modes and the scale
+    assert "4 and 5: bent tilt, a pair, 950.6" in html
+    assert not re.search(r"\b(A1|A2|B1|B2|SA|AS)\b", html)
+    found = re.search(r'<script type="application/json">(.*?)</script>', html)
+    assert found is not None
+    content = json.loads(found[1])
+    count = len(content["points"]) // 3
+    assert len(content["quads"]) == 4 * 1400
+    assert max(content["quads"]) == count - 1
+    assert content["size"] == [3000, 3000, 178]
+    assert content["reach"] == 240
+    for field in content["fields"]:
+        size = np.linalg.norm(np.array(field).reshape(count, 3), axis=1)
+        assert size.max() == pytest.approx(999, abs=1.0)
+    assert len(html) < 450_000
+    assert "the largest is drawn as 8 % of the side" in html
+    assert html.count("<details>") == 1
+
+
+def test_data_cannot_end_its_script_element() -> None:
+    surface = mode_shapes(STAGE, A, 1)
+    still = replace(surface.modes[0], displacement=np.zeros_like(surface.points), words=HOSTILE)
+    text = data(replace(surface, modes=(still,)))  # at rest: no 0/0
+    assert "<" not in text
+    assert set(json.loads(text)["fields"][0]) == {0}
+
+
+def test_page_allows_this_script_and_nothing_else() -> None:
+    plain = page(Words("x"))
+    assert "script" not in plain
+    figure = mode_shape_figure(mode_shapes(STAGE, A))
+    text = page(figure, figure)
+    scripts = re.findall(r"<script>(.*?)</script>", text, flags=re.DOTALL)
+    assert len(scripts) == 1
+    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert policy is not None
+    assert policy[1].endswith(f"; script-src 'sha256-{digest}'")
+    assert policy[1].startswith("default-src 'none';")
+    assert "://" not in text
+
+
+# ---- dimensions -------------------------------------------------------------------------------
+
+
+def boxes(group: ElementTree.Element) -> list[tuple[float, float, float, float]]:
+    keys = ("x", "y", "width", "height")
+    return [tuple(float(r.get(k, "")) for k in keys) for r in group.iter("rect")]  # type: ignore[misc]
+
+
+def test_drawing_is_to_scale_and_says_the_dimensions() -> None:
+    root = ElementTree.fromstring(draw_stages(Geometry(), {"start": A, "end": B}))
+    for group, theta in zip(root.findall("g"), (A, B), strict=True):
+        found = boxes(group)
+        assert len(found) == 1 + 16 + 1  # the square, its bays, the ribs behind the cut
+        square, behind = found[0], found[-1]
+        scale = square[2] / 300.0
+        assert square[2] == pytest.approx(square[3])
+        assert scale == pytest.approx(1.12, abs=1e-4)  # in both
+        bay = min(found[1:17])  # the outer one at the lower left
+        t_o, t_i, x_i, H = (1e3 * theta[i] for i in (1, 2, 5, 4))
+        assert bay[0] - square[0] == pytest.approx(t_o * scale, abs=0.011)
+        assert bay[2] == pytest.approx((150 - x_i - t_o - t_i / 2) * scale, abs=0.011)
+        assert behind[3] == pytest.approx(H * TALLER * scale, abs=0.011)
+    words = ["".join(t.itertext()) for t in root.iter("text")]
+    assert words[:4] == ["start, 1.019 kg", "t_o = 3 mm", "t_i = 8 mm", "t_c = 8 mm"]
+    assert {"H = 16.81 mm", "H = 11.92 mm", "x_i = 74.97 mm", "t_c = 4.059 mm"} < set(words)
+    assert words.count("side = 300 mm") == words.count("h = 1 mm") == 2
+
+
+def test_words_above_the_plan_do_not_meet_at_the_ends_of_the_range() -> None:
+    for x_i in (LOWER[5], UPPER[5]):
+        theta = (1.2345e-3, 3.4567e-3, 5.4321e-3, 6.5432e-3, 12.345e-3, x_i)
+        root = ElementTree.fromstring(draw_stages(Geometry(), {"a": theta}))
+        rows: dict[str, list[tuple[float, float]]] = {}
+        for item in root.iter("text"):
+            words, anchor = "".join(item.itertext()), item.get("text-anchor")
+            if not words.startswith(("t_", "a")):
+                continue
+            wide = 0.6 * 12.5 * len(words)  # more than any of the page's fonts takes
+            left = float(item.get("x", "")) - (0.5 * wide if anchor == "middle" else 0.0)
+            rows.setdefault(item.get("y", ""), []).append((left, left + wide))
+        assert len(rows) == 3
+        for spans in rows.values():
+            spans.sort()
+            assert all(a[1] < b[0] for a, b in pairwise(spans))
+
+
+def test_dimension_figure_has_a_caption_with_numbers_and_a_table() -> None:
+    words = drawing(Geometry(), {"start": A, "end": B}).caption
+    assert "From start to end the mass goes from 1.0189 to 0.59001 kg (−42.1 %)." in words
+    assert "Changed: t_c (−49.3 %), t_i (−46.9 %), H (−29.1 %), x_i (+11.1 %)." in words
+    assert "heights drawn 3 times as large" in words
+    rows = {row[0]: row[2:] for row in drawing(Geometry(), {"a": A, "b": B}).tables[0].rows}
+    assert rows["t_c"] == ("mm", 8.0, pytest.approx(4.0588))
+    assert rows["b_1"] == ("mm", pytest.approx(75.5), pytest.approx(69.9037))
+    assert rows["mass"] == ("kg", pytest.approx(1.01891, rel=1e-4), pytest.approx(0.59, rel=1e-3))
+
+
+def test_one_stage_three_stages_hostile_names_and_point_masses() -> None:
+    assert "Changed" not in drawing(Geometry(), {"start": A}).caption
+    assert "No parameter changes." in drawing(Geometry(), {"a": A, "b": A}).caption
+    masses = Geometry(point_masses=(PointMass(0.0, 0.15, 0.1),))
+    assert "Dashed" not in drawing(Geometry(), {"start": A}).caption
+    assert "Dashed circles: masses" in drawing(masses, {"start": A}).caption
+    html = drawing(masses, {HOSTILE: A, "x" * 90: B, "c": A}).drawing.svg
+    (root,) = svgs(html)
+    assert "<script" not in html
+    assert len(list(root.iter("circle"))) == 3
+    words = ["".join(t.itertext()) for t in root.iter("text")]
+    assert f"{HOSTILE}, 1.119 kg" in words
+    assert f"{'x' * 39}…, 0.69 kg" in words
+    tall = float(root.get("viewBox", "").split()[3])
+    single = float(svgs(drawing(masses, {"a": A}).drawing.svg)[0].get("viewBox", "").split()[3])
+    assert tall == pytest.approx(2 * single, rel=1e-5)

@@ -1,0 +1,243 @@
+"""Forces and sensors between nodes: exact on what it is exact on, slopes, masses, the case file."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers import few
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import eigh
+
+from ccd_casadi.cases.case import CaseError, load_case, parse_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.cases.toml_writer import case_to_toml
+from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
+from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
+from ccd_casadi.plants.places import Between, Places, placed
+from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
+from ccd_casadi.support.errors import PlantError
+
+CASE = Path(__file__).parents[2] / "examples" / "placed_motors" / "case.toml"
+GRID = tuple((x, y) for x in np.linspace(-0.3, 0.3, 5) for y in np.linspace(-0.2, 0.2, 4))
+RIGID = np.array([[1.0, x, y] for x, y in GRID]).T
+KG, INERTIA = 3.0, (0.05, 0.09)
+
+
+def beam_of_nodes(seed: int) -> Plant:
+    """A rigid plate with four smooth modes on it, whose stiffness a θ scales."""
+    rng = np.random.default_rng(seed)
+    waves = rng.uniform(2.0, 6.0, (4, 2))
+    shapes = np.cos(np.array(GRID) @ waves.T + rng.uniform(0.0, 3.0, 4)).T
+
+    def model(theta):
+        k = theta["k"]
+        return {
+            "mass": ca.diag([KG, *INERTIA, 1.0, 1.0, 1.0, 1.0]),
+            "stiffness": k * ca.diag([0.0, 0.0, 0.0, 1e5, 3e5, 6e5, 9e5]),
+            "damping_ratio": 0.01,
+            "input": ca.vertcat(ca.DM(RIGID), k * ca.DM(shapes)),
+            "output": ca.DM([[1.0, 0, 0, 0, 0, 0, 0]]),
+            "hardware_cost": k,
+        }
+
+    return build_plant(model, ["k"], {})
+
+
+POINTS = (("x", "y"), ("-x", 0.1), (0.05, "-y"))
+inside = st.tuples(st.floats(-0.25, 0.25), st.floats(-0.15, 0.15))
+
+
+@few(20)
+@given(inside, st.integers(0, 99))
+def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed: int) -> None:
+    between, point = Between(np.array(GRID)), np.array(at)
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.normal(), rng.normal(size=2), rng.normal(size=(2, 2))
+
+    def field(p: np.ndarray) -> float:
+        return float(a + b @ p + p @ c @ p)
+
+    weights, slopes = between.weights(point)
+    values = np.array([field(np.array(node)) for node in GRID])
+    assert weights @ values == pytest.approx(field(point), abs=1e-9)
+    assert slopes @ values == pytest.approx(b + (c + c.T) @ point, abs=1e-8)
+    node = int(rng.integers(len(GRID)))
+    assert between.weights(np.array(GRID[node]))[0] == pytest.approx(
+        np.eye(len(GRID))[node], abs=1e-9
+    )
+    assert between.left_out(values[None]) < 1e-8
+
+
+@few(20)
+@given(inside, st.floats(0.05, 0.95), st.integers(0, 99))
+def test_slopes_are_those_of_differences(at: tuple[float, float], z: float, seed: int) -> None:
+    """To 1e-6, of M, K, B and C to stiffness, positions and presence."""
+    places = Places(GRID, POINTS, POINTS[:2], 0.4, 0.1, present=("z", 1.0, 0.5))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
+    theta = np.array([at[0], 1.3, z, at[1]])
+    compare_slopes(plant, theta)
+
+
+def compare_slopes(plant: Plant, theta: np.ndarray) -> None:
+    system = mechanics(plant, theta)
+    for i, unit in enumerate(np.eye(len(theta))):
+        near = [mechanics(plant, theta + 1e-3 * k * unit) for k in (-2, -1, 1, 2)]
+        for part, exact in zip("MDKBC", system.derivatives, strict=True):
+            found = np.tensordot([1, -8, 8, -1], [getattr(one, part) for one in near], 1) / 12e-3
+            size = max(1.0, float(np.abs(exact[i]).max()))
+            assert np.abs(found - exact[i]).max() < 1e-6 * size, (part, i)
+
+
+SIX = (("x", "y"), ("-x", 0.13), (0.05, "-y"), (-0.2, -0.1), (0.22, 0.1), (-0.1, 0.02))
+
+
+@few(20)
+@given(inside, st.floats(0.3, 0.95), st.integers(0, 99))
+def test_axes_leave_quiet_modes_alone_and_have_slopes(
+    at: tuple[float, float], z: float, seed: int
+) -> None:
+    """Forces of length 1 along 1, x, y and a damped mode, none on the quiet one."""
+    present = ("z", *(1.0,) * 5)
+    places = Places(GRID, SIX, SIX, 0.4, 0.1, present=present, axes=True, quiet=(1,), damped=(3,))
+    free = placed(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "z", "y"))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
+    theta = np.array([at[0], 1.3, z, at[1]])
+    system, apart = mechanics(plant, theta), mechanics(free, theta)
+    assert (plant.inputs, plant.outputs, system.B.shape) == (4, 4, (7, 4))
+    lam, modes = eigh(system.K, system.M)
+    quiet = modes[:, 3]
+    assert np.abs(quiet @ system.B).max() < 1e-9 * np.abs(quiet @ apart.B).max()
+    assert np.abs(system.C @ quiet).max() < 1e-9 * np.abs(apart.C @ quiet).max()
+    V = np.linalg.lstsq(apart.B, system.B, rcond=None)[0]
+    assert pytest.approx(np.eye(4), abs=1e-8) == V.T @ V
+    if np.diff(lam[3:]).min() > 0.02 * lam[3]:  # where two modes come close slopes are steep
+        compare_slopes(plant, theta)
+
+
+@few(20)
+@given(inside, st.floats(0.0, 2.0))
+def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
+    at: tuple[float, float], kg: float
+) -> None:
+    plant = placed(beam_of_nodes(0), Places(GRID, POINTS, (), kg), ("k", "x", "y"))
+    M = mechanics(plant, (1.0, *at)).M[:3, :3]
+    r = np.array([[1.0, *p] for p in (at, (-at[0], 0.1), (0.05, -at[1]))])
+    assert pytest.approx(np.diag([KG, *INERTIA]) + kg * r.T @ r, abs=1e-9) == M
+    assert mechanics(plant, (1.0, *at)).C.shape == (1, 7)  # without sensors the plant's own
+
+
+def test_presence_zero_is_one_actuator_less_and_one_is_all_of_it() -> None:
+    plant = placed(
+        beam_of_nodes(1),
+        Places(GRID, POINTS, (), 0.4, present=("z", 1.0, 1.0), at_most=2, actuator_cost=5.0),
+        ("k", "z", "x", "y"),
+    )
+    fewer = placed(beam_of_nodes(1), Places(GRID, POINTS[1:], (), 0.4), ("k", "x", "y"))
+    every = placed(beam_of_nodes(1), Places(GRID, POINTS, (), 0.4), ("k", "x", "y"))
+    gone, there = mechanics(plant, (1.0, 0.0, 0.1, 0.05)), mechanics(plant, (1.0, 1.0, 0.1, 0.05))
+    assert not gone.B[:, 0].any()
+    assert gone.B[:, 1:] == pytest.approx(mechanics(fewer, (1.0, 0.1, 0.05)).B)
+    assert pytest.approx(mechanics(fewer, (1.0, 0.1, 0.05)).M) == gone.M
+    assert pytest.approx(mechanics(every, (1.0, 0.1, 0.05)).B) == there.B
+    assert hardware_cost(plant, (1.0, 1.0, 0.1, 0.05)) == pytest.approx(1.0 + 5.0 * 3)
+    assert plant.constraint_names == ("at most 2 actuators",)
+    assert constraint_values(plant, (1.0, 1.0, 0.1, 0.05)) == pytest.approx([0.5])
+
+
+def test_distances_are_kept_where_theta_moves_them() -> None:
+    corners = (("r", "r"), ("-r", "-r"), (0.0, 0.1), (0.1, 0.0))
+    plant = placed(beam_of_nodes(0), Places(GRID, corners, corners, apart=0.2), ("k", "r"))
+    assert len(plant.constraint_names) == 5  # of six pairs one stands still; sensors are the same
+    assert constraint_values(plant, (1.0, 0.1))[0] == pytest.approx(1.0 - 0.08 / 0.04)
+
+
+def test_what_does_not_match_is_one_sentence() -> None:
+    plant = beam_of_nodes(0)
+    line = tuple((x, 0.0) for x in np.linspace(0.0, 1.0, len(GRID)))
+    for places, words in (
+        (Places(GRID[:-1], POINTS), "19, the plant has 20 inputs"),
+        (Places(GRID, (("x",),)), "has 1 coordinates, a node 2"),
+        (Places(GRID, POINTS, present=(1.0,)), "1 numbers for 3 actuators"),
+        (Places(line, POINTS), "on one line"),
+    ):
+        with pytest.raises(PlantError, match=words):
+            placed(plant, places, ("k", "x", "y"))
+
+
+def test_the_case_moves_with_its_places(tmp_path: Path) -> None:
+    """A position by its name or as a number is one plant; what a run writes needs no file."""
+    case = load_case(CASE)
+    whole = problem_of(case)
+    text = case_to_toml(case)
+    assert load_case_of(text) == case.places
+    with pytest.raises(CaseError, match=r"theta\.b: is missing"):
+        parse_case(tomllib.loads(text.replace("[theta.b]", "[theta.other]")))
+    data = tomllib.loads(text.replace('"b"', "0.09").replace('"-b"', "-0.09"))
+    del data["theta"]["b"]
+    held = problem_of(parse_case(data))
+    at = dict(zip(whole.names, whole.start, strict=True)) | {"b": 0.09}
+    data = tomllib.loads(text)
+    data["theta"]["b"] = {"fixed": 0.09}
+    fixed = problem_of(parse_case(data))
+    other = mechanics(plant_of(whole), [at[name] for name in whole.names])
+    for one in (held, fixed):
+        assert plant_of(one).names == one.names == ("a", "t")
+        system = mechanics(plant_of(one), [at[name] for name in one.names])
+        for part in "MKBC":
+            expected = getattr(other, part)
+            size = np.abs(expected).max()
+            assert np.abs(getattr(system, part) - expected).max() <= 1e-12 * size
+        assert one.identity() != whole.identity()
+
+
+def load_case_of(text: str):  # what is written is read as it was
+    return parse_case(tomllib.loads(text)).places
+
+
+STROKE = CASE.parent.parent / "gantry_stroke" / "case.toml"
+
+
+def test_a_parameter_that_varies_is_one_of_the_box() -> None:
+    """Not in θ, with slopes of its own, and at its start the model itself."""
+    problem = problem_of(load_case(STROKE))
+    assert problem.names == ("h", "wall")
+    assert problem.source.held == {"at": 0.1}
+    uncertain = uncertain_plant(problem, problem.start)
+    assert uncertain.names == ("resonance_shift", "theta.at")
+    assert uncertain.nominal.tolist() == [0.0, 0.1]
+    assert uncertain.box.tolist() == [[-0.02, -0.3], [0.02, 0.3]]
+    model, moved = uncertain.plant(uncertain.nominal), uncertain.plant(np.array([0.01, -0.2]))
+    omega = np.array([0.1, 0.7, 2.0])
+    assert model.system.response(omega) == pytest.approx(
+        scaled_plant(problem, problem.start).system.response(omega), rel=1e-9
+    )
+    assert moved.natural[1:] != pytest.approx(1.01 * model.natural[1:], rel=1e-3)
+    assert len(model.dA) == 2
+    point, step = np.array([0.01, 0.15]), 1e-4
+    near = [uncertain.plant(point + k * step * np.eye(2)[1]).plant_si() for k in (-2, -1, 1, 2)]
+    omega = 2.0 * np.pi * np.array([3.0, 40.0, 150.0, 330.0])
+    found = np.tensordot([1, -8, 8, -1], [one.response(omega) for one in near], 1) / (12 * step)
+    sloped = uncertain.sloped(point)
+    dA, dB, dC = (part[1] for part in (sloped.dA, sloped.dB, sloped.dC))
+    for i, w in enumerate(omega / sloped.omega_0):
+        R = np.linalg.inv(1j * w * np.eye(len(sloped.A)) - sloped.A)
+        slope = dC @ R @ sloped.B + sloped.C @ R @ (dA @ R @ sloped.B + dB)
+        scale = (sloped.C @ R @ sloped.B) / sloped.plant_si().response(omega[[i]])[0]
+        assert slope / scale == pytest.approx(found[i], rel=1e-5)
+
+
+def test_what_varies_needs_sections_and_bounds() -> None:
+    data = tomllib.loads(STROKE.read_text())
+    whole = parse_case(data, STROKE)
+    text = case_to_toml(whole)
+    assert parse_case(tomllib.loads(text), STROKE).fixed == whole.fixed
+    data["theta"]["at"]["integer"] = True
+    with pytest.raises(CaseError, match=r"theta\.at\.varies: has no place beside integer"):
+        parse_case(data, STROKE)
+    del data["theta"]["at"]["integer"], data["controller"], data["loop"], data["robust"]
+    with pytest.raises(CaseError, match=r"theta\.at\.varies: needs controller\.structure"):
+        parse_case(data, STROKE)

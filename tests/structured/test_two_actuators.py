@@ -1,0 +1,183 @@
+"""Several actuators on one sensor: S, KS, T and S G of 1 x 2 plants, and the disk drive."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fixed_structure_channels import BOUNDS, FAST, assert_derivatives, plant
+from scipy.signal import cont2discrete
+
+from ccd_casadi.fixed_structure import Bounds, ChannelStructure, Sampling, Structure, synthesise
+from ccd_casadi.fixed_structure.certificate import certify
+from ccd_casadi.fixed_structure.composite import composite_problem
+from ccd_casadi.fixed_structure.decoupling import find_decoupling, given_decoupling
+from ccd_casadi.fixed_structure.figures import assess, hessians
+from ccd_casadi.fixed_structure.loop import plant_set
+from ccd_casadi.fixed_structure.loop_problem import Curve, MatrixProblem
+from ccd_casadi.fixed_structure.starts import actuator_starts
+from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.plants.scaling import ScaledPlant, scale_state_space
+from ccd_casadi.support.errors import PlantError
+
+ROOT = Path(__file__).resolve().parents[2]
+BOTH = given_decoupling(("coarse", "fine"), [[1], [1]], [[1, 0], [0, 1]])
+STRUCTURE = ChannelStructure(
+    BOTH, (Structure(biquads=1, roll_off=1), Structure(integrator=False, biquads=0, roll_off=1))
+)
+
+
+def one_sensor(theta: tuple[float, float] = (1.0, 1.0), off: float = 0.3) -> ScaledPlant:
+    """The first output of the stage of three channels, its first two inputs."""
+    whole = plant(theta, off)
+    B, dB, C, dC = whole.B[:, :2], whole.dB[:, :, :2], whole.C[:1], whole.dC[:, :1]
+    return replace(whole, B=B, dB=dB, C=C, dC=dC, channels=())
+
+
+def problem(theta: tuple[float, float], sampling: Sampling | None) -> MatrixProblem:
+    """Of the plants at (1, 1) and at θ."""
+    first = [one_sensor(), one_sensor(theta, 0.2)]
+    box = composite_problem(first[:1], STRUCTURE, BOUNDS, sampling).box
+    return MatrixProblem(plant_set(first, sampling, BOTH), STRUCTURE, BOUNDS, box)
+
+
+def start(sampling: Sampling | None) -> np.ndarray:
+    """A random κ that both plants are stable with."""
+    plants = [one_sensor(), one_sensor(off=0.2)]
+    whole = composite_problem(plants, STRUCTURE, BOUNDS, sampling)
+    found = actuator_starts(whole, STRUCTURE, plants, sampling, 1, np.random.default_rng(0))
+    assert len(found) == 1
+    return found[0]
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_derivatives_of_gains_of_1_by_2_plants(sampling: Sampling | None) -> None:
+    kappa = start(sampling)
+    seen = assert_derivatives(
+        lambda theta: problem(theta, sampling), kappa, lambda row: row % 2 == 1
+    )
+    assert seen >= {Curve.S_MAX, Curve.S_LOW, Curve.CROSSING}
+    assert seen & {Curve.KS, Curve.GS}
+
+
+def test_second_derivatives_of_1_by_2_plants() -> None:
+    """At fixed frequencies, of every curve: |S|, |T| and the singular values of KS and S G."""
+    kappa, model = start(FAST), problem((1.0, 1.0), FAST)
+    peaks = assess(model, kappa, -1.5, depth=-2.0).peaks
+    rng = np.random.default_rng(1)
+    direction = rng.normal(0.0, 1.0, len(kappa))
+    direction /= np.linalg.norm(direction)
+    ends = [assess(model, kappa + x * direction, -1.5, depth=-2.5).peaks for x in (1e-5, -1e-5)]
+    for j in range(len(peaks.v)):
+        one = peaks.only(np.array([j]))
+        exact = hessians(model, kappa, -1.5, one)[0, :-1, :-1] @ direction
+        slopes = []
+        for end in ends:
+            same = np.flatnonzero((end.curve == one.curve[0]) & (end.plant == one.plant[0]))
+            slopes.append(end.to_kappa[same[np.argmin(np.abs(np.log(end.v[same] / one.v[0])))]])
+        numeric = (slopes[0] - slopes[1]) / 2e-5
+        np.testing.assert_allclose(exact, numeric, atol=2e-4 * (1.0 + np.abs(numeric).max()))
+
+
+def test_the_peak_of_s_is_that_of_the_sum_of_both_loops() -> None:
+    kappa, model = start(None), problem((1.0, 1.0), None)
+    first = one_sensor()
+    K = STRUCTURE.state_space(STRUCTURE.in_units(kappa, first.omega_0, first.force))
+    s = 1j * first.omega_0 * np.geomspace(1e-2, 1e4, 20001)[:, None, None]
+    G = first.plant_si()
+    k = K.C @ np.linalg.solve(s * np.eye(len(K.A)) - K.A, K.B + 0j) + K.D
+    g = G.C @ np.linalg.solve(s * np.eye(len(G.A)) - G.A, G.B + 0j)
+    loops = g[:, 0, 0] * k[:, 0, 0] + g[:, 0, 1] * k[:, 1, 0]
+    peaks = assess(model, kappa, -1.5).peaks
+    own = peaks.value[(peaks.plant == 0) & (peaks.curve == Curve.S_MAX)].max()
+    assert np.exp(own) * BOUNDS.S_max == pytest.approx(np.abs(1.0 / (1.0 + loops)).max(), rel=1e-3)
+
+
+@pytest.mark.parametrize("sampling", [None, FAST])
+def test_the_judge_sees_a_loop_at_rest_with_one_integrator_of_two(
+    sampling: Sampling | None,
+) -> None:
+    """K has a pole at 0 Hz then, S G goes to 0; with no integrator it goes to G/(1 + L)."""
+    first, kappa = one_sensor(), start(sampling)
+    own = STRUCTURE.in_units(kappa, first.omega_0, first.force)
+    K = STRUCTURE.state_space(own)
+    found = certify([first], K, BOUNDS, sampling, integrator=STRUCTURE.integrator).plants[0]
+    assert 0.0 < found.static_compliance < 1e-3 * found.low_compliance
+    G = first.plant_si()
+    g = G.C @ np.linalg.solve(-G.A, G.B)
+    k = np.array([[0.1], [0.2]]) / np.abs(g).max()
+    still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), k)
+    found = certify([first], still, BOUNDS, sampling, integrator=False).plants[0]
+    expected = np.linalg.norm(g) / abs(1.0 + (g @ k).item())
+    assert found.static_compliance == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_coarse_and_a_fine_actuator_are_designed_together() -> None:
+    """From nothing but their bounds; judged by the sum of both loops at the sampling instants."""
+    HZ = 2.0 * np.pi
+    rows = [(0.1, 0.7, 30.0**2), (200.0, 0.01, -0.9 * 30.0**2), (2000.0, 0.05, 2000.0**2)]
+    A, B = np.zeros((6, 6)), np.zeros((6, 2))
+    for i, (hz, zeta, gain) in enumerate(rows):
+        w = HZ * hz
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[0.0, w], [-w, -2.0 * zeta * w]]
+        B[2 * i + 1, int(i == 2)] = HZ**2 * gain / w
+    both = StateSpace(A, B, np.tile([1.0, 0.0], 3)[None], np.zeros((1, 2)))
+    bounds = Bounds(S_max=2.0, S_low=0.01, omega_low=HZ, shape=1.1)
+    own = Structure(biquads=0, roll_off=1)
+    structure = ChannelStructure(BOTH, (own, replace(own, integrator=False)))
+    made = synthesise([scale_state_space(both, 1e-3)], structure, bounds, sampling=Sampling(8000.0),
+                      starts=2)  # fmt: skip
+    assert made.certified, made.words
+    K = made.controller
+    loop = (
+        cont2discrete((A, B, both.C, both.D), 1.0 / 8000.0, "zoh"),
+        cont2discrete((K.A, K.B, K.C, K.D), 1.0 / 8000.0, "bilinear"),
+    )
+    omega = HZ * np.geomspace(0.1, 4000.0, 4000)
+    z = np.exp(1j * omega / 8000.0)[:, None, None]
+    g, k = (
+        np.asarray(c @ np.linalg.solve(z * np.eye(len(a)) - a, b + 0j) + d)
+        for a, b, c, d, _ in loop
+    )
+    S = np.abs(1.0 / (1.0 + (g @ k)[:, 0, 0]))
+    assert S.max() <= 2.0 * (1.0 + 1e-5)
+    assert (S[omega < made.bandwidth] <= np.sqrt(0.5) * (1.0 + 1e-5)).all()
+
+
+def test_channels_that_do_not_fit_the_plant_are_refused() -> None:
+    with pytest.raises(PlantError, match="give as many"):
+        given_decoupling(("a", "b"), [[1, 0, 0], [0, 1, 0]], [[1, 0], [0, 1]])
+    with pytest.raises(PlantError, match="1 outputs and 2 inputs"):
+        plant_set([one_sensor()], None, find_decoupling(plant()))
+    whole = plant()
+    fewer = replace(whole, B=whole.B[:, :2], dB=whole.dB[:, :, :2], channels=())
+    directions = given_decoupling(("a", "b"), [[1, 0], [0, 1]], [[1, 0], [0, 1]])
+    with pytest.raises(PlantError, match="3 outputs and 2 inputs"):
+        plant_set([fewer], None, directions)
+
+
+@pytest.fixture
+def drive(monkeypatch: pytest.MonkeyPatch):
+    """The benchmark of the disk drive, and its example."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    monkeypatch.syspath_prepend(str(ROOT / "examples" / "disk_drive"))
+    for name in ("plant", "design", "disk_drive"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    import disk_drive
+
+    yield disk_drive
+    for name in ("plant", "design", "disk_drive"):
+        sys.modules.pop(name, None)
+
+
+def test_the_kept_controllers_of_the_disk_drive_keep_what_the_page_says(drive) -> None:
+    kept = json.loads((ROOT / "benchmarks" / "disk_drive.json").read_text())
+    branches = drive.ours(kept["sections"])
+    for temperature, gain in ((-1.0, 0.95), (0.0, 1.0), (1.0, 1.05)):
+        found = drive.judge(branches, temperature, gain)
+        assert found["stable"]
+        assert found["S_peak"] <= 2.087 * (1.0 + 1e-5)
+        assert found["bandwidth_hz"] >= 1900.0
