@@ -48,11 +48,13 @@ class _Crossing:
     ) -> None:
         self.plant, self.r, self.f = G, r, f
         self.loop = loop = closed_loop(G, K)
+        self.poles, self.V = np.linalg.eig(loop.A)
+        self.stable, self.time = bool(np.abs(self.poles).max() < 1.0), np.inf
+        if not self.stable:
+            return
         self.x = driven_states(loop, G, r, f)  # the last at rest but for the loop's own modes
         self.still = np.eye(len(loop.A)) - loop.A
         self.rest = np.linalg.solve(self.still, loop.B_r[:, 0] * r[-1])
-        self.poles, self.V = np.linalg.eig(loop.A)
-        self.stable = bool(np.abs(self.poles).max() < 1.0)
         self.W = np.linalg.inv(self.V)
         self.c, self.b = loop.C_y[0] @ self.V, self.W @ (self.x[-1] - self.rest)
         self.residues = -self.c * self.b
@@ -159,6 +161,10 @@ class MoveTime:
                 dt = back.along(closed_loop(moved, K), moved.B)
                 gradient[i] += weight * (dt + back.to_r @ r + back.to_f @ f[:, 0])
         return np.asarray(gradient / value)
+
+    def times(self, kappa: Array) -> list[float]:
+        """When the envelope of each plant's error crosses the window, s."""
+        return [each.time for each in self._crossings(np.asarray(kappa, float))]
 
     def shown(self, value: float) -> str:
         """In ms."""
