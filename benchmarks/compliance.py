@@ -31,7 +31,7 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace, balanced
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.compliance import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of
 from ccd_casadi.synthesis.synthesis import synthesise
 
 ROOT = Path(__file__).parent.parent

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def table(comparison: "Comparison") -> str:
     """The methods in a few columns for the terminal."""
-    from ccd_casadi.reporting.verdict import short
+    from ccd_casadi.reporting.verdict import head_words
 
     head = f"{'method':24}{'J':>11}{'Hz':>9}{'cost':>10}{'syntheses':>11}{'box look':>10}"
     lines = [f"{head}{'s':>8}  status"]
@@ -27,7 +27,7 @@ def table(comparison: "Comparison") -> str:
             f"{method.name:24}{f['objective']:11.4f}{f['bandwidth_hz']:9.3f}"
             f"{f['hardware_cost']:10.4g}{f['syntheses_to_optimum']:11d}"
             f"{f['syntheses'] - f['syntheses_to_optimum']:10d}{f['seconds']:8.1f}  {f['status']}"
-            + (f" ({short(f)})" if short(f) else "")
+            + (f" ({head_words(f)})" if f.get("verdict") else "")
         )
     return "\n".join(lines)
 

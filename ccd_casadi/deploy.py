@@ -12,11 +12,9 @@ from ccd_casadi.support.errors import UserError, require
 from ccd_casadi.support.options import number, one_line, positive
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
-from ccd_casadi.support.units import HZ
 
 if TYPE_CHECKING:  # what computes is imported once the options are known to be right
     from ccd_casadi.cases.run_folder import FinishedRun
-    from ccd_casadi.deployment.on_hardware import OnHardware
     from ccd_casadi.deployment.outcome import Deployment
 
 LEADS = {"auto": None, "on": True, "off": False}
@@ -62,10 +60,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     moved = None
     if kind_of(finished.problem).as_designed:  # one way where a rate was given
         channels, count = 0, 1 if finished.problem.sampling else count
-    steps = channels + count + 2 + (options.saturation is not None)
+    steps = channels + count + 1 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
-            finished, timing, saturation=options.saturation, seed=options.seed,
+            finished, timing, saturation=options.saturation,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
         if found.stable:
@@ -94,10 +92,12 @@ def command(options: argparse.Namespace) -> ExitCode:
     finished = told(finished, folder, "deployable", deployed_line(finished, found))
     if not options.quiet:
         say(_summary(finished, found))
-        if moved is not None:
-            say(f"{'a move':13s} {_move_words(moved)}")
     from ccd_casadi.reporting.deploy_page import deploy_page  # matplotlib is slow to import
     from ccd_casadi.reporting.index import index_of, publish
+    from ccd_casadi.reporting.moves import way_words
+
+    if moved is not None and not options.quiet:
+        say(f"{'a move':13s} {way_words(moved.ways[-1].words, moved.ways[-1].move)}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
@@ -111,58 +111,28 @@ def command(options: argparse.Namespace) -> ExitCode:
 
 def _summary(run: "FinishedRun", found: "Deployment") -> str:
     from ccd_casadi.deployment.robust_set import place_words
-    from ccd_casadi.deployment.words import against, status_words
-    from ccd_casadi.inner_problem.kinds import kind_of
+    from ccd_casadi.deployment.words import figure_rows, order_words, status_words
     from ccd_casadi.reporting.verdict import advice
 
-    full, small, sampled, measured = (
-        run.figures, found.reduced_figures, found.sampled, found.measured,
-    )  # fmt: skip
-    orders = " + ".join(f"{o.chosen.order} of {o.rows[0].order}" for o in found.orders)
     needed = "no rate will do" if found.needed_hz is None else f"{found.needed_hz:.5g} Hz"
-    if kind_of(run.problem).as_designed:
-        orders = f"{' + '.join(str(o.chosen.order) for o in found.orders)}, as designed"
     lines = [
         ("status", status_words(run, found)),
         *([("decision", advice(run.result))] if advice(run.result) else []),
-        ("order", f"{orders} states ({len(run.controller.A)} synthesised)"),
-        ("full", f"bandwidth {full.bandwidth / HZ:.6g} Hz, peak {full.sensitivity_peak:.6g}"),
-        ("reduced", f"bandwidth {small.bandwidth / HZ:.6g} Hz, peak {small.sensitivity_peak:.6g}"),
-        ("sampled", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
-                    f"{found.conversion.label}; needed {needed}"),
+        ("order", order_words(run, found)),
+        ("rate", f"{found.rate_hz:.6g} Hz, delay {1e6 * found.delay:.5g} us, "
+                 f"{found.conversion.label}; needed {needed}"),
+        *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
     ]  # fmt: skip
-    if measured is None:
+    if not found.stable:
         lines.append(("", found.shortfalls[0]))
-    else:
-        for name, figures in (("", sampled), ("simulated", measured)):
-            lines.append((
-                name,
-                f"bandwidth {figures.bandwidth / HZ:.6g} Hz "
-                f"({100 * (figures.bandwidth / full.bandwidth - 1):+.2f} %), peak "
-                f"{figures.sensitivity_peak:.6g} "
-                f"({against(figures.sensitivity_peak, run.problem.inner.S_max)})",
-            ))  # fmt: skip
     if found.members:
-        worst, count = found.worst, 1 + len(found.measured_members)
+        worst = found.worst
         peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
-        words = f"{1 + len(found.members)} plants, {count} simulated: {peak}"
+        words = f"{1 + len(found.members)} plants: {peak}"
         lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
     if found.statics is not None:
         lines.append(("at rest", found.statics.words))
     return "\n".join(f"{name:13s} {words}" for name, words in lines)
-
-
-def _move_words(moved: "OnHardware") -> str:
-    last = moved.ways[-1]
-    ends = (
-        f"in its window after {last.move.settled:.4g} s"
-        if last.move.settled < float("inf")
-        else f"not in its window of {1e6 * moved.window:g} um"
-    )
-    return (
-        f"{moved.profile.duration:.4g} s, {last.words}: {ends}, "
-        f"peak error {1e6 * last.move.peak_error:.4g} um"
-    )
 
 
 def _shortfall(run: "FinishedRun", found: "Deployment") -> str:

@@ -23,8 +23,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.case import CaseError, load_case, parse_theta
     from ccd_casadi.cases.case_problem import problem_of
     from ccd_casadi.cases.measured_case import measured_case
-    from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer
-    from ccd_casadi.codesign.sections_inner_answer import sections_answer
+    from ccd_casadi.codesign.inner_answer import InnerOptions, mixed_answer, sections_answer
     from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem
     from ccd_casadi.inner_problem.sections_problem import SectionsProblem
     from ccd_casadi.support.errors import UserError

@@ -25,7 +25,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.codesign.retraining import Job
     from ccd_casadi.codesign.run import outer_of, require_solvable
     from ccd_casadi.codesign.run_files import write_run
-    from ccd_casadi.codesign.versions import only_job, publish
+    from ccd_casadi.codesign.stored import only_job, publish
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore

@@ -20,23 +20,23 @@ if TYPE_CHECKING:  # what computes is imported once the options are known to be 
 
 def summary(solution: "Solution") -> str:
     """The result in a few lines for the terminal."""
-    from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.design_entries import budget_lines, move_lines
     from ccd_casadi.inner_problem.sections_words import channel_words
+    from ccd_casadi.reporting.facts import cost_words, loop_lines, theta_words
     from ccd_casadi.reporting.verdict import advice, terminal_lines
-    from ccd_casadi.sampling.spent import cost_words
+    from ccd_casadi.sampling.spent import cost_words as spent_words
 
     result = solution.result
     if result["status"] == "infeasible":
         return f"no feasible design: {result['reason']}"
-    certificate, controller = result["certificate"], result.get("controller")
+    controller = result.get("controller")
     peak = f"peak {result['sensitivity_peak']:.5f} at {result['sensitivity_peak_hz']:.4g} Hz"
     lines = [
         f"status        {result['status']}  {result['reason']}".rstrip(),
         *(f"decision      {words}" for words in (advice(result),) if words),
         *terminal_lines(result),
-        f"theta         {_theta(result)}",
-        f"objective     {result['objective']:.4f}   hardware cost {_cost(result)}",
+        f"theta         {theta_words(result)}",
+        f"objective     {result['objective']:.4f}   hardware cost {cost_words(result, 6)}",
         *inner_value_lines(result),
         *_weights_lines(result),
         *([] if controller is None else controller_lines(controller)),
@@ -44,15 +44,11 @@ def summary(solution: "Solution") -> str:
         *(f"              {channel_words(own)}" for own in result.get("channel_bounds", ())),
         f"compliance    {result.get('compliance_words', 'not known')}",
         *loop_lines(result),
-        f"certificate   {'passed' if certificate['passed'] else 'FAILED'}: {_norm(certificate)}, "
-        f"poles left of {certificate['max_real_pole']:.4g} 1/s",
-        *_robust_lines(result.get("robust", {})),
         *budget_lines(result),
         *move_lines(result),
         f"binding       {', '.join(result['active']) or 'nothing'}",
         *design_plant_lines(result.get("robust") or {}),
-        f"optimality    {_optimality(result)}",
-        f"cost          {cost_words(result)}",
+        f"cost          {spent_words(result)}",
     ]
     lines += [f"note          {words}" for words in result.get("notes", ())]
     return "\n".join(lines)
@@ -73,43 +69,6 @@ def _weights_lines(result: Mapping[str, Any]) -> list[str]:
         return []
     at = (f"omega_{name} = {result[f'omega_{name}_hz']:.5g} Hz" for name in "ST")
     return [f"weights       {', '.join(at)}"]
-
-
-def _norm(certificate: Mapping[str, Any]) -> str:
-    """Of the stacked loop, or of the worst figure over its bound on the plants of a set."""
-    if "plants" not in certificate:
-        return f"norm {certificate['norm']:.6g} <= {certificate['norm_bound']:.6g}"
-    on = counted(certificate["plants"], "plant")
-    return f"{certificate['norm']:.7g} of a bound at most on {on}"
-
-
-def _robust_lines(robust: Mapping[str, Any]) -> list[str]:
-    """Of a box of plants that was judged."""
-    if "worst_excess" not in robust:
-        return []
-    how = f"{'passed' if robust['passed'] else 'FAILED'} on {counted(robust['plants'], 'plant')}"
-    worst = f"{100.0 * robust['worst_excess']:+.3g} % of a bound"
-    return [f"robust        {how} of the box; the worst that was searched: {worst}"]
-
-
-def _optimality(result: Mapping[str, Any]) -> str:
-    residual, kink = result["kkt"]["stationarity"], result["kkt"].get("kink")
-    words = f"KKT residual {'unknown' if residual is None else f'{residual:.1e}'} over theta"
-    words += "" if kink is None else " and controller, at a kink of J"
-    if "race" in result:
-        ends = ", ".join(f"{o['bandwidth_hz']:.2f} Hz" for o in result["race"])
-        off = result["controller"]["kkt_residual"]
-        words += f", {off:.1e} over the controller; a multi-start search there: {ends}"
-    return words
-
-
-def _cost(result: Mapping[str, Any]) -> str:
-    return f"{result['hardware_cost']:.6g} {result['cost_unit']}".strip()
-
-
-def _theta(result: Mapping[str, Any]) -> str:
-    values = {**result["theta"], **result.get("fixed", {})}
-    return ", ".join(f"{k} = {v:.6g} {result['units'][k]}".strip() for k, v in values.items())
 
 
 def design_plant_lines(robust: Mapping[str, Any]) -> list[str]:
@@ -202,7 +161,6 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.sampling.cluster import pool
     from ccd_casadi.sampling.sampler import Sampler
     from ccd_casadi.sampling.store import SampleStore
-    from ccd_casadi.support.units import counted
 
     case = load_case(options.case)
     problem = problem_of(case)

@@ -13,7 +13,6 @@ from ccd_casadi.support.terminal import say
 
 def command(options: argparse.Namespace) -> ExitCode:
     """Tune, print a table, write result.json, controller.json, report.html and the C code."""
-    from ccd_casadi.analysis.loop_figures import loop_lines
     from ccd_casadi.codesign.inner_answer import answer_of
     from ccd_casadi.codesign.tuning import tune
     from ccd_casadi.deployment.c_code import write_c
@@ -22,6 +21,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.fixed_structure import Structure
     from ccd_casadi.inner_problem.sections_words import SectionWords
     from ccd_casadi.lti.hold import tustin
+    from ccd_casadi.reporting.facts import loop_lines
     from ccd_casadi.reporting.measured_page import measured_page
     from ccd_casadi.support.json_files import clean, write_json
     from ccd_casadi.support.process_pool import Workers

@@ -4,7 +4,7 @@ Margins are of the loops cut one at a time at the plant's inputs, the least over
 are given; steps are of the model and of the plants where the margins are least.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -213,30 +213,3 @@ def loop_entry(
         "force_step_max": found.step.by_force,
         "loop_warnings": loop_warnings(found.growth, found.light_roots, bandwidth),
     }
-
-
-def loop_lines(result: Mapping[str, Any]) -> list[str]:
-    """Margins and step for the terminal; nothing of a result without them."""
-    if "phase_margin_deg" not in result:
-        return []
-
-    def shown(value: float | None, unit: str) -> str:
-        if value is None:
-            return "unlimited"
-        return f"{value:.0f}{unit}" if value >= 1e3 else f"{value:.3g}{unit}"
-
-    r = result
-    lines = [
-        f"margins       phase {shown(r['phase_margin_deg'], ' deg')}, gain "
-        f"{shown(r['gain_margin'], '')}, delay {shown(r['delay_margin_us'], ' us')}, modulus "
-        f"{shown(r['modulus_margin'], '')}; crossover {shown(r['crossover_hz'], ' Hz')}"
-    ]
-    if "step_overshoot" in r:
-        settled = "does not settle" if r["settling_ms"] is None else (
-            f"within 2 % after {r['settling_ms']:.3g} ms"
-        )  # fmt: skip
-        lines.append(
-            f"steps         overshoot {100.0 * r['step_overshoot']:.3g} %, {settled}; "
-            f"1 N moves {1e6 * r['force_step_max']:.3g} um at most"
-        )
-    return lines + [f"warning       {words}" for words in r.get("loop_warnings", ())]

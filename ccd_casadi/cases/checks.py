@@ -123,7 +123,8 @@ def one_or_more(value: Any) -> str | None:
 
 @_with({"anyOf": [{"type": "string"}, _list(_list({"type": "number"}, 1, 3))]})
 def text_or_rows(value: Any) -> str | None:
-    width = len(value[0]) if isinstance(value, list | tuple) and value and value[0] else 1
+    first = value[0] if isinstance(value, list | tuple) and value else None
+    width = len(first) if isinstance(first, list | tuple) and first else 1
     return text(value) if isinstance(value, str) else rows(width)(value)
 
 
@@ -190,7 +191,6 @@ coordinate = Check(
     ),
     {"type": ["number", "string"]},
 )
-coordinates = every(coordinate, 'give a list of numbers and names of [theta], as [0.1, "x", "-x"]')
 places = every(
     every(coordinate, "", 1, 3), 'give rows of numbers and names of [theta], as [["x", 0.1]]'
 )

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ccd_casadi.cases.checks import shown
 from ccd_casadi.cases.sections import PlacesSection
-from ccd_casadi.plants.places import Places, names_in
+from ccd_casadi.plants.nodes import names_in
+from ccd_casadi.plants.places import Places
 
 Fail = Callable[[str, str], Exception]
 
@@ -37,7 +38,7 @@ def checked_places(section: PlacesSection, folder: Path, fail: Fail) -> PlacesSe
 
 def place_names(section: PlacesSection) -> tuple[str, ...]:
     """The parameters that it names."""
-    return names_in((*section.actuators, *section.sensors, section.present))
+    return names_in((*section.actuators, *section.sensors))
 
 
 def places_of(section: PlacesSection) -> Places | None:

@@ -15,17 +15,6 @@ from ccd_casadi.cases.parameters import KEYS as THETA
 from ccd_casadi.cases.sections import SECTIONS
 from ccd_casadi.plants.registry import model_names
 
-_SHAPE = (
-    "`shape` makes ω_b a bandwidth. A narrow filter at ω_b holds |S| just below -3 dB up to there,",
-    "and |S| leaps to S_max above it, with 33° of phase margin. So on every plant and at every",
-    "frequency |S(jω)| <= min(S_max, shape (ω/ω_b)/√2). At ω_b that is a factor of `shape` above",
-    "-3 dB; it meets S_max at √2 S_max/shape times ω_b, for 1.75 and a shape of 1.1 at 2.25 ω_b.",
-    '`shape_ends = "crossing"` ends it at ω_b.',
-    "",
-    "![|S| where the shape ends at ω_b and where it holds up to S_max](shape.png)",
-    "",
-    "*Case study 1, ±3 %, damping × 0.5 to 2, 10 kHz with 100 µs, the same bounds on KS and T.*",
-)
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 _PLANT = {
     "model": 'a model of the package, or "measured": a frequency response; or give function',
@@ -132,8 +121,6 @@ def keys_page() -> str:
                 for item in fields(kind)
             ]
         )
-        if name == "inner":
-            lines += ["", *_SHAPE]
         if name == "budget":
             lines += ["", "A spectrum is a table, or several in double brackets, with the keys "
                       + ", ".join(f"`{key}`" for key in TABLE_CHECKS)

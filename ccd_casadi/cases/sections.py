@@ -15,7 +15,6 @@ from ccd_casadi.cases.checks import (
     NOT_NEGATIVE,
     POSITIVE,
     choice,
-    coordinates,
     count,
     factors,
     files,
@@ -283,14 +282,6 @@ class PlacesSection:
     apart: float = key(
         NOT_NEGATIVE, 0.0, says="least distance of two forces, and of two sensors", unit="m"
     )
-    present: tuple[float | str, ...] = key(
-        coordinates,
-        (),
-        says="one for each force: 1 present, 0 absent, or the name of a [theta] with "
-        "values = [0, 1]; default: all are present",
-    )
-    at_most: int | None = key(count(1), None, says="largest number of forces that are present")
-    actuator_cost: float = key(NOT_NEGATIVE, 0.0, says="hardware cost of each present force")
     axes: bool = key(
         flag,
         False,

@@ -7,7 +7,7 @@ the plant alone the set is widened step by step, each design polished on the pro
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any, cast
 
@@ -31,40 +31,34 @@ POLISHES = 5  # at most in a continuation
 LEAST = 1.0 / 16.0  # share of the range under which a step is given up
 
 
-@dataclass(frozen=True)
-class Reached:
-    """The end of a continuation: x = (θ, ln ω_S, ln ω_T) and the share of the range held there."""
+def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
+    """From a design of the plant alone towards the whole set of a problem with one design plant.
 
-    x: Array
-    share: float
-
-
-def widen(sampler: Sampler, x: Array) -> Reached:
-    """From a design of the plant alone towards the whole set of a problem with one design plant."""
+    x = (θ, ln ω_S, ln ω_T) and the share of the range held there.
+    """
     problem = sampler.problem
     assert problem.robust is not None
-    reached, step = Reached(np.asarray(x, float), 0.0), FIRST
+    x, held, step = np.asarray(x, float), 0.0, FIRST
     for _ in range(POLISHES):
-        if reached.share >= 1.0 or step < LEAST:
+        if held >= 1.0 or step < LEAST:
             break
-        share = min(1.0, reached.share + step)
+        share = min(1.0, held + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
-        found, made = polish(sampler.of(narrower, traced=share == 1.0), reached.x)
+        found, made = polish(sampler.of(narrower, traced=share == 1.0), x)
         if acceptable(narrower, found, made):
-            reached, step = Reached(found, share), 2.0 * step
+            x, held, step = found, share, 2.0 * step
         else:
             step *= 0.5
-    return reached
+    return x, held
 
 
 def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, float]:
     """What a formulation would hand on at the end of `widen`, None short of it; the share held."""
-    reached = widen(sampler, x)
-    if reached.share < 1.0:
-        return None, reached.share
-    made = sampler.truth.at(reached.x)
+    x, held = widen(sampler, x)
+    if held < 1.0:
+        return None, held
     words = "reached by continuation from narrower ranges"
-    return FormulationResult(reached.x, made, (), (), None, True, words), 1.0
+    return FormulationResult(x, sampler.truth.at(x), agreed=True, message=words), 1.0
 
 
 def best_over_design_plants(

@@ -35,13 +35,13 @@ class FormulationResult:
     truth met the tolerance at the end.
     """
 
-    x: Array | None
-    design: Sensitivities | None
-    iterates: tuple[Iterate, ...]
-    surrogates: tuple[GaussianProcess, ...]
-    outer: OuterSolution | None
-    agreed: bool
-    message: str
+    x: Array | None = None
+    design: Sensitivities | None = None
+    iterates: tuple[Iterate, ...] = ()
+    surrogates: tuple[GaussianProcess, ...] = ()
+    outer: OuterSolution | None = None
+    agreed: bool = False
+    message: str = ""
 
 
 @dataclass(frozen=True)

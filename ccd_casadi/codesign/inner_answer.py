@@ -3,7 +3,7 @@ on a measured response, designed and judged on its lines.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from ccd_casadi.analysis.loop_figures import measured_entry
 from ccd_casadi.analysis.loop_view import peaks_of
 from ccd_casadi.cases.measured_case import MeasuredCase
+from ccd_casadi.cases.run_folder import sections_kappa
 from ccd_casadi.codesign.design_entries import (
     budget_entry,
     compliance_dict,
@@ -20,8 +21,15 @@ from ccd_casadi.codesign.design_entries import (
     loop_of_design,
     move_entry,
 )
+from ccd_casadi.codesign.sections_entries import (
+    active_of,
+    design_dict,
+    proof_dict,
+    sections_controller,
+)
 from ccd_casadi.fixed_structure.measured_design import MeasuredDesign, design_on_data
 from ccd_casadi.fixed_structure.measured_loop import controller_response
+from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import (
     CoDesignProblem,
@@ -31,8 +39,13 @@ from ccd_casadi.inner_problem.problem import (
     scaled_plant,
     true_design,
 )
+from ccd_casadi.inner_problem.sections_bandwidth import too_slow
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, structure_of
+from ccd_casadi.inner_problem.sections_robustness import judged_widely, proof_of, worst_members
+from ccd_casadi.inner_problem.sections_search import least_value_at, prepared, with_range
 from ccd_casadi.inner_problem.sections_words import sections_dict
 from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.lti.closed_loop import open_alone
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.plant import hardware_cost
@@ -40,9 +53,8 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
-from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.statics import statics
-from ccd_casadi.synthesis.synthesis import DesignFigures, synthesise
+from ccd_casadi.synthesis.synthesis import DesignFigures
 
 
 @dataclass(frozen=True)
@@ -124,14 +136,7 @@ def _design(
 ) -> tuple[bool, dict[str, Any], dict[str, Any]]:
     """Whether the synthesis is certified, its figures, and controller.json."""
     plant = scaled_plant(problem, theta)
-    made = synthesise(
-        plant,
-        problem.weights.at(*point),
-        omega_low=problem.inner.omega_low,
-        gamma_backoff=problem.inner.gamma_backoff,
-        compliance=True,
-    )
-    made = handed_out(plant, made, problem.inner.omega_low)
+    made = final_design(problem, theta, point)
     figures = made.figures
     feasible = problem.inner.feasible(figures)
     compliance: dict[str, Any] = {}
@@ -153,6 +158,7 @@ def _design(
         ],
         "natural_hz": [float(omega) / HZ for omega in plant.natural],
         **budget_entry(problem, theta, made.controller),
+        **move_entry(problem, theta, made.controller),
         **move_entry(problem, theta, made.controller),
     }
     return figures.certified, answer, controller_dict(made.controller)
@@ -212,3 +218,65 @@ def _loop_entry(case: MeasuredCase, made: MeasuredDesign) -> dict[str, Any]:
               for one in case.responses]  # fmt: skip
     loops = [(omega, open_alone(L, i)) for omega, L in joints for i in range(L.shape[1])]
     return measured_entry(loops, made.controller, made.bandwidth, made.figures.S_peak)
+
+
+def sections_answer(
+    problem: CoDesignProblem, theta: tuple[float, ...], options: InnerOptions
+) -> InnerAnswer:
+    """The largest bandwidth (or least of another figure) at θ, judged over its box.
+
+    From the controller of the folder `options.begin_at` alone, where there is one.
+    """
+    if options.point is not None:
+        words = "sections have no weights' frequencies; leave out --omega-s-hz and --omega-t-hz"
+        raise UserError(words)
+    begin_at, progress, workers = options.begin_at, options.progress, options.workers
+    head = head_of(problem, theta)
+    sections = replace(sections_of_problem(problem), seed=options.seed)
+    asked = replace(with_range(replace(problem, controller=sections)), start=theta)
+    if begin_at is not None:
+        anchors = (sections_kappa(begin_at, structure_of(asked)),)
+        asked = replace(asked, controller=replace(sections_of_problem(asked), anchors=anchors))
+    asked, made = prepared(asked, progress, workers, begin_at is not None)
+    if not made.certified:
+        return InnerAnswer("infeasible", head | {"reason": made.words, "syntheses": 1})
+    value = made.bandwidth
+    if problem.figure is not BANDWIDTH:
+        slow = too_slow(asked, made)
+        if not slow.certified:
+            return InnerAnswer("infeasible", head | {"reason": slow.words, "syntheses": 1})
+        fastest = made.bandwidth
+        asked, least = least_value_at(asked, theta, made, progress)
+        made = least.design
+        value = least.value if problem.w2 > 0.0 else made.bandwidth
+        entry = problem.figure.entry
+        head["least_error" if entry == "error_rms" else f"least_{entry}"] = {
+            f"{entry}_of_set": least.value,
+            f"{entry}_at_largest_bandwidth": least.first_value,
+            "largest_bandwidth_hz": fastest / HZ,
+            "steps": least.steps,
+        }
+    worst = worst_members(asked, theta, made)[0]
+    assert made.controller is not None
+    wide, checked = judged_widely(asked, theta, made.controller, worst, workers)
+    proof = proof_of(asked, theta, made)
+    passed = wide.passed and not proof.refuted
+    figures = head | {
+        **design_dict(asked, theta, made),
+        "active": active_of(made),
+        "feasible": True,
+        "objective": objective(problem, theta, value),
+        "robust": {
+            "plants": checked,
+            "passed": wide.passed,
+            "words": wide.words,
+            "bandwidth_hz": wide.bandwidth / HZ,
+            "worst_excess": float(np.expm1(worst.value)),
+        },
+        "proof": proof_dict(proof),
+        "syntheses": 1,
+        **budget_entry(asked, theta, made.controller),
+        **move_entry(asked, theta, made.controller),
+    }
+    status = "verified" if passed else "not_verified"
+    return InnerAnswer(status, figures, sections_controller(asked, made))

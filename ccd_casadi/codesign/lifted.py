@@ -81,7 +81,7 @@ def solve_lifted(
         samples = list(given.samples)
     if len(samples) < len(lower) + 1:
         message = f"only {len(samples)} of {points} designs in the box were certified"
-        return FormulationResult(None, None, (), (), None, False, message)
+        return FormulationResult(message=message)
     iterates: list[Iterate] = []
     processes: tuple[GaussianProcess, ...] = () if given is None else given.processes
     solution: OuterSolution | None = None

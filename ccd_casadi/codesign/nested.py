@@ -75,7 +75,7 @@ def solve_nested(
         thetas = given.thetas
     samples = sampler.bandwidths(thetas)
     if not any(sample.feasible for sample in samples):
-        return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
+        return FormulationResult(message="no sampled theta is feasible")
     iterates: list[Iterate] = []
 
     def value_of(sample: BandwidthSample) -> float:

@@ -22,7 +22,7 @@ from ccd_casadi.codesign.kkt import kkt_certificate
 from ccd_casadi.codesign.lifted import Lifted, solve_lifted
 from ccd_casadi.codesign.nested import Nested, solve_nested
 from ccd_casadi.codesign.outer import End, Outer, Place
-from ccd_casadi.codesign.outer_problem import active_bounds, lifted_bounds, lifted_program
+from ccd_casadi.codesign.outer_problem import lifted_bounds
 from ccd_casadi.codesign.peak_constraints import HALF_POWER
 from ccd_casadi.codesign.post_optimal import PostOptimal, post_optimal
 from ccd_casadi.codesign.robust_check import check_references, check_robust, other_damping, survived
@@ -30,19 +30,18 @@ from ccd_casadi.codesign.stored import Surrogates, fitted_quantities
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.verified import Solution
 from ccd_casadi.codesign.verified_mixed import VerifiedDesign
-from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.objective import objective
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of, scaled_plant
-from ccd_casadi.inner_problem.sweep import active_constraints
+from ccd_casadi.inner_problem.true_function import final_design
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost
 from ccd_casadi.sampling.samples import BandwidthSample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
-from ccd_casadi.synthesis.closed_loop import handed_out, measure
+from ccd_casadi.synthesis.closed_loop import measure
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.peaks import local_peaks_with_gradients
-from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design, DesignFigures, synthesise
+from ccd_casadi.synthesis.synthesis import UNBOUNDED, Design
 from surrogates import GaussianProcess, design, quality_of
 
 POLISH_ROUNDS = 3
@@ -207,7 +206,8 @@ class MixedOuter(Outer):
         end = cast(MixedEnd, end)
         problem, sampler, x = self.problem, self.sampler, end.x
         theta = tuple(float(v) for v in self.theta_of(x))
-        make = partial(_final, problem, theta, end.design.figures)
+        figures = end.design.figures
+        make = partial(final_design, problem, theta, (figures.omega_S, figures.omega_T))
         final = sampler.kept("final", tuple(x), Design, make)
         free = replace(problem, suspension=Suspension(0.0, 0.0))
         unsuspended = measure(
@@ -226,7 +226,6 @@ class MixedOuter(Outer):
             value=final.figures.bandwidth,
             objective=objective(problem, theta, final.figures.bandwidth),
             hardware_cost=hardware_cost(plant_of(problem), theta),
-            binding=self._binding(x, final.figures),
             kkt=kkt_certificate(problem, x, end.design, sampler.truth.at),
             inner_gap=end.gap,
             feasible=final.figures.certified and acceptable(problem, x, end.design),
@@ -247,24 +246,6 @@ class MixedOuter(Outer):
 
     def responses(self, x: Array) -> PostOptimal:
         return post_optimal(self.problem, x, self.sampler.quiet)
-
-    def _binding(self, x: Array, figures: DesignFigures) -> tuple[str, ...]:
-        problem = self.problem
-        program = lifted_program(problem, self.sampler.truth, exact_hessian=False)
-        bounds = [name for name in active_bounds(program, x) if not name.startswith("omega_")]
-        extra = touched(problem, tuple(self.theta_of(x)))
-        return (*bounds, *active_constraints(problem.inner, figures), *extra)
-
-
-def _final(problem: CoDesignProblem, theta: tuple[float, ...], figures: DesignFigures) -> Design:
-    """The synthesis that is handed out, in SI and certified again there."""
-    plant = scaled_plant(problem, theta)
-    made = synthesise(
-        plant, problem.weights.at(figures.omega_S, figures.omega_T),
-        omega_low=problem.inner.omega_low, gamma_backoff=problem.inner.gamma_backoff,
-        compliance=True,
-    )  # fmt: skip
-    return handed_out(plant, made, problem.inner.omega_low)
 
 
 def _snapped(problem: CoDesignProblem, x: Array) -> Array:

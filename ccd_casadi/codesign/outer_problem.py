@@ -16,15 +16,17 @@ import numpy as np
 from ccd_casadi.inner_problem.constraints import constraint_shares, constraint_sizes, unmet
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sweep import MARGIN
-from ccd_casadi.optim.ipopt import end_points
+from ccd_casadi.optim.ipopt import EndPoint, end_points
 from ccd_casadi.plants.plant import constraint_values
 from ccd_casadi.support.arrays import Array
 from surrogates import design
 
+APART = 1e-4  # of the box: ends closer than this are one optimum
+
 
 @dataclass(frozen=True)
 class NonlinearProgram:
-    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper, with names for what may bind.
+    """min f(x), g_lower <= g(x) <= 0, lower <= x <= upper; g has λ in shares of its size.
 
     `g_lower` is minus infinity where it is not given; zero makes an equation of a row.
     """
@@ -34,35 +36,30 @@ class NonlinearProgram:
     g: ca.MX
     lower: Array
     upper: Array
-    variables: tuple[str, ...]
-    constraints: tuple[str, ...]
     exact_hessian: bool = True
     g_lower: Array | None = None
 
 
 @dataclass(frozen=True)
 class LocalOptimum:
-    """One end point of IPOPT: x, objective, multipliers of g and of the bounds, its verdict.
-
-    g has λ in shares of its size, see `inner_problem.constraints`.
-    """
+    """Where so many `starts` of IPOPT ended."""
 
     x: Array
     objective: float
-    multipliers_g: Array
-    multipliers_x: Array
-    status: str
-    converged: bool
     starts: int = 1
 
 
 @dataclass(frozen=True)
 class OuterSolution:
-    """The best local optimum, all distinct ones (best first), and the number of starts."""
+    """All distinct local optima, best first, and the number of starts."""
 
-    best: LocalOptimum
     optima: tuple[LocalOptimum, ...]
     starts: int
+
+    @property
+    def best(self) -> LocalOptimum:
+        """That of the least objective."""
+        return self.optima[0]
 
 
 class OuterFailure(RuntimeError):
@@ -80,8 +77,6 @@ def nested_program(problem: CoDesignProblem, bandwidth: ca.Function) -> Nonlinea
         g=lam,
         lower=np.array(problem.lower),
         upper=np.array(problem.upper),
-        variables=problem.names,
-        constraints=plant.constraint_names,
         exact_hessian=plant.exact_hessian,
     )
 
@@ -109,8 +104,6 @@ def lifted_program(
         g=ca.vertcat(q[1 : 1 + len(levels)] - levels, lam),
         lower=lower,
         upper=upper,
-        variables=(*problem.names, "omega_S", "omega_T"),
-        constraints=(*inner.bounds, *plant.constraint_names),
         exact_hessian=exact_hessian and plant.exact_hessian,
     )
 
@@ -127,14 +120,13 @@ def solve_program(
     program: NonlinearProgram,
     starts: Array,
     *,
-    warm: bool = False,
     tolerance: float = 1e-9,
     settled: float | None = None,
 ) -> OuterSolution:
     """IPOPT from every row of `starts`; variables are scaled to the unit box.
 
-    `warm` starts close to a solution without pushing it into the interior. `settled`: an end is
-    also where f changes by no more than that (relative) in four iterations one after the other.
+    `settled`: an end is also where f changes by no more than that (relative) in four iterations one
+    after the other.
     Raises OuterFailure where no start converges.
     """
     width = program.upper - program.lower
@@ -154,63 +146,28 @@ def solve_program(
             "ipopt.acceptable_constr_viol_tol": 1e-9,
             "ipopt.acceptable_obj_change_tol": settled,
         }
-    if warm:
-        options |= {
-            "ipopt.warm_start_init_point": "yes",
-            "ipopt.mu_init": 1e-7,
-            "ipopt.bound_push": 1e-10,
-            "ipopt.bound_frac": 1e-10,
-            "ipopt.warm_start_bound_push": 1e-10,
-            "ipopt.warm_start_bound_frac": 1e-10,
-            "ipopt.warm_start_slack_bound_push": 1e-10,
-            "ipopt.warm_start_slack_bound_frac": 1e-10,
-            "ipopt.warm_start_mult_bound_push": 1e-10,
-        }
-    found = [
-        LocalOptimum(
-            x=program.lower + width * end.z,
-            objective=end.objective,
-            multipliers_g=end.multipliers_g,
-            multipliers_x=end.multipliers_z / width,
-            status=end.status,
-            converged=end.converged,
-        )
-        for end in end_points(
-            {"x": z, "f": f, "g": g},
-            (np.atleast_2d(starts) - program.lower) / width,
-            options,
-            -np.inf if program.g_lower is None else program.g_lower,
-        )
-    ]
-    converged = [item for item in found if item.converged]
-    if not converged:
-        raise OuterFailure(f"IPOPT converged from none of {len(found)} starts: {found[0].status}")
-    optima = _distinct(converged, width)
-    return OuterSolution(optima[0], tuple(optima), len(found))
-
-
-def _distinct(found: list[LocalOptimum], width: Array) -> list[LocalOptimum]:
-    """End points closer than 1e-4 of the box are one optimum; best objective first."""
-    kept: list[LocalOptimum] = []
-    for item in sorted(found, key=lambda item: item.objective):
-        for i, other in enumerate(kept):
-            if np.abs((item.x - other.x) / width).max() < 1e-4:
-                kept[i] = LocalOptimum(**{**vars(other), "starts": other.starts + 1})
-                break
-        else:
-            kept.append(item)
-    return kept
-
-
-def active_bounds(program: NonlinearProgram, x: Array, tolerance: float = 1e-6) -> tuple[str, ...]:
-    """Names of the bounds that bind at x, within a share `tolerance` of the box."""
-    width = program.upper - program.lower
-    return tuple(
-        f"{name} {end}"
-        for i, name in enumerate(program.variables)
-        for end, bound in (("lower", program.lower[i]), ("upper", program.upper[i]))
-        if abs(x[i] - bound) <= tolerance * width[i]
+    found = end_points(
+        {"x": z, "f": f, "g": g},
+        (np.atleast_2d(starts) - program.lower) / width,
+        options,
+        -np.inf if program.g_lower is None else program.g_lower,
     )
+    kept: list[EndPoint] = []
+    counts: list[int] = []
+    for end in sorted((end for end in found if end.converged), key=lambda end: end.objective):
+        near = [i for i, other in enumerate(kept) if np.abs(end.z - other.z).max() < APART]
+        if near:
+            counts[near[0]] += 1
+        else:
+            kept.append(end)
+            counts.append(1)
+    if not kept:
+        raise OuterFailure(f"IPOPT converged from none of {len(found)} starts: {found[0].status}")
+    optima = (
+        LocalOptimum(program.lower + width * end.z, end.objective, count)
+        for end, count in zip(kept, counts, strict=True)
+    )
+    return OuterSolution(tuple(optima), len(found))
 
 
 def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
@@ -234,8 +191,6 @@ def unmet_constraint(problem: CoDesignProblem, starts: int, seed: int) -> str:
         g=_hardware(problem, theta)[1] - slack,
         lower=np.append(lower, -most),
         upper=np.append(upper, most),
-        variables=(*problem.names, "slack"),
-        constraints=plant.constraint_names,
         exact_hessian=plant.exact_hessian,
     )
     try:

@@ -7,6 +7,7 @@ end a multi-start search and a search for worse plants ask whether these were go
 The polish works on the true value: it passes kinks, and keeps its controller.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,21 +17,26 @@ import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
 from ccd_casadi.codesign.costs import Costs, costs_of
+from ccd_casadi.codesign.direct import Direct
+from ccd_casadi.codesign.formulation import FormulationResult
+from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
 from ccd_casadi.codesign.sections_races import raced_at, seeded_and_prepared, teller, value_at
+from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
-from ccd_casadi.codesign.theta_kkt import theta_kkt
+from ccd_casadi.codesign.theta_joint import together
+from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.verified_sections import VerifiedSections
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.figure import MOVE_TIME
+from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
 from ccd_casadi.inner_problem.move_figures import told_time
 from ccd_casadi.inner_problem.objective import objective_of
-from ccd_casadi.inner_problem.problem import box, plant_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
 from ccd_casadi.inner_problem.sections_problem import Member
@@ -40,7 +46,7 @@ from ccd_casadi.inner_problem.sections_robustness import (
     proof_of,
     worst_members,
 )
-from ccd_casadi.inner_problem.sections_search import joined
+from ccd_casadi.inner_problem.sections_search import ROUNDS, joined
 from ccd_casadi.limitations.of_problem import known_gap
 from ccd_casadi.optim.pieces import FIRST
 from ccd_casadi.plants.plant import hardware_cost
@@ -58,12 +64,13 @@ FOLLOWED = 3  # times at most that a controller is taken along past a jump of ω
 @dataclass(frozen=True)
 class SectionsEnd(End):
     """With the sampler of the problem that has it, its value and that one's design and gradients,
-    a multi-start search there, the worst plant, and those to add."""
+    a multi-start search there (None where plants are to be added first), the worst plant, and those
+    to add."""
 
     asked: Sampler
     best: BandwidthSample
     found: SectionsValue
-    raced: SectionsValue
+    raced: SectionsValue | None
     worst: Excess
     members: tuple[Member, ...]
 
@@ -76,6 +83,16 @@ class SectionsOuter(ThetaOuter):
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
         self.words = words
+
+    def formulated(
+        self, formulation: Formulation, seed: int, given: Surrogates | None = None
+    ) -> FormulationResult:
+        """Direct from the case's start alone is the polish."""
+        if isinstance(formulation, Direct) and formulation.starts == 1:
+            best = self.sampler.bandwidths(np.array(self.problem.start), "direct")[0]
+            x = np.array(best.theta) if best.feasible else None
+            return FormulationResult(x, None, (), (), None, best.feasible, best.shortfall)
+        return super().formulated(formulation, seed, given)
 
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
@@ -102,10 +119,10 @@ class SectionsOuter(ThetaOuter):
             asked, best = polish_sections(self.sampler, self.theta_of(x))
         problem, theta = asked.problem, best.theta
         found = value_at(asked, theta)
-        raced = raced_at(asked, theta)
         tell = teller("at the end", asked.quiet)
         worst, members = worst_members(problem, theta, found.design, 0, tell)
-        gap = problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
+        raced = None if members else raced_at(asked, theta)
+        gap = 0.0 if raced is None else _gap(problem, best, raced)
         return SectionsEnd(
             np.array(theta), best.value, objective_of(problem, best),
             theta_kkt(problem, best, envelope=found.envelope), gap, asked, best, found, raced,
@@ -114,19 +131,18 @@ class SectionsOuter(ThetaOuter):
 
     def joined(self, end: End) -> "SectionsOuter | None":
         end = cast(SectionsEnd, end)
-        better = end.gap > BETTER
-        if not (better or end.members):
+        if end.members:
+            return SectionsOuter(with_members(end.asked, end.found.design.kappa, end.members))
+        if end.raced is None or end.gap <= BETTER:
             return None
-        kappa = (end.raced if better else end.found).design.kappa
-        trace = self.sampler.trace
-        if end.members:  # what was found for fewer plants is worth nothing on these
-            trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
-        return SectionsOuter(self.sampler.of(joined(end.asked.problem, kappa, end.members)))
+        kappa = end.raced.design.kappa
+        return SectionsOuter(self.sampler.of(joined(end.asked.problem, kappa, ())))
 
     def verified(self, end: End, rounds: int) -> VerifiedSections:
         end = cast(SectionsEnd, end)
         asked, best, made, worst = end.asked, end.best, end.found.design, end.worst
         problem = asked.problem
+        raced = raced_at(asked, best.theta) if end.raced is None else end.raced
         assert made.controller is not None
         loops = loops_of(problem, best.theta, made.controller)
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
@@ -148,12 +164,12 @@ class SectionsOuter(ThetaOuter):
             objective=end.objective,
             hardware_cost=hardware_cost(plant_of(problem), best.theta),
             kkt=kkt,
-            inner_gap=float(max(end.gap, 0.0)),
+            inner_gap=float(max(_gap(problem, best, raced), 0.0)),
             feasible=made.certified and not unmet(problem, best.theta),
             survival=survived(problem, loops, made.bandwidth)[0] if made.certified else None,
             damping=other_damping(problem, loops),
             design=made,
-            raced=end.raced,
+            raced=raced,
             wide=wide,
             checked=checked,
             proof=proof,
@@ -170,10 +186,44 @@ class SectionsOuter(ThetaOuter):
         return sections_responses(self.problem, sample, value_at(self.sampler, sample.theta))
 
 
+def _gap(problem: CoDesignProblem, best: BandwidthSample, raced: SectionsValue) -> float:
+    return problem.figure.gain(raced.value, best.value) if raced.feasible else 0.0
+
+
+def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> Sampler:
+    """The sampler of the problem with more plants: on these what was found before is worth
+    nothing."""
+    trace = sampler.trace
+    trace[:] = [replace(item, bandwidth=np.nan, objective=np.nan) for item in trace]
+    return sampler.of(joined(sampler.problem, kappa, members))
+
+
+def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
+    """`together` again with the worst plants of its end, until there are none that are worse."""
+    for turn in range(ROUNDS):
+        sampler, best = together(sampler, theta)
+        if not best.feasible:
+            break
+        design, tell = value_at(sampler, best.theta).design, teller("on the way", sampler.quiet)
+        members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
+        if not members:
+            break
+        sampler, theta = with_members(sampler, design.kappa, members), np.array(best.theta)
+    return sampler, best
+
+
 def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
     """From a design nearly optimal to the best θ that is found near it on the true problem, and
     the sampler of the problem that has it: with more anchors, where the given ones lose it.
+
+    By the joint search where J counts the bandwidth; from there, where J is not stationary, by
+    pieces (`pieces`), which know kinks.
     """
+    if sampler.problem.figure is BANDWIDTH:
+        sampler, best = carried(sampler, theta)
+        if best.feasible and _stationary(sampler, best):
+            return sampler, best
+        theta = np.array(best.theta)
     problem = sampler.problem
     lower, upper = box(problem)
     near = np.where(theta - lower <= 1e-3 * (upper - lower), lower, theta)
@@ -184,6 +234,12 @@ def polish_sections(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthS
     if theta_kkt(problem, best).stationarity > STATIONARY:
         truth, best = by_pieces(truth, best)
     return truth.sampler, best
+
+
+def _stationary(sampler: Sampler, best: BandwidthSample) -> bool:
+    """Whether a sample is optimal to first order, by the gradients of several sides of it."""
+    envelope = value_at(sampler, best.theta).envelope
+    return theta_kkt(sampler.problem, best, envelope=envelope).stationarity <= SMOOTH
 
 
 def by_pieces(

@@ -25,9 +25,8 @@ from ccd_casadi.codesign.lifted import OUTPUTS
 from ccd_casadi.codesign.outer import Outer
 from ccd_casadi.codesign.outer_problem import unmet_constraint
 from ccd_casadi.codesign.search import concluded_at
-from ccd_casadi.codesign.stored import Surrogates, stored_designs, stored_thetas
+from ccd_casadi.codesign.stored import Surrogates, keep_version, stored_designs, stored_thetas
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.codesign.versions import keep_version
 from ccd_casadi.inner_problem.problem import box
 from ccd_casadi.sampling.rows import problem_hash
 from ccd_casadi.sampling.samples import BandwidthSample, QuantitySample, quantity_sample
@@ -101,7 +100,7 @@ class Job:
             return known
         began, outer, sampler = perf_counter(), self.outer, self.outer.sampler
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
-        outcome = FormulationResult(None, None, (), (), None, False, words)
+        outcome = FormulationResult(message=words)
         if not words:
             outcome = self._trained(mark["tolerance"])
             if outcome.x is None:
@@ -138,7 +137,7 @@ class Job:
         given = self._known()
         if given is None:
             words = "too few points where the truth has a value"
-            return FormulationResult(None, None, (), (), None, False, words)
+            return FormulationResult(message=words)
         sampled = 2 * len(self.outer.problem.names) + 2 if self.over_theta else 1
         rounds = min(int(self.left / (self._cost(len(given.thetas)) * sampled)), ROUNDS)
         options = formulation_of(self.case, name)

@@ -54,7 +54,7 @@ def searched(
         if known is None:
             outcome = outer.formulated(formulation, seed, given)
         else:
-            outcome = FormulationResult(known, None, (), (), None, True, "")
+            outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:
             outcome = outer.rescued(outcome, seed)
         if outcome.x is None:
@@ -64,7 +64,8 @@ def searched(
         more = None if rounds == AGAIN else outer.joined(end)
         if more is None:
             return _looked(Searched(outer, outcome, end, rounds), formulation, sampled, seed)
-        outer, known = more, None if known is None else end.x
+        goes_on = known is not None or isinstance(formulation, Direct)
+        outer, known = more, end.x if goes_on else None
 
 
 def _looked(
@@ -152,4 +153,4 @@ def concluded_at(
 
 def nothing_found(outer: Outer, words: str) -> Searched:
     """No design, and why."""
-    return Searched(outer, FormulationResult(None, None, (), (), None, False, words), None, 0)
+    return Searched(outer, FormulationResult(message=words), None, 0)

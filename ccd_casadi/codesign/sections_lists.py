@@ -153,13 +153,13 @@ def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
         "bandwidth_hz": best.bandwidth / HZ,
         f"{problem.figure.entry}_of_set": best.value,
     }
-    outcome = FormulationResult(np.array(best.theta), None, (), (), None, True, "")
+    outcome = FormulationResult(np.array(best.theta), agreed=True)
     return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
 
 
 def _nothing(words: str) -> Solution:
     result = {"status": "infeasible", "reason": words, "syntheses": 0}
-    return Solution(result, FormulationResult(None, None, (), (), None, False, words), None)
+    return Solution(result, FormulationResult(message=words), None)
 
 
 def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
@@ -169,10 +169,7 @@ def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:
     lam = plant.hardware(x)[1]
     theta = np.clip(theta, lower, upper)
     f = ca.sumsqr((x - theta) / (upper - lower))
-    program = NonlinearProgram(
-        x, f, lam + INSIDE, lower, upper, problem.names, plant.constraint_names,
-        exact_hessian=plant.exact_hessian,
-    )  # fmt: skip
+    program = NonlinearProgram(x, f, lam + INSIDE, lower, upper, plant.exact_hessian)
     try:
         return np.clip(solve_program(program, theta).best.x, lower, upper) if lam.numel() else theta
     except OuterFailure:

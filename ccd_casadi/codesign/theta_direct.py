@@ -31,10 +31,16 @@ class TrueBandwidth(VectorCallback):
 
     def at(self, theta: Array) -> BandwidthSample:
         """The sample at θ; repeated points cost nothing."""
-        key = np.asarray(theta, float).tobytes()
-        if key not in self.known:
-            self.known[key] = self.sampler.bandwidths(theta, self.label)[0]
-        return self.known[key]
+        return self.all_at(np.atleast_2d(theta))[0]
+
+    def all_at(self, thetas: Array) -> list[BandwidthSample]:
+        """Those at several θ (k, n), over the workers."""
+        keys = [np.asarray(theta, float).tobytes() for theta in thetas]
+        new = [i for i, key in enumerate(keys) if key not in self.known]
+        if new:
+            samples = self.sampler.bandwidths(np.asarray(thetas)[new], self.label)
+            self.known |= {keys[i]: sample for i, sample in zip(new, samples, strict=True)}
+        return [self.known[key] for key in keys]
 
     def _value(self, theta: Array) -> Array:
         sample = self.at(theta)
@@ -56,7 +62,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
     good = [p for p in points if truth.at(p).feasible and np.isfinite(truth.at(p).gradient).all()]
     if not good:
         message = f"none of {len(points)} starting designs is certified"
-        return FormulationResult(None, None, (), (), None, False, message)
+        return FormulationResult(message=message)
     program = nested_program(problem, truth)
     program = replace(program, exact_hessian=False)
     try:
@@ -64,7 +70,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
     except OuterFailure as error:
         best = min((truth.at(p) for p in good), key=lambda s: objective_of(problem, s))
         if not np.isfinite(objective_of(problem, best)):
-            return FormulationResult(None, None, (), (), None, False, str(error))
+            return FormulationResult(message=str(error))
         return FormulationResult(np.array(best.theta), None, (), (), None, False, str(error))
     best = min(truth.known.values(), key=lambda s: objective_of(problem, s))
     return FormulationResult(np.array(best.theta), None, (), (), solution, True, "")

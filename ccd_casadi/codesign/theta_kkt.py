@@ -79,7 +79,7 @@ def theta_kkt(
     Z = _steepest_first(at.free(nu), at.gradient)
     second = np.inf if Z.shape[1] == 0 else None
     if Z.shape[1] and truth is not None and kink is not None:
-        slopes = tuple(_slopes(problem, truth, sample, z, at.size) for z in Z.T)
+        slopes = _slopes(problem, truth, sample, Z, at.size)
         kink = Kink(kink.one_gradient, slopes, kink.multipliers)
     elif Z.shape[1] and truth is not None:
         second = reduced_curvature(Z, _hessian(problem, truth, sample, Z), at.size)
@@ -120,24 +120,21 @@ def _steepest_first(Z: Array, gradient: Array) -> Array:
 
 
 def _slopes(
-    problem: CoDesignProblem, truth: TrueBandwidth, sample: BandwidthSample, z: Array, size: float
-) -> tuple[float, float]:
-    """By how much J grows on both sides of a design, per share of the box and over `size`."""
+    problem: CoDesignProblem, truth: TrueBandwidth, sample: BandwidthSample, Z: Array, size: float
+) -> tuple[tuple[float, float], ...]:
+    """By how much J grows on both sides of a design along each of Z (n, k), per share of the box
+    and over `size`; all are asked for at once."""
     lower, upper = box(problem)
-    theta = np.array(sample.theta)
-
-    def value(at: BandwidthSample) -> float:
-        return objective(problem, at.theta, at.value)
-
-    found = []
-    for sign in (-1.0, 1.0):
-        end = np.clip(theta + sign * BESIDE * z * (upper - lower), lower, upper)
-        step = float(np.linalg.norm((end - theta) / (upper - lower)))
-        slope = np.nan
-        if step > 0.5 * BESIDE:
-            slope = (value(truth.at(end)) - value(sample)) / (step * size)
-        found.append(slope)
-    return found[0], found[1]
+    width, theta = upper - lower, np.array(sample.theta)
+    sides = np.array([sign * BESIDE * z * width for z in Z.T for sign in (-1.0, 1.0)])
+    ends = np.clip(theta + sides, lower, upper)
+    steps = np.linalg.norm((ends - theta) / width, axis=1)
+    J = objective(problem, sample.theta, sample.value)
+    far = np.flatnonzero(steps > 0.5 * BESIDE)
+    found = np.full(len(ends), np.nan)
+    for i, there in zip(far, truth.all_at(ends[far]), strict=True):
+        found[i] = (objective(problem, there.theta, there.value) - J) / (steps[i] * size)
+    return tuple((float(low), float(high)) for low, high in found.reshape(-1, 2))
 
 
 def _hessian(

@@ -67,15 +67,6 @@ class Verdict:
         return tuple((item.name, getattr(self, item.name)) for item in fields(self))
 
 
-@dataclass(frozen=True)
-class CloserModel:
-    """The controller on a closer model of the plant: stable, and its peak of S."""
-
-    name: str
-    stable: bool
-    peak: float
-
-
 def optimal(
     kkt: KktCertificate,
     *,
@@ -217,12 +208,13 @@ def survives(
     robust: bool | None = None,
     robust_words: str = "",
     other_damping: str = "",
-    closer: Sequence[CloserModel] = (),
+    closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
 ) -> Line:
     """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none).
 
-    `other_damping`: what that set does not keep, in words; `figures`: more of them.
+    `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
+    stable, and the peak of S; `figures`: more of them.
     """
     if found is None:
         if robust is False:
@@ -243,14 +235,13 @@ def survives(
         state = State.WARNED
         at = ", ".join(f"{hz:.4g}" for hz in found.unstable_poles_hz[:3])
         said.append(f"K itself is unstable (poles at {at} Hz)")
-    for model in closer:
-        if model.stable and model.peak > (1.0 + CLOSER_PEAK) * S_max:
-            state = State.WARNED
-            said.append(f"peak of S {model.peak:.3g} on {model.name}")
-    for model in closer:
-        if not model.stable:
+    for name, stable, peak in closer:
+        if stable and peak > (1.0 + CLOSER_PEAK) * S_max:
+            state = state if state is State.FAILED else State.WARNED
+            said.append(f"peak of S {peak:.3g} on {name}")
+        elif not stable:
             state = State.FAILED
-            said.insert(0, f"unstable on {model.name}")
+            said.insert(0, f"unstable on {name}")
     said[:0] = [words for words in (robust_words, other_damping) if words]
     if robust is False:
         state = State.FAILED
@@ -276,7 +267,7 @@ def survives(
         "static_compliance": rest.compliance,
         "static_share": rest.share,
         "robust_set": robust,
-        "closer_models": {m.name: {"stable": m.stable, "peak": m.peak} for m in closer},
+        "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
     return Line(state, "; ".join(said), figures)
 

@@ -1,4 +1,4 @@
-"""Certified controller → reduced → sampled → verified → realised → measured in a simulation."""
+"""Certified controller → reduced → sampled → verified → realised."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +23,7 @@ from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
-from ccd_casadi.synthesis.compliance import compliance_of
+from ccd_casadi.synthesis.statics import compliance_of
 from ccd_casadi.synthesis.synthesis import UNBOUNDED
 
 # A reduced controller keeps S_max and a bound on the compliance to 0.5 % (they bind at most optima,
@@ -40,7 +40,6 @@ def deploy(
     timing: Timing,
     *,
     saturation: float | None = None,
-    seed: int = 0,
     progress: Callable[[str], None] = lambda words: None,
 ) -> Deployment:
     """Reduce, discretise and verify the controller of a run; `progress` is told each step.
@@ -49,7 +48,7 @@ def deploy(
     where no sampling rate is enough, or the given one is no rate for this loop.
     """
     if kind_of(run.problem).as_designed:
-        return deploy_as_designed(run, timing, saturation, seed, progress)
+        return deploy_as_designed(run, timing, saturation, progress)
     inner, full = run.problem.inner, run.figures
     bandwidth_hz = full.bandwidth / HZ
     if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
@@ -83,11 +82,7 @@ def deploy(
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
-    progress("simulation")
-    return plants.deployment(
-        limits, reduced, reduced_figures, trials, target, seed=seed,
-        simulated={item.at for item in family}, compliance_max=inner.compliance_max,
-    )  # fmt: skip
+    return plants.deployment(limits, reduced, reduced_figures, trials, target, inner.compliance_max)
 
 
 def _orders(

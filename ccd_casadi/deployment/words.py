@@ -1,9 +1,13 @@
 """A deployment's verdict in words: what is kept, by how much, and on which plant."""
 
+from math import isfinite
+from typing import Any
+
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.verdict import Line, State
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.robust_set import place_words
+from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.support.units import HZ
 
 
@@ -42,6 +46,35 @@ def deployed_line(run: FinishedRun, found: Deployment) -> Line:
     if reason:
         return Line(State.WARNED, f"{kept}; {reason}", figures)
     return Line(State.PASSED, kept, figures)
+
+
+def order_words(run: FinishedRun, found: Deployment) -> str:
+    """`4 of 6 states (7 synthesised), and 1 of the lead`."""
+    orders = [item.chosen.order for item in found.orders]
+    if kind_of(run.problem).as_designed:
+        return f"{' + '.join(map(str, orders))} states, as designed"
+    words = " + ".join(
+        f"{order} of {item.rows[0].order}" for order, item in zip(orders, found.orders, strict=True)
+    )
+    more = len(found.realisation.system.A) - found.order if found.conversion.lead else 0
+    lead = f", and {more} of the lead" if more else ""
+    return f"{words} states ({len(run.controller.A)} synthesised){lead}"
+
+
+def figure_rows(run: FinishedRun, found: Deployment) -> list[tuple[str, str, str]]:
+    """Bandwidth and peak of S of every loop on the way: name, value and remark."""
+    loops: list[tuple[str, Any]] = [
+        ("Full", run.figures), ("Reduced", found.reduced_figures), ("Sampled", found.sampled),
+    ]  # fmt: skip
+    rows = []
+    for name, figures in loops:
+        if figures is not None and isfinite(figures.bandwidth):
+            change = 100.0 * (figures.bandwidth / run.figures.bandwidth - 1.0)
+            peak = against(figures.sensitivity_peak, run.problem.inner.S_max)
+            words = f"peak {figures.sensitivity_peak:.6g} ({peak})"
+            words += "" if name == "Full" else f", bandwidth {round(change, 2) + 0.0:+.2f} %"
+            rows.append((name, f"{figures.bandwidth / HZ:.6g} Hz", words))
+    return rows
 
 
 def against(peak: float, S_max: float) -> str:

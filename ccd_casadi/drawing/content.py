@@ -151,11 +151,10 @@ class Lines:
 
 @dataclass(frozen=True)
 class ThetaPath:
-    """A method's way over θ, rows (θ₁, θ₂); numbered where `numbered`."""
+    """A method's way over θ, rows (θ₁, θ₂)."""
 
     label: str
     theta: Array
-    numbered: bool = False
 
 
 @dataclass(frozen=True)

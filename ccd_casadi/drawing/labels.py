@@ -84,7 +84,7 @@ class Labels:
                 best, least = place, covered
         return best
 
-    def beside(self, x: float, y: float, text: str, wish: tuple[float, float], colour: str) -> None:
+    def beside(self, x: float, y: float, text: str, wish: tuple[float, float]) -> None:
         """A label beside a point, at the offset `wish` in pt if that is free."""
         a, b = self._at(x, y)
         wide = LETTER * len(text)
@@ -97,8 +97,7 @@ class Labels:
         if found is not None:
             dx, dy = places[found][1]
             side = "center" if dx == 0 else "left" if dx > 0 else "right"
-            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND,
-                        color=colour)  # fmt: skip
+            self._write(text, (dx, dy), (x, y), "data", ha=side, va=_above(dy), bbox=BEHIND)
 
     def along(self, value: float, text: str, vertical: bool) -> None:
         """A label at a line across the axes, upright beside a vertical one."""

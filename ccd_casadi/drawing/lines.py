@@ -117,7 +117,7 @@ def _draw(axes: "Axes", panel: Panel) -> None:
     for mark in panel.marks:
         labels.avoid(mark.x, mark.y)
     for mark in panel.marks:
-        labels.beside(mark.x, mark.y, mark.text, mark.offset, mark.colour)
+        labels.beside(mark.x, mark.y, mark.text, mark.offset)
     for level in panel.levels:
         labels.along(level.value, level.text, level.vertical)
     labelled = [*(b.label for b in panel.bands), *(c.label for c in panel.curves)]

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccd_casadi.drawing.content import Landscape, SweepMap, ThetaPath
+from ccd_casadi.drawing.content import Landscape, SweepMap
 from ccd_casadi.drawing.svg import (
     BLACK,
     COLOUR_MAP,
@@ -67,7 +67,9 @@ def _landscape(land: Landscape, key: str, width: float) -> str:
                                      linestyle=(0, (4, 3)), linewidth=0.8, clip_on=False,
                                      label="last trust region"))  # fmt: skip
         for i, path in enumerate(land.paths):
-            _path(axes, path, CYCLE[(i + 1) % len(CYCLE)])
+            axes.plot(*path.theta.T, "-o", color=CYCLE[(i + 1) % len(CYCLE)], linewidth=1.2,
+                      markersize=6, clip_on=False, markerfacecolor="white", markeredgewidth=1.3,
+                      label=path.label, zorder=5)  # fmt: skip
         if land.optimum is not None:
             a, b = land.optimum
             axes.plot([a], [b], "*", color=ORANGE, markersize=15, clip_on=False, zorder=7,
@@ -167,28 +169,6 @@ def _shade(axes: "Axes", x: Array, y: Array, excess: Array) -> None:
     veil.set_linewidth(0.0)
     axes.fill([], [], facecolor="white", edgecolor="#777777", hatch="////", linewidth=0.5,
               label="infeasible")  # fmt: skip
-
-
-def _path(axes: "Axes", path: ThetaPath, colour: str) -> None:
-    axes.plot(*path.theta.T, "-o", color=colour, linewidth=1.2, markersize=6, clip_on=False,
-              markerfacecolor="white", markeredgewidth=1.3, label=path.label, zorder=5)  # fmt: skip
-    if not path.numbered:
-        return
-    span = [np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())]
-    groups: list[tuple[Array, list[int]]] = []
-    for i, theta in enumerate(path.theta):
-        for spot, members in groups:
-            if (np.abs(theta - spot) <= 0.02 * np.array(span)).all():
-                members.append(i + 1)
-                break
-        else:
-            groups.append((theta, [i + 1]))
-    for spot, members in groups:
-        text = f"{members[0]}–{members[-1]}" if len(members) > 2 else ", ".join(map(str, members))
-        axes.annotate(text, (float(spot[0]), float(spot[1])), xytext=(9, 9),
-                      textcoords="offset points", fontsize=9, zorder=8, annotation_clip=False,
-                      bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none",
-                            "alpha": 0.85})  # fmt: skip
 
 
 def _colour_bar(figure: "Figure", filled: Any, label: str) -> None:

@@ -175,13 +175,20 @@ def _(problem: CompositeProblem, kappa: Array, found: Constraints) -> Array:
 
 
 @hessians.register
-def _(problem: CompositeProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
-    n = len(kappa)
-    out = np.zeros((len(rows.v), n + 1, n + 1))
-    for part, at, own in problem.split(rows):
-        spread = np.zeros((len(part.place) + 1, n + 1))
-        spread[:-1, :-1], spread[-1, -1] = part.spread(n), 1.0
-        inner = hessians(part.problem, kappa[part.place], tau + part.lead, own)
+def _(
+    problem: CompositeProblem,
+    kappa: Array,
+    tau: float,
+    rows: Constraints,
+    beside: Sequence[CompositeProblem] = (),
+) -> Array:
+    k, n = len(beside), len(kappa)
+    out = np.zeros((len(rows.v), k + n + 1, k + n + 1))
+    for number, (part, at, own) in enumerate(problem.split(rows)):
+        place = np.concatenate([np.arange(k), k + part.place, [k + n]])
+        spread = np.asarray(np.arange(k + n + 1) == place[:, None], float)
+        near = [other.parts[number].problem for other in beside]
+        inner = hessians(part.problem, kappa[part.place], tau + part.lead, own, near)
         out[at] = spread.T @ inner @ spread
     return out
 

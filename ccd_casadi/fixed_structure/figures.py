@@ -6,6 +6,8 @@ fixed frequency those of `kernels.loop_curvature`; a peak moves as κ does: -c_x
 added, x = ln v, exact but for one difference in frequency.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import singledispatch
 from typing import Any
 
@@ -34,6 +36,8 @@ from ccd_casadi.support.arrays import Array
 RELEVANT, RELEVANT_OF_SEVERAL = -1.0, -0.4
 WITHIN, WITHIN_OF_SEVERAL = 0.5, 0.4
 STEP = 1e-5  # of ln v
+BESIDE = 1e-6  # of the range of a parameter of the plants: far less than a half width's worth
+UNLIKE = 0.1  # relative: mixed differences that a smooth row has alike
 
 
 @singledispatch
@@ -126,25 +130,51 @@ def to_theta(problem: LoopProblem, kappa: Array, found: Constraints) -> Array:
 
 
 @singledispatch
-def hessians(problem: LoopProblem, kappa: Array, tau: float, rows: Constraints) -> Array:
-    """(M, n + 1, n + 1): ∂²c_j to (κ, τ), κ first."""
-    n, m, P = len(kappa), len(rows.v), problem.plants.count
-    out = np.zeros((m, n + 1, n + 1))
+def hessians(
+    problem: LoopProblem,
+    kappa: Array,
+    tau: float,
+    rows: Constraints,
+    beside: Sequence[LoopProblem] = (),
+) -> Array:
+    """(M, k + n + 1, k + n + 1): ∂²c_j to (z, κ, τ), in this order.
+
+    z are k parameters of the plants: `beside` has the loops that are moved by `BESIDE` along each.
+    """
+    k, n, m, P = len(beside), len(kappa), len(rows.v), problem.plants.count
+    out = np.zeros((m, k + n + 1, k + n + 1))
     if not m:
         return out
     loop = problem.loop(kappa, tau)
-    out[:, :n, :n] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
+    out[:, k:-1, k:-1] = second(rows.curve, rows.plant // P, rows.plant % P, rows.v, loop)
     v = (rows.v * np.exp([[0.0], [STEP], [-STEP]])).ravel()
     found = evaluate_rows(problem, kappa, tau, np.tile(rows.curve, 3), np.tile(rows.plant, 3), v)
-    (slope, *slopes), (_, *to_kappa) = (np.split(part, 3) for part in found[1:3])
+    (slope, *slopes), (own, *to_kappa) = (np.split(part, 3) for part in found[1:3])
     c_xx, c_xk = ((up - down) / (2.0 * STEP) for up, down in (slopes, to_kappa))
     end = rows.curve == Curve.CROSSING
     fixed = end | (rows.curve == Curve.S_LOW)
     top = ~fixed & (c_xx < 0.0) & (np.abs(slope) < 1e-3 * np.sqrt(np.abs(c_xx)))
-    shift = c_xk / np.where(top, -c_xx, np.inf)[:, None]
-    out[:, :n, :n] += shift[:, :, None] * c_xk[:, None, :]
+    c_xz, smooth = np.zeros((m, k)), np.ones(m, bool)
+    if beside:
+        to_z = to_theta(problem, kappa, rows)
+        for i, other in enumerate(beside):
+            moved = evaluate_rows(other, kappa, tau, rows.curve, rows.plant, rows.v)
+            c_xz[:, i] = (moved[1] - slope) / BESIDE
+            out[:, i, k:-1] = out[:, k:-1, i] = (moved[2] - own) / BESIDE
+            out[:, i, :k] = (to_theta(other, kappa, rows) - to_z) / BESIDE
+        out[:, :k, :k] = 0.5 * (out[:, :k, :k] + out[:, :k, :k].transpose(0, 2, 1))
+        # Where singular values cross no difference means anything: its two orders disagree.
+        up, down = (to_theta(problem, kappa, replace(rows, v=rows.v * np.exp(x)))
+                    for x in (STEP, -STEP))  # fmt: skip
+        c_zx = (up - down) / (2.0 * STEP)
+        unlike = np.abs(c_xz - c_zx).max(axis=1)
+        smooth = unlike <= UNLIKE * (1.0 + np.abs(c_zx).max(axis=1))
+    c_xy = np.concatenate([c_xz, c_xk], axis=1)
+    shift = c_xy / np.where(top, -c_xx, np.inf)[:, None]
+    out[:, :-1, :-1] += shift[:, :, None] * c_xy[:, None, :]
     if end.any():
         chain = rows.to_tau[end] / np.where(slope[end] == 0.0, 1.0, slope[end])
-        out[end, :n, n] = out[end, n, :n] = chain[:, None] * c_xk[end]
-        out[end, n, n] = chain**2 * c_xx[end]
+        out[end, :-1, -1] = out[end, -1, :-1] = chain[:, None] * c_xy[end]
+        out[end, -1, -1] = chain**2 * c_xx[end]
+    out[~smooth] = 0.0
     return out

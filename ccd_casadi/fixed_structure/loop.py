@@ -22,21 +22,36 @@ import numpy as np
 
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
 from ccd_casadi.fixed_structure.decoupling import Decoupling, in_channels
-from ccd_casadi.fixed_structure.loop_plant import (
-    LoopPlant,
-    finite_zeros,
-    loop_plants,
-    padded_modes,
-    padded_states,
-)
 from ccd_casadi.fixed_structure.structure import Structure, state_spaces
 from ccd_casadi.kernels import modes
-from ccd_casadi.lti.hold import Sampling, moments, transfer
+from ccd_casadi.lti.hold import Sampling, in_w, moments, sampled, transfer
+from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
 
+FAITHFUL = 1e-7  # relative error of the modal response, above which a plant has no such form
 CLOSE = 1e-6  # relative gap of two poles below which their divided difference is a derivative
+
+
+@dataclass(frozen=True)
+class LoopPlant:
+    """One plant as the loop sees it.
+
+    (A, B, C, D) in w. `poles` of the continuous plant, with `drive` = V⁻¹B (n, m) and `reading` =
+    CV (p, n) in its eigenvectors; `dA` = V⁻¹ ∂A V, `dB` = V⁻¹ ∂B, `dC` = ∂C V, leading axis θ.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    poles: np.ndarray
+    drive: np.ndarray
+    reading: np.ndarray
+    dA: np.ndarray
+    dB: np.ndarray
+    dC: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -177,11 +192,28 @@ def plant_set(
     if decoupling is not None and decoupling.orthogonal:
         plants = [in_channels(plant, decoupling) for plant in plants]
         out = into = np.eye(len(out))
-    found, units = loop_plants(plants, sampling)
-    zeros = tuple(finite_zeros(loop) for loop in found)
-    directions = (np.ascontiguousarray(M, float) for M in (out, into))
-    return PlantSet(tuple(found), *units, *padded_modes(found), zeros, *padded_states(found),
-                    *directions)  # fmt: skip
+    if not plants:
+        raise PlantError("there is no plant in the set; give at least one")
+    omega_0, force = plants[0].omega_0, plants[0].force
+    period = None if sampling is None else sampling.period * omega_0
+    delay = 0.0 if sampling is None else sampling.delay * omega_0
+    units = (omega_0, force, period, delay)
+    found = tuple(_loop_plant(plant, f"plant {i}", *units) for i, plant in enumerate(plants, 1))
+    # Shorter plants have residues of zero, and stable states that do nothing.
+    P, (p, m) = len(found), found[0].D.shape
+    most, states = max(len(one.poles) for one in found), max(len(one.A) for one in found)
+    poles, residues = np.full((P, most), -1.0, complex), np.zeros((P, most, p, m), complex)
+    A = np.tile(-np.eye(states), (P, 1, 1))
+    B, C = np.zeros((P, states, m)), np.zeros((P, p, states))
+    for i, loop in enumerate(found):
+        n, k = len(loop.A), len(loop.poles)
+        A[i, :n, :n], B[i, :n], C[i, :, :n] = loop.A, loop.B, loop.C
+        poles[i, :k] = loop.poles
+        residues[i, :k] = np.einsum("pn,nm->npm", loop.reading, loop.drive)
+    zeros = tuple(StateSpace(one.A, one.B, one.C, one.D).zeros() for one in found)
+    D = np.array([one.D for one in found])
+    out, into = (np.ascontiguousarray(M, float) for M in (out, into))
+    return PlantSet(found, *units, poles, residues, zeros, A, B, C, D, out, into)
 
 
 def closed_loops(
@@ -216,3 +248,28 @@ def stable(poles: np.ndarray) -> np.ndarray:
     """Whether all poles (..., n) lie in the open left half plane."""
     with np.errstate(invalid="ignore"):
         return np.asarray((poles.real < 0.0).all(-1))
+
+
+def _loop_plant(
+    plant: ScaledPlant, name: str, omega_0: float, force: float, period: float | None, delay: float
+) -> LoopPlant:
+    ratio, drive = plant.omega_0 / omega_0, plant.omega_0 / omega_0 * force / plant.force
+    A, B, C = ratio * plant.A, drive * plant.B, plant.C
+    poles, V = np.linalg.eig(A)
+    if not (poles.real < 0.0).all():
+        words = "is not stable; a suspension has to hold its rigid-body modes"
+        raise PlantError(f"{name} {words}")
+    W = np.linalg.inv(V)
+    b, c = W @ B, C @ V
+    at = 1j * np.geomspace(1e-2, 1e2, 7)
+    direct = StateSpace(A, B, C, np.zeros((len(C), B.shape[1]))).at(at)
+    modal = np.einsum("pn,kn,nm->kpm", c, 1.0 / (at[:, None] - poles), b)
+    if np.abs(modal - direct).max() > FAITHFUL * np.abs(direct).max():
+        words = "has poles that coincide and are coupled; move a damping ratio away from 1"
+        raise PlantError(f"{name} {words}")
+    state = (A, B, C, np.zeros((len(C), B.shape[1])))
+    if period is not None:
+        w = in_w(sampled(StateSpace(*state), period, delay))
+        state = (w.A, w.B, w.C, w.D)
+    dA = W @ (ratio * plant.dA) @ V
+    return LoopPlant(*state, poles, b, c, dA, W @ (drive * plant.dB), plant.dC @ V)

@@ -8,15 +8,29 @@ makes IPOPT shorten its step. Hessians are not available: use a quasi-Newton met
 (`ipopt.hessian_approximation = "limited-memory"`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
-from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, true_design
+from ccd_casadi.inner_problem.problem import CoDesignProblem, frequencies, scaled_plant, true_design
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.casadi_callback import VectorCallback
+from ccd_casadi.synthesis.closed_loop import handed_out
 from ccd_casadi.synthesis.derivatives import Sensitivities
+from ccd_casadi.synthesis.synthesis import Design, synthesise
+
+
+def final_design(
+    problem: CoDesignProblem, theta: Sequence[float], point: tuple[float, float]
+) -> Design:
+    """The synthesis at (ω_S, ω_T) in rad/s that is handed out, in SI and certified again there."""
+    plant, inner = scaled_plant(problem, theta), problem.inner
+    made = synthesise(
+        plant, problem.weights.at(*point), omega_low=inner.omega_low,
+        gamma_backoff=inner.gamma_backoff, compliance=True,
+    )  # fmt: skip
+    return handed_out(plant, made, inner.omega_low)
 
 
 class TrueQuantities(VectorCallback):

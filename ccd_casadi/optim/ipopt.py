@@ -26,12 +26,10 @@ OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class EndPoint:
-    """Where IPOPT ended: z (d,) in the unit box, f, multipliers of g and of z, its verdict."""
+    """Where IPOPT ended: z (d,) in the unit box, f, its verdict."""
 
     z: Array
     objective: float
-    multipliers_g: Array
-    multipliers_z: Array
     status: str
     converged: bool
 
@@ -58,8 +56,6 @@ def end_points(
             EndPoint(
                 z=np.clip(np.array(result["x"]).ravel(), 0.0, 1.0),
                 objective=float(result["f"]),
-                multipliers_g=np.array(result["lam_g"]).ravel(),
-                multipliers_z=np.array(result["lam_x"]).ravel(),
                 status=str(stats["return_status"]),
                 converged=bool(stats["success"]),
             )

@@ -286,14 +286,16 @@ def _corrected(
 
 
 def _within_reach(value: Array, slopes: Array, radius: float) -> np.ndarray:
-    """The rows that a step can lift over their bounds, those that the shortest one does first.
+    """The rows that a step can lift over their bounds: those that are over them first, by how far,
+    then those that the shortest step lifts.
 
     Where there are too many these count: a steep row far below its bound must not push out one
-    that holds the step.
+    that holds the step, nor a flat one just over its bound the one that is furthest over.
     """
     away = -value / np.maximum(np.abs(slopes).sum(1), 1e-300)
-    order = np.argsort(away, kind="stable")[:ROWS]
-    return order[away[order] < radius]
+    over = value > 0.0
+    order = np.lexsort((np.where(over, -value, away), ~over))[:ROWS]
+    return np.asarray(order[away[order] < radius])
 
 
 def _gain(here: Iterate[Data], there: Iterate[Data] | None, penalty: float) -> float:

@@ -47,6 +47,16 @@ class Mechanics:
     derivatives: tuple[Array, Array, Array, Array, Array]
 
 
+def to_first_order(system: Mechanics, step: Array) -> Mechanics:
+    """The matrices at θ + step by their derivatives at θ, which are kept."""
+    own = (system.M, system.D, system.K, system.B, system.C)
+    M, D, K, B, C = (
+        matrix + np.tensordot(step, slopes, 1)
+        for matrix, slopes in zip(own, system.derivatives, strict=True)
+    )
+    return Mechanics(M, D, K, B, C, system.damping_ratio, system.derivatives)
+
+
 @dataclass(frozen=True)
 class Plant:
     """A model bound to its parameters: what the design loop asks of any plant.

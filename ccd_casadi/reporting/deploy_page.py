@@ -9,7 +9,7 @@ from ccd_casadi.deployment.on_hardware import OnHardware
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.reduction import Reduction
 from ccd_casadi.deployment.sections import Root, sections_of
-from ccd_casadi.deployment.words import against, reason_words, short_status
+from ccd_casadi.deployment.words import figure_rows, order_words, reason_words, short_status
 from ccd_casadi.drawing.content import (
     Block,
     Curve,
@@ -23,8 +23,7 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, ORANGE
-from ccd_casadi.inner_problem.kinds import kind_of
+from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
@@ -35,7 +34,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_pan
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.sections_page import sections_table
-from ccd_casadi.reporting.tables import over_frequency, over_time, spread
+from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown
 
@@ -70,32 +69,10 @@ def deploy_page(
 
 
 def _conclusion(run: FinishedRun, found: Deployment) -> str:
-    K, full = found.sampled, run.figures
-    orders = " + ".join(str(item.chosen.order) for item in found.orders)
-    before = " + ".join(str(item.rows[0].order) for item in found.orders)
     if not found.stable:
         return f"At {number(found.rate_hz)} Hz the sampled loop is {found.shortfalls[0]}."
     rest = "" if found.statics is None else f" {found.statics.words}"
-    how = "as designed" if kind_of(run.problem).as_designed else (
-        f"instead of {before} (synthesised: {len(run.controller.A)})"
-    )  # fmt: skip
-    return (
-        f"{orders} states {how}{_added(found, ', and ')}, at "
-        f"{number(found.rate_hz)} Hz with a delay of "
-        f"{number(1e6 * found.delay, 4)} µs: bandwidth {number(K.bandwidth / HZ)} Hz "
-        f"({_percent(K.bandwidth, full.bandwidth)}), peak of S {number(K.sensitivity_peak)} "
-        f"({against(K.sensitivity_peak, run.problem.inner.S_max)}).{rest}"
-    )
-
-
-def _added(found: Deployment, before: str) -> str:
-    """The states beside those of the reduced controller."""
-    more = len(found.realisation.system.A) - found.order
-    return f"{before}{more} of the lead" if more and found.conversion.lead else ""
-
-
-def _percent(value: float, reference: float) -> str:
-    return f"{round(100.0 * (value / reference - 1.0), 2) + 0.0:+.2f} %"
+    return f"The controller has {order_words(run, found)}.{rest}"
 
 
 def _loops(run: FinishedRun, found: Deployment) -> tuple[tuple[Loop, str, str, str], ...]:
@@ -120,13 +97,6 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
         curves.append(Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
         drawn.append(Curve(hz, largest(K), "", colour, line))
     gains, controllers = ([curve.y for curve in each] for each in (curves, drawn))
-    if found.measured is not None:
-        first = int(np.searchsorted(found.measured.omega / HZ, low))
-        at = [first + i for i in spread(found.measured.omega[first:])]
-        curves.append(
-            Curve(found.measured.omega[at] / HZ, found.measured.gain[at],
-                  "measured in the simulation", BLACK, "", ".")
-        )  # fmt: skip
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")
@@ -147,32 +117,8 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
 
 
 def _facts(run: FinishedRun, found: Deployment) -> tuple[Block, ...]:
-    full, small, sampled = run.figures, found.reduced_figures, found.sampled
-    S_max = run.problem.inner.S_max
-
-    def remark(peak: float, bandwidth: float) -> str:
-        return (
-            f"peak {number(peak, 6)} ({against(peak, S_max)}); bandwidth "
-            f"{_percent(bandwidth, full.bandwidth)}"
-        )
-
-    def hz(omega: float) -> str:
-        return f"{number(omega / HZ, 6)} Hz"
-
-    rows = [
-        ("Full", hz(full.bandwidth), remark(full.sensitivity_peak, full.bandwidth)),
-        ("Reduced", hz(small.bandwidth), remark(small.sensitivity_peak, small.bandwidth)),
-        ("Sampled, exact", hz(sampled.bandwidth),
-         remark(sampled.sensitivity_peak, sampled.bandwidth)),
-    ]  # fmt: skip
-    if found.measured is not None:
-        m = found.measured
-        rows.append((
-            "Sampled, simulated", hz(m.bandwidth),
-            f"{remark(m.sensitivity_peak, m.bandwidth)}; multisine, {m.periods} periods, changing "
-            f"by {number(m.leftover, 2)} from one to the next",
-        ))  # fmt: skip
-    rows.append(("Slowest sampled mode", number(sampled.spectral_radius, 8), "must be below 1"))
+    rows = figure_rows(run, found)
+    rows.append(("Slowest sampled mode", number(found.sampled.spectral_radius, 8), "below 1"))
     unstable = [r for r in np.linalg.eigvals(found.reduced.A) if r.real > 0.0]
     words = (
         "The controller is unstable by itself (its loop is not): close the loop at rest, and open "
@@ -281,9 +227,7 @@ def _code(found: Deployment) -> tuple[Block, ...]:
     sizes = f"{K.blocks.count(1)} of one state, {K.blocks.count(2)} of two"
     larger = len(K.blocks) - K.blocks.count(1) - K.blocks.count(2)
     words = (
-        f"controller.c holds {len(K.system.A)} states"
-        f"{_added(found, f' ({found.order} of the controller, ')}"
-        f"{')' if _added(found, '') else ''}, A block-diagonal ({sizes}"
+        f"controller.c holds {len(K.system.A)} states, A block-diagonal ({sizes}"
         f"{f', {larger} larger' if larger else ''}). Call controller_step every "
         f"{number(1e6 * K.system.period, 6)} µs. controller_test.c compares it with forces that "
         "the Python difference equation gave; controller.st is the same as structured text "

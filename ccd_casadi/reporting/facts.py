@@ -9,8 +9,6 @@ from ccd_casadi.drawing.content import Fact, Table
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.units import HZ, number, shown_unit
 
-_FREQUENCIES = ("bandwidth", "surrogate_bandwidth", "omega_S", "omega_T", "sensitivity_peak")
-
 
 def conclusion(result: Mapping[str, Any]) -> str:
     """One sentence with the key numbers."""
@@ -94,29 +92,18 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
     ranges = [
         f"range {number(a / HZ)} to {number(b / HZ)} Hz" for a, b in (inner.omega_S, inner.omega_T)
     ]
-    hz = {key: f"{number(r[key + '_hz'], 6)} Hz" for key in _FREQUENCIES}
+    hz = {key: f"{number(r[key + '_hz'], 6)} Hz" for key in ("omega_S", "omega_T")}
     poles = f"largest real part {number(certificate['max_real_pole'], 4)} 1/s"
     norm = f"norm {number(certificate['norm'], 6)} ≤ {number(certificate['norm_bound'], 6)}"
     bound = f"least possible norm; lower bound γ_jω = {number(r['gamma_lower_bound'], 6)}"
     backoff = f"synthesised at {inner.gamma_backoff:g} γ_opt, recomputed from the closed loop"
-    J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) ω_b, ω_b in rad/s"
-    peak = f"at {hz['sensitivity_peak']}; S_max = {inner.S_max:g}"
-    error = f"relative error {number(r['verification_error'], 2)}"
     return [
-        ("Objective J", number(r["objective"], 7), J),
-        ("Hardware cost f(θ)", cost_words(r, 6), ""),
-        ("Bandwidth ω_b", hz["bandwidth"], "true: first -3 dB crossing of σ_max(S)"),
-        ("Predicted bandwidth", hz["surrogate_bandwidth"], error),
+        *value_facts(problem, r, "true: first -3 dB crossing of σ_max(S)"),
         ("Weight on S: ω_S", hz["omega_S"], ranges[0]),
         ("Weight on T: ω_T", hz["omega_T"], ranges[1]),
         ("γ_opt", number(r["gamma_opt"], 6), bound),
         ("γ achieved", number(r["gamma"], 6), backoff),
-        ("Peak of sensitivity ‖S‖∞", number(r["sensitivity_peak"], 6), peak),
-        (
-            f"|S| at {number(inner.omega_low / HZ)} Hz",
-            number(r["sensitivity_low"], 4),
-            f"S_low = {inner.S_low:g}",
-        ),
+        *sensitivity_facts(problem, r),
         *_compliance(problem, r),
         *loop_facts(r),
         (
@@ -132,6 +119,33 @@ def design_facts(problem: CoDesignProblem, result: Mapping[str, Any]) -> list[Fa
     ]
 
 
+def value_facts(problem: CoDesignProblem, r: Mapping[str, Any], of: str) -> list[Fact]:
+    """J and what it counts, true and predicted; `of`: which bandwidth it is, in words."""
+    figure, guess = problem.figure, r["surrogate_bandwidth_hz"]
+    value = ("Predicted bandwidth", f"{number(guess, 6)} Hz")
+    v, words, entry = figure.symbol, figure.words, figure.entry
+    if f"{entry}_of_set" in r and not figure.larger_is_better:
+        e, guess = (figure.shown(r[key], 6) for key in (f"{entry}_of_set", f"surrogate_{entry}"))
+        value = (f"{words[0].upper()}{words[1:]} {v}", f"{e} over the set (predicted {guess})")
+    J = f"{problem.w1:g} f(θ) + ({problem.w2:g}) {v}, {v} in {figure.si_unit}"
+    return [
+        ("Objective J", number(r["objective"], 7), J),
+        ("Hardware cost f(θ)", cost_words(r, 6), ""),
+        ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", of),
+        (*value, f"relative error {number(r['verification_error'], 2)}"),
+    ]
+
+
+def sensitivity_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
+    """The peak of S and |S| at ω_low, with their bounds."""
+    inner, at = problem.inner, f"at {number(r['sensitivity_peak_hz'], 6)} Hz"
+    low = f"|S| at {number(inner.omega_low / HZ)} Hz"
+    return [
+        ("Peak of S", number(r["sensitivity_peak"], 6), f"{at}; S_max = {inner.S_max:g}"),
+        (low, number(r["sensitivity_low"], 4), f"S_low = {inner.S_low:g}"),
+    ]
+
+
 def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
     """Margins and steps, and what is narrow at the bandwidth; nothing of a run of before."""
     if "phase_margin_deg" not in r:
@@ -144,8 +158,8 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
     rest = f"delay {shown('delay_margin_us', ' µs')}, modulus {shown('modulus_margin', '')}"
     found = [
         ("Margins", f"phase {shown('phase_margin_deg', '°')}",
-         f"{gain}, {rest}; the least of the plants that the controller is made for"),
-        ("Crossover |L| = 1", shown("crossover_hz", " Hz"),
+         f"{gain}, {rest}; the least of its plants"),
+        ("Crossover", shown("crossover_hz", " Hz"),
          "of the model" if "step_overshoot" in r else "of the first plant"),
     ]  # fmt: skip
     if "step_overshoot" in r:
@@ -153,10 +167,17 @@ def loop_facts(r: Mapping[str, Any]) -> list[Fact]:
             f"within 2 % after {number(r['settling_ms'], 3)} ms"
         )  # fmt: skip
         found += [
-            ("Step of the reference", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
-            ("Step of force, 1 N", shown("force_step_max", " µm", 1e6), "largest displacement"),
+            ("Step response", f"overshoot {shown('step_overshoot', ' %', 100.0)}", settled),
+            ("Force step", shown("force_step_max", " µm", 1e6), "largest displacement by 1 N"),
         ]
     return found + [("Warning", "narrow", words) for words in r.get("loop_warnings", ())]
+
+
+def loop_lines(r: Mapping[str, Any]) -> list[str]:
+    """The same for the terminal."""
+    plain = str.maketrans({"µ": "u", "°": " deg", "×": "x", "÷": "/"})
+    lines = (f"{name.lower():14s}{value}, {remark}" for name, value, remark in loop_facts(r))
+    return [line.translate(plain) for line in lines]
 
 
 def _compliance(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:

@@ -7,21 +7,17 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.codesign.formulation import Iterate
-from ccd_casadi.drawing.content import Curve, Figure, Level, Lines, Panel, Table
-from ccd_casadi.drawing.svg import BLUE, ORANGE
+from ccd_casadi.drawing.content import Table, Words
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ, counted, number
 
-LEAST_SPAN = 1e-3  # half the least height of a panel, relative
-LEAST_ERROR = 1e-16  # an exact agreement still has a place on the logarithmic axis
 
-
-def history_figure(
+def history_blocks(
     iterates: Sequence[Iterate], problem: CoDesignProblem, result: Mapping[str, Any],
     theta: tuple[float, ...], tolerance: float, *, lifted: bool,
-) -> Figure:  # fmt: skip
-    """ω_b and J predicted and true over the rounds, the verified design last, and the error."""
+) -> tuple[Words, Table]:  # fmt: skip
+    """ω_b and J predicted and true, round by round, the verified design last, and the error."""
     predicted_hz, true_hz = result["surrogate_bandwidth_hz"], result["bandwidth_hz"]
     J = result["objective"]
     last = replace(
@@ -45,46 +41,10 @@ def history_figure(
         for name, item, row in zip(names, (*iterates, last), known, strict=True)
     ))  # fmt: skip
     *_, objective, error = known.T
-    caption = _caption(error, int(np.isnan(objective).sum()), tolerance, lifted)
-    return Figure(_lines(known, tolerance), caption, (table,))
+    return Words(_words(error, int(np.isnan(objective).sum()), tolerance, lifted)), table
 
 
-def _lines(known: Array, tolerance: float) -> Lines:
-    """`known` (rounds, 5): ω_b and J, predicted and true, and the error."""
-    promised, true, promised_J, true_J, error = known.T
-    rounds = np.arange(1.0, len(known) + 1.0)
-    span = (0.7, len(rounds) + 0.3)
-
-    def pair(predicted: Array, truth: Array, label: str) -> Panel:
-        curves = (
-            Curve(rounds, predicted, "predicted", ORANGE, "--", "s"),
-            Curve(rounds, truth, "true", BLUE, "-", "o"),
-        )
-        return Panel("round (–)", label, curves, x_range=span, whole_x=True,
-                     y_range=_value_range(np.array([predicted, truth])))  # fmt: skip
-
-    shown = np.maximum(error, LEAST_ERROR)
-    ends = [*shown[np.isfinite(shown)], tolerance]
-    below = Panel(
-        "round (the last: the verified design) (–)", "relative error (–)",
-        (Curve(rounds, shown, "", BLUE, "-", "o"),), log_y=True, x_range=span, whole_x=True,
-        levels=(Level(tolerance, f"tolerance {tolerance:g}"),),
-        y_range=(min(ends) / 4.0, max(ends) * 8.0),
-    )  # fmt: skip
-    top = (pair(promised, true, "bandwidth ω_b (Hz)"), pair(promised_J, true_J, "objective J (–)"))
-    title = "Predicted and true bandwidth and objective, and their difference, by round"
-    return Lines((top, (below,)), title, (2.6, 2.2))
-
-
-def _value_range(values: Array) -> tuple[float, float]:
-    """Around all values; agreement to rounding must not fill the panel."""
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    half = max(0.56 * (high - low), LEAST_SPAN * max(abs(low), abs(high)))
-    middle = 0.5 * (low + high)
-    return middle - half, middle + half
-
-
-def _caption(error: Array, lost: int, tolerance: float, lifted: bool) -> str:
+def _words(error: Array, lost: int, tolerance: float, lifted: bool) -> str:
     """How the error fell, in numbers."""
     known = error[np.isfinite(error)]
     met = np.flatnonzero(error[:-1] <= tolerance)

@@ -33,13 +33,14 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted, number, shown
+from ccd_casadi.support.units import counted, number, shown, shown_unit
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
 DRAWN = 1200  # points of a curve of a move on the machine
+FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 
 
@@ -192,40 +193,71 @@ def _words(name: str, made: Sequence[Move]) -> str:
 
 def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    drawn = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
-    error, force = [], []
-    for way, colour in zip(found.ways, COLOURS, strict=False):
-        if way not in drawn:
-            continue
-        m = way.move
-        at = np.unique(np.linspace(0, len(m.time) - 1, DRAWN).astype(int))
-        ms = 1e3 * m.time[at]
-        error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
-        force.append(Curve(ms, m.force[at, 0], "", colour))
-    end = Level(1e3 * found.profile.duration, "setpoint ends", vertical=True)
-    lines = Lines(
-        ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
-         (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),
-        "A move of output 1, sampled with hold and delay", (3.0, 2.2),
-    )  # fmt: skip
-    head = ("way", "settled after, ms", "peak error, µm", "last error, µm", "peak force, N",
-            "at the limit")  # fmt: skip
+    ways = {way.words: way.move for way in found.ways}
+    words = "The plant has its soft suspension, hold and delay are exact."
+    return ways_figure(ways, words), Words(_limit_words(found))
+
+
+def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
+    """Error and first force of one move made in several ways, and a table; `words` end the
+    caption."""
+    moves = list(ways.values())
+    first, until = moves[0], max(map(shown_until, moves))
+    end = Level(1e3 * first.duration, "setpoint ends", vertical=True)
+    kept = [(name, m, colour) for (name, m), colour in zip(ways.items(), COLOURS, strict=False)
+            if m.peak_error < 1e3 * first.peak_error]  # fmt: skip
+    top = max(m.peak_error for _, m, _ in kept)
+    panels, force = [], []
+    for large in (True, False):  # those that are flat beside the large ones by themselves
+        same = [way for way in kept if (FLAT * way[1].peak_error > top) == large]
+        unit, scale = shown_unit("m", max((m.peak_error for _, m, _ in same), default=0.0))
+        curves = []
+        for name, m, colour in same:
+            at = np.flatnonzero(m.time <= until)
+            at = at[np.unique(np.linspace(0, at.size - 1, DRAWN).astype(int))]
+            ms = 1e3 * m.time[at]
+            curves.append(Curve(ms, scale * _error(m)[at], name, colour))
+            force.append(Curve(ms, m.force[at, 0], "", colour))
+        if curves:
+            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), levels=(end,),
+                                legend="upper right"))  # fmt: skip
+    heights = (*[2.6] * len(panels), 2.2)
+    panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
+    lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    head = ("way", "settled after, ms", "RMS error, µm", "peak error, µm", "last error, µm",
+            "peak force, N", "at the limit")  # fmt: skip
     rows = tuple(
-        (way.words, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.peak_error,
-         1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
-        for way in found.ways for m in (way.move,)
+        (name, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.rms_error,
+         1e6 * m.peak_error, 1e6 * m.last_error(WATCHED), float(m.peak_force.max()),
+         f"{100.0 * m.saturated:.3g} %")
+        for name, m in ways.items()
     )  # fmt: skip
-    ends = []
-    for way in found.ways:
-        m = way.move
-        when = "does not settle" if np.isinf(m.settled) else f"settles {shown(m.settled, 's')} in"
-        ends.append(f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}")
+    ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{'; '.join(ends)}. Settled is what stays within {shown(found.window, 'm')}; the last "
-        "error of the table is the largest over the last quarter, the amplitude of a limit cycle "
-        "if there is one. The plant has its soft suspension, hold and delay are exact."
+        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error of the "
+        f"table is the largest over the last quarter. {words}"
     )
-    return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
+    return Figure(lines, caption, (Table(head, rows),))
+
+
+def _error(m: Move) -> Array:
+    """Of the moving output."""
+    return m.error if m.error.ndim == 1 else np.asarray(m.error[:, 0])
+
+
+def shown_until(found: Move) -> float:
+    """Where the figure of a move ends, s."""
+    return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+
+
+def way_words(name: str, m: Move, until: float = np.inf) -> str:
+    """How a move ends, and what is left of its error after `until` s, where a figure ends."""
+    when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
+    words = f"{name}: {when}, error of at most {shown(m.peak_error, 'm')}"
+    after = np.abs(_error(m)[m.time > until])
+    if not after.size or m.settled <= until:
+        return words
+    return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
 
 
 def _limit_words(found: OnHardware) -> str:

@@ -16,7 +16,9 @@ from ccd_casadi.reporting.facts import (
     conclusion,
     cost_words,
     loop_facts,
+    sensitivity_facts,
     theta_words,
+    value_facts,
 )
 from ccd_casadi.support.units import HZ, counted, number, shown
 from ccd_casadi.synthesis.closed_loop import measure
@@ -117,7 +119,7 @@ def limits_blocks(problem: CoDesignProblem, result: Mapping[str, Any]) -> tuple[
 
 
 def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]:
-    certificate, robust, inner = r["certificate"], r["robust"], problem.inner
+    certificate, robust = r["certificate"], r["robust"]
     optima = ", ".join(f"{number(o['bandwidth_hz'], 5)} Hz ({o['searches']}×)" for o in r["race"])
     sampling = sections_of_problem(problem).sampling
     runs = "continuous" if sampling is None else (
@@ -126,27 +128,14 @@ def sections_facts(problem: CoDesignProblem, r: Mapping[str, Any]) -> list[Fact]
     on = counted(certificate["plants"], "plant")
     worst = f"largest of {counted(robust['plants'], 'plant')} of the box"
     kkt = r["kkt"]["stationarity"]
-    predicted = ("Predicted bandwidth", f"{number(r['surrogate_bandwidth_hz'], 6)} Hz")
-    if problem.figure is not BANDWIDTH:
-        v = problem.figure
-        value, guess = (v.shown(r[key], 6) for key in (f"{v.entry}_of_set", f"surrogate_{v.entry}"))
-        predicted = (f"{v.words[0].upper()}{v.words[1:]} {v.symbol}",
-                     f"{value} over the set (predicted {guess})")  # fmt: skip
     return [
-        ("Objective J", number(r["objective"], 7),
-         f"{problem.w1:g} f(θ) + ({problem.w2:g}) {problem.figure.symbol}"),
-        ("Hardware cost f(θ)", cost_words(r, 6), ""),
-        ("Bandwidth ω_b", f"{number(r['bandwidth_hz'], 6)} Hz", "on every plant of the set"),
-        (*predicted, f"relative error {number(r['verification_error'], 2)}"),
+        *value_facts(problem, r, "on every plant of the set"),
         ("Loop", runs, ""),
-        ("Peak of sensitivity", number(r["sensitivity_peak"], 6),
-         f"at {number(r['sensitivity_peak_hz'], 4)} Hz; S_max = {inner.S_max:g}"),
+        *sensitivity_facts(problem, r),
         *((f"Channel {own['name']}", f"peak of S {number(own['sensitivity_peak'], 6)}, "
            f"{number(own['bandwidth_hz'], 6)} Hz", _asked_of(own))
           for own in r.get("channel_bounds", ())),
         ("Peak of S over the box", number(robust["worst_sensitivity_peak"], 6), worst),
-        (f"|S| at {number(inner.omega_low / HZ)} Hz", number(r["sensitivity_low"], 4),
-         f"S_low = {inner.S_low:g}"),
         ("Compliance |GS|", f"{number(1e6 * r['compliance_max'], 4)} µm/N",
          r["compliance_words"]),
         *loop_facts(r),

@@ -39,7 +39,7 @@ from ccd_casadi.reporting.bode import bode
 from ccd_casadi.reporting.budget_section import budget_section
 from ccd_casadi.reporting.facts import binding, design_facts, theta_table, theta_words
 from ccd_casadi.reporting.glance import glance
-from ccd_casadi.reporting.history import history_figure
+from ccd_casadi.reporting.history import history_blocks
 from ccd_casadi.reporting.index import publish
 from ccd_casadi.reporting.inner_sweep import sweep_data, sweep_figure
 from ccd_casadi.reporting.landscape import (
@@ -217,7 +217,7 @@ def _theta(
         radius = iterates[-1].radius if iterates else 1.0
         land = landscape_data(problem, processes, truths, radius, verified.theta)
         path = np.array([item.theta for item in iterates]).reshape(-1, 2)
-        paths = (ThetaPath("iterates", path, numbered=True),) if len(path) else ()
+        paths = (ThetaPath("iterates", path),) if len(path) else ()
         land = replace(land, paths=paths, optimum=(verified.theta[0], verified.theta[1]))
         error_hz = 0.0 if missed is None else abs(missed.error)
         lifted = len(processes) > 1
@@ -272,11 +272,11 @@ def _history(
                if result["formulation"] == "direct" else (result["reason"] or "none was run."))
         )  # fmt: skip
         return Section(heading, (Words(words),))
-    figure = history_figure(
+    blocks = history_blocks(
         outcome.iterates, problem, result, verified.theta, case.outer.tolerance,
         lifted=len(outcome.surrogates) > 1,
     )  # fmt: skip
-    return Section(heading, (figure,))
+    return Section(heading, blocks)
 
 
 def _trust(solution: "Solution") -> list[Section]:

@@ -55,15 +55,6 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def short(result: Mapping[str, Any]) -> str:
-    """What did not pass, in a few words: `survives warned`."""
-    return ", ".join(
-        f"{line.name} {line.state}"
-        for line in lines_of(result)
-        if line.state in (State.FAILED, State.WARNED)
-    )
-
-
 def head_of(
     title: str, good: bool, status: str, reason: str, meta: str, lead: str,
     result: Mapping[str, Any], decision: str = "",
@@ -126,5 +117,5 @@ def head_words(result: Mapping[str, Any]) -> str:
     if failed:
         return f"by the solve, and since then failed: {', '.join(failed)}"
     if not warned:
-        return "no line of the verdict is against it"
+        return "all checks passed"
     return f"with warnings: {', '.join(warned)}"

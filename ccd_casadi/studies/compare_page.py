@@ -20,8 +20,8 @@ from ccd_casadi.reporting.true_samples import read_truths
 from ccd_casadi.reporting.verdict import lines_of, worst
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Comparison, Method
-from ccd_casadi.studies.methods import LABELS, cost_figure, descent_figure, theta_paths
-from ccd_casadi.studies.steepest_descent import Descent
+from ccd_casadi.studies.conclusions import LABELS
+from ccd_casadi.studies.methods import cost_figure, descent_figure, theta_paths
 from ccd_casadi.support.units import number
 
 
@@ -49,8 +49,9 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
             },
         )
     sections += [
-        Section(f"History: {name}", (descent_figure(problem, descent),))
-        for name, descent in histories(comparison).items()
+        Section(f"History: {LABELS[item.name]}", (descent_figure(problem, item.descent),))
+        for item in comparison.methods
+        if item.descent is not None and item.descent.iterates
     ]
     sections += [
         Section(f"Verdict: {LABELS[method.name]}", (Verdict(lines_of(method.figures)),))
@@ -59,8 +60,10 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
     ]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     sections += [
-        Section("The case", (Source(case_to_toml(comparison.case)),)),
-        Section("Versions", (Words(f"{versions}; seed {answer['seed']}."),)),
+        Section(
+            "The case",
+            (Words(f"{versions}; seed {answer['seed']}."), Source(case_to_toml(comparison.case))),
+        )
     ]
     ours = [method.figures for method in comparison.methods if method.solution]
     verified = all(figures["status"] == "verified" for figures in ours)
@@ -73,25 +76,6 @@ def comparison_page(folder: Path, comparison: Comparison, answer: dict[str, Any]
         " ".join(found["sentences"][1:2]), decision=found["sentences"][0],
     )  # fmt: skip
     return Page(head, tuple(sections), index="")
-
-
-def histories(comparison: Comparison) -> dict[str, Descent]:
-    """The best descent of each gradient, and the best one from the case's own start."""
-    found: dict[str, Descent] = {}
-    for method in comparison.methods:
-        if method.descent is None or not method.descent.iterates:
-            continue
-        label = LABELS[method.name]
-        own = [
-            d for d in comparison.descents
-            if d.gradient is method.descent.gradient and d.iterates
-            and d.start == comparison.problem.start
-        ]  # fmt: skip
-        if own:
-            found[f"{label}, from the case's start"] = min(own, key=lambda d: d.objective)
-        if method.descent.start != comparison.problem.start:
-            found[f"{label}, best of all runs"] = method.descent
-    return found
 
 
 def _methods(problem: CoDesignProblem, answer: dict[str, Any]) -> tuple[Table, Words]:
@@ -159,14 +143,9 @@ def _paths(folder: Path, comparison: Comparison, best: str | None) -> Figure:
     if best is not None:
         theta = comparison.method(best).figures["theta"]
         optimum = (theta[problem.names[0]], theta[problem.names[1]])
-    ends = []
-    for method in walked:
-        if len(method.path):
-            last = ", ".join(number(v, 5) for v in method.path[-1])
-            ends.append(f"{LABELS[method.name]} ends at ({last})")
     caption = (
         "Colours: ω_b*(θ) predicted by the lifted surrogates; dots: the nested formulation's true "
-        "samples in the same colours. " + "; ".join(ends) + "."
+        "samples in the same colours."
     )
     land = replace(land, paths=theta_paths(walked), optimum=optimum)
     return Figure(land, caption, tables_landscape(land))

@@ -7,6 +7,15 @@ from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.support.units import HZ
 
 EQUAL = 1e-6  # relative difference of J that counts as none
+LABELS = {
+    "nested": "nested",
+    "lifted": "lifted",
+    "direct": "direct",
+    "steepest_descent": "steepest descent, K fixed",
+    "steepest_descent_total": "steepest descent, total gradient",
+    "sequential": "sequential, next to the start",
+    "sequential_global": "sequential, globally cheapest",
+}
 
 
 def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -19,37 +28,21 @@ def conclusions(problem: CoDesignProblem, methods: dict[str, dict[str, Any]]) ->
     near = [n for n in ranked if solved[n]["objective"] <= best + EQUAL * abs(best)]
     cheapest = min(near, key=lambda name: solved[name]["syntheses_to_optimum"])
     answer: dict[str, Any] = {"best": cheapest, "best_objective": best, "equally_good": near}
-    sentences = [*worth_sentence(solved, cheapest)]
-    sentences.append(
+    sentences = [
         f"The best J is {best:.4f}, reached by {', '.join(near)}; the cheapest of these is "
         f"{cheapest} with {solved[cheapest]['syntheses_to_optimum']} true syntheses to the optimum"
         f"{_beside(solved[cheapest])}."
-    )
+    ]
     for name in ("steepest_descent", "steepest_descent_total"):
         if name in solved:
             found, words = _descent(problem, solved[name], solved[cheapest], name)
             answer[name] = found
             sentences += words
-    for name in ("sequential", "sequential_global"):
-        if name in solved:
-            found, sentence = _sequential(solved[name], solved[cheapest], name)
-            answer[name] = found
-            sentences.append(sentence)
+    against = [name for name in ranked if name in ("sequential", "sequential_global")]
+    for i, name in enumerate(against):  # the best of them stands first: it is the answer
+        answer[name], sentence = _sequential(solved[name], solved[cheapest], name)
+        sentences.insert(len(sentences) if i else 0, sentence)
     return answer | {"sentences": sentences}
-
-
-def worth_sentence(solved: dict[str, dict[str, Any]], best: str) -> list[str]:
-    """The answer: what co-design changes against the best sequential design."""
-    known = [solved[n] for n in ("sequential", "sequential_global") if n in solved]
-    if not known:
-        return []
-    other, mine = min(known, key=lambda f: f["objective"]), solved[best]
-    if mine["objective"] >= other["objective"] - EQUAL * abs(other["objective"]):
-        return ["Co-design gains nothing here: the sequential design is as good."]
-    cost = 100.0 * (mine["hardware_cost"] / other["hardware_cost"] - 1.0)
-    speed = 100.0 * (mine["bandwidth_hz"] / other["bandwidth_hz"] - 1.0)
-    words = "Co-design improves on the best sequential design"
-    return [f"{words}: hardware cost {cost:+.1f} %, bandwidth {speed:+.1f} %."]
 
 
 def _beside(figures: dict[str, Any]) -> str:
@@ -81,15 +74,10 @@ def _descent(
         "stop": run["stop"],
         "last_gradient": run["history"][-1]["gradient"],
     }
-    label = (
-        "Steepest descent with K held fixed"
-        if name == "steepest_descent"
-        else ("Steepest descent with the total gradient")
-    )
     words = [
-        f"{label} (best of {run['runs']} runs) ends at J = {run['objective']:.4f}, "
-        f"{gap:.3g} above, after {run['syntheses']} syntheses, {ratio:.0f} times as many; "
-        f"all its runs together took {run['syntheses_of_all_runs']}."
+        f"{LABELS[name].capitalize()} (best of {run['runs']} runs) ends at J = "
+        f"{run['objective']:.4f}, {gap:.3g} above, after {run['syntheses']} syntheses, "
+        f"{ratio:.0f} times as many; all its runs together took {run['syntheses_of_all_runs']}."
     ]
     if gap > EQUAL * abs(best["objective"]) and not baseline.swept:
         words.append(
@@ -110,13 +98,8 @@ def _sequential(run: dict[str, Any], best: dict[str, Any], name: str) -> tuple[d
     cost = 100.0 * (best["hardware_cost"] / run["hardware_cost"] - 1.0)
     speed = 100.0 * (best["bandwidth_hz"] / run["bandwidth_hz"] - 1.0)
     found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
-    label = (
-        "the sequential design next to the case's start"
-        if name == "sequential"
-        else ("the globally cheapest sequential hardware")
-    )
     words = (
-        f"Against {label} (hardware cost {run['hardware_cost']:.5g}, "
+        f"Against the design {LABELS[name]} (hardware cost {run['hardware_cost']:.5g}, "
         f"{run['bandwidth_hz']:.2f} Hz) co-design changes the hardware cost by {cost:+.1f} % and "
         f"the bandwidth by {speed:+.1f} %."
     )

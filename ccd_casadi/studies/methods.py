@@ -10,18 +10,9 @@ from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.reporting.facts import cost_axis, theta_axes
 from ccd_casadi.studies.baselines import baseline_of
 from ccd_casadi.studies.comparison import Method
+from ccd_casadi.studies.conclusions import LABELS
 from ccd_casadi.studies.steepest_descent import Descent
 from ccd_casadi.support.units import HZ
-
-LABELS = {
-    "nested": "nested",
-    "lifted": "lifted",
-    "direct": "direct",
-    "steepest_descent": "steepest descent, K fixed",
-    "steepest_descent_total": "steepest descent, total gradient",
-    "sequential": "sequential, next to the start",
-    "sequential_global": "sequential, globally cheapest",
-}
 
 
 def best_so_far(method: Method) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,22 +46,12 @@ def cost_figure(methods: Sequence[Method]) -> Figure:
         (Panel(x, "its bandwidth (Hz)", tuple(curves_b), log_x=True),),
     )
     lines = Lines(rows, "Objective and bandwidth against the number of true syntheses", (3.6, 2.6))
-    return Figure(lines, _cost_caption(methods), (_cost_table(methods),))
+    return Figure(lines, "Further left is cheaper, lower is better.", (_cost_table(methods),))
 
 
 def _steps(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A staircase: a value holds until the next one is found."""
     return np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]
-
-
-def _cost_caption(methods: Sequence[Method]) -> str:
-    """Where each method's line ends."""
-    ends = []
-    for method in methods:
-        spent, objective, _ = best_so_far(method)
-        if spent.size:
-            ends.append(f"{LABELS[method.name]} {objective[-1]:.3f} after {spent[-1]:.0f}")
-    return "Further left is cheaper, lower is better. The lines end at: " + "; ".join(ends) + "."
 
 
 def _cost_table(methods: Sequence[Method]) -> Table:

@@ -107,12 +107,10 @@ def _from_start(task: tuple[CoDesignProblem, float, tuple[float, ...]]) -> Hardw
         g=ca.vertcat(-callback(theta), lam / ca.DM(constraint_sizes(problem))),
         lower=lower,
         upper=upper,
-        variables=problem.names,
-        constraints=("first_resonance", *plant.constraint_names),
         exact_hessian=False,
     )
     try:
-        point = solve_program(program, np.array([start]), warm=True).best.x
+        point = solve_program(program, np.array([start])).best.x
     except OuterFailure:
         point = np.array(start)
     omega = callback.at(point)[0]

@@ -18,7 +18,7 @@ from ccd_casadi.kernels.gradients import (
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import Shown
-from ccd_casadi.synthesis.compliance import compliance_over_family
+from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.synthesis import DesignFigures, Outcome, figures_from_row, over_family
 from ccd_casadi.synthesis.weights import Weights
 

@@ -18,7 +18,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.notebook import Shown
-from ccd_casadi.synthesis.compliance import compliance_over_family
+from ccd_casadi.synthesis.statics import compliance_over_family
 from ccd_casadi.synthesis.weights import Weights
 
 UNBOUNDED = 1e9  # a level that no weighted loop reaches: measure without judging the norm

@@ -174,6 +174,9 @@ class Told:
             tuple(map(float, theta)), -value, gradient, np.nan, np.nan, (), "", 0.0, 1
         )
 
+    def all_at(self, thetas: np.ndarray) -> list[BandwidthSample]:
+        return [self.at(theta) for theta in thetas]
+
 
 def certificate(told: Told, z: np.ndarray, slopes: np.ndarray) -> KktCertificate:
     """At z, where all pieces with these slopes are equal."""
@@ -270,6 +273,7 @@ class TwoControllers(SimpleNamespace):
         return TwoControllers(problem=other, slope=self.slope, cliff=self.cliff)
 
     def bandwidths(self, theta: np.ndarray, label: str) -> list[BandwidthSample]:
+        theta = np.ravel(theta)
         z = (float(theta[0]) - 55.0) / 15.0
         better = z < self.cliff or (1.0,) in self.problem.controller.anchors
         value = 300.0 + self.slope * z - 40.0 * z**2 if better else 250.0 + 10.0 * z

@@ -15,8 +15,8 @@ from busy import HANGS
 import ccd_casadi as ccd
 from ccd_casadi.codesign.outer_mixed import MixedOuter
 from ccd_casadi.codesign.retraining import Job, Outcome
+from ccd_casadi.codesign.stored import FOLDER, LOCK, load_version, only_job, version_names
 from ccd_casadi.codesign.verified import Solution
-from ccd_casadi.codesign.versions import FOLDER, LOCK, load_version, only_job, version_names
 from ccd_casadi.inner_problem.problem import CoDesignProblem
 from ccd_casadi.sampling.sampler import Sampler
 from ccd_casadi.sampling.store import SampleStore
@@ -172,7 +172,7 @@ def test_a_surrogate_is_kept_with_its_error(retrained: tuple[Path, Outcome, Solu
 HOLDS = """
 import sys
 from pathlib import Path
-from ccd_casadi.codesign.versions import only_job
+from ccd_casadi.codesign.stored import only_job
 with only_job(Path(sys.argv[1]), 7):
     print("held", flush=True)
     sys.stdin.read()

@@ -204,7 +204,7 @@ def test_the_summary_says_what_matters(
     assert "m1 = 55 kg, m2 = 55 kg" in found["theta"]
     assert "-439.46" in found["objective"]
     assert "72.04" in found["bandwidth"]
-    assert "passed" in found["certificate"]
+    assert "passed" in found["certified"]
     assert "S_max" in found["binding"]
     assert str(folder) in found["run"]
 

@@ -191,3 +191,16 @@ def test_rows_far_below_their_bounds_push_out_none_that_holds_the_step() -> None
     found = best_step(model, start, model.Q, 4.0, 100.0)
     assert found is not None
     assert found.change[0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_rows_that_are_just_passed_push_out_none_that_is_passed_by_far() -> None:
+    """From x = 0 with 1 - x <= 0 unmet, beside more flat rows that are hardly passed."""
+    flat = 2 * ROWS
+    A = np.concatenate([np.full((flat, 1), 1e-3), -np.ones((1, 1))])
+    b = np.append(np.full(flat, 1e-2), 1.0)
+    model = Smooth(np.eye(1), np.full(1, -1.0), b, A, np.zeros((flat + 1, 1, 1)))
+    start = model.at(np.zeros(1))
+    assert start is not None
+    found = best_step(model, start, model.Q, 4.0, 100.0)
+    assert found is not None
+    assert found.change[0] > 0.9

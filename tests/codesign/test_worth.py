@@ -31,7 +31,7 @@ def test_the_gain_is_that_of_a_full_solve(tmp_path, capsys) -> None:
         ("bandwidth_hz", "bandwidth_percent"),
     ):
         assert found[percent] == pytest.approx(100.0 * (solved[key] / old[key] - 1.0), abs=3.0)
-    assert found["left_open_percent"] > 0.0
+    assert found["uncertainty_percent"] > 0.0
 
 
 def test_a_case_that_it_cannot_count_is_one_line(tmp_path, capsys) -> None:

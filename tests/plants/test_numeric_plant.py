@@ -119,8 +119,8 @@ def test_ipopt_finds_the_least_cost_of_a_numeric_plant_as_of_the_exact_one() -> 
         theta = ca.MX.sym("theta", 2)
         f, lam = plant.hardware(theta)
         program = NonlinearProgram(
-            x=theta, f=f, g=lam, lower=np.array(LOWER), upper=np.array(UPPER), variables=NAMES,
-            constraints=("stiff",), exact_hessian=plant.exact_hessian,
+            x=theta, f=f, g=lam, lower=np.array(LOWER), upper=np.array(UPPER),
+            exact_hessian=plant.exact_hessian,
         )  # fmt: skip
         ends.append(solve_program(program, np.array([[2.0, 3e-3]])).best)
     np.testing.assert_allclose(ends[1].x, ends[0].x, rtol=1e-6)

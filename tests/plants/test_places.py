@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import few
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.linalg import eigh
 
@@ -17,8 +17,9 @@ from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.toml_writer import case_to_toml
 from ccd_casadi.inner_problem.problem import plant_of, scaled_plant
 from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant
-from ccd_casadi.plants.places import Between, Places, placed
-from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, hardware_cost, mechanics
+from ccd_casadi.plants.nodes import Between
+from ccd_casadi.plants.places import Places, placed
+from ccd_casadi.plants.plant import Plant, build_plant, constraint_values, mechanics
 from ccd_casadi.support.errors import PlantError
 
 CASE = Path(__file__).parents[2] / "examples" / "placed_motors" / "case.toml"
@@ -61,51 +62,52 @@ def test_the_spline_holds_nodes_and_second_degrees(at: tuple[float, float], seed
     def field(p: np.ndarray) -> float:
         return float(a + b @ p + p @ c @ p)
 
-    weights, slopes = between.weights(point)
+    weights, slopes = between.at(point)
     values = np.array([field(np.array(node)) for node in GRID])
     assert weights @ values == pytest.approx(field(point), abs=1e-9)
     assert slopes @ values == pytest.approx(b + (c + c.T) @ point, abs=1e-8)
     node = int(rng.integers(len(GRID)))
-    assert between.weights(np.array(GRID[node]))[0] == pytest.approx(
-        np.eye(len(GRID))[node], abs=1e-9
-    )
+    assert between.at(np.array(GRID[node]))[0] == pytest.approx(np.eye(len(GRID))[node], abs=1e-9)
     assert between.left_out(values[None]) < 1e-8
 
 
 @few(20)
-@given(inside, st.floats(0.05, 0.95), st.integers(0, 99))
-def test_slopes_are_those_of_differences(at: tuple[float, float], z: float, seed: int) -> None:
-    """To 1e-6, of M, K, B and C to stiffness, positions and presence."""
-    places = Places(GRID, POINTS, POINTS[:2], 0.4, 0.1, present=("z", 1.0, 0.5))
-    plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
-    theta = np.array([at[0], 1.3, z, at[1]])
+@given(inside, st.integers(0, 99))
+def test_slopes_are_those_of_differences(at: tuple[float, float], seed: int) -> None:
+    """To 1e-6, of M, K, B and C to stiffness and positions."""
+    places = Places(GRID, POINTS, POINTS[:2], 0.4, 0.1)
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
     compare_slopes(plant, theta)
 
 
 def compare_slopes(plant: Plant, theta: np.ndarray) -> None:
-    system = mechanics(plant, theta)
+    """To 1e-6, besides what differences of two steps differ by: where modes come close, much."""
+    system, steps = mechanics(plant, theta), (5e-4, 1e-3)
     for i, unit in enumerate(np.eye(len(theta))):
-        near = [mechanics(plant, theta + 1e-3 * k * unit) for k in (-2, -1, 1, 2)]
+        near = [[mechanics(plant, theta + k * h * unit) for k in (-2, -1, 1, 2)] for h in steps]
         for part, exact in zip("MDKBC", system.derivatives, strict=True):
-            found = np.tensordot([1, -8, 8, -1], [getattr(one, part) for one in near], 1) / 12e-3
+            found, coarse = (
+                np.tensordot([1, -8, 8, -1], [getattr(one, part) for one in four], 1) / (12 * h)
+                for four, h in zip(near, steps, strict=True)
+            )
             size = max(1.0, float(np.abs(exact[i]).max()))
-            assert np.abs(found - exact[i]).max() < 1e-6 * size, (part, i)
+            rough = np.abs(found - coarse).max()
+            assume(rough < 1e-3 * size)
+            assert np.abs(found - exact[i]).max() < 1e-6 * size + rough, (part, i)
 
 
 SIX = (("x", "y"), ("-x", 0.13), (0.05, "-y"), (-0.2, -0.1), (0.22, 0.1), (-0.1, 0.02))
 
 
 @few(20)
-@given(inside, st.floats(0.3, 0.95), st.integers(0, 99))
-def test_axes_leave_quiet_modes_alone_and_have_slopes(
-    at: tuple[float, float], z: float, seed: int
-) -> None:
+@given(inside, st.integers(0, 99))
+def test_axes_leave_quiet_modes_alone_and_have_slopes(at: tuple[float, float], seed: int) -> None:
     """Forces of length 1 along 1, x, y and a damped mode, none on the quiet one."""
-    present = ("z", *(1.0,) * 5)
-    places = Places(GRID, SIX, SIX, 0.4, 0.1, present=present, axes=True, quiet=(1,), damped=(3,))
-    free = placed(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "z", "y"))
-    plant = placed(beam_of_nodes(seed), places, ("x", "k", "z", "y"))
-    theta = np.array([at[0], 1.3, z, at[1]])
+    places = Places(GRID, SIX, SIX, 0.4, 0.1, axes=True, quiet=(1,), damped=(3,))
+    free = placed(beam_of_nodes(seed), replace(places, axes=False), ("x", "k", "y"))
+    plant = placed(beam_of_nodes(seed), places, ("x", "k", "y"))
+    theta = np.array([at[0], 1.3, at[1]])
     system, apart = mechanics(plant, theta), mechanics(free, theta)
     assert (plant.inputs, plant.outputs, system.B.shape) == (4, 4, (7, 4))
     lam, modes = eigh(system.K, system.M)
@@ -130,24 +132,6 @@ def test_a_mass_moves_centre_and_inertia_as_by_parallel_axes(
     assert mechanics(plant, (1.0, *at)).C.shape == (1, 7)  # without sensors the plant's own
 
 
-def test_presence_zero_is_one_actuator_less_and_one_is_all_of_it() -> None:
-    plant = placed(
-        beam_of_nodes(1),
-        Places(GRID, POINTS, (), 0.4, present=("z", 1.0, 1.0), at_most=2, actuator_cost=5.0),
-        ("k", "z", "x", "y"),
-    )
-    fewer = placed(beam_of_nodes(1), Places(GRID, POINTS[1:], (), 0.4), ("k", "x", "y"))
-    every = placed(beam_of_nodes(1), Places(GRID, POINTS, (), 0.4), ("k", "x", "y"))
-    gone, there = mechanics(plant, (1.0, 0.0, 0.1, 0.05)), mechanics(plant, (1.0, 1.0, 0.1, 0.05))
-    assert not gone.B[:, 0].any()
-    assert gone.B[:, 1:] == pytest.approx(mechanics(fewer, (1.0, 0.1, 0.05)).B)
-    assert pytest.approx(mechanics(fewer, (1.0, 0.1, 0.05)).M) == gone.M
-    assert pytest.approx(mechanics(every, (1.0, 0.1, 0.05)).B) == there.B
-    assert hardware_cost(plant, (1.0, 1.0, 0.1, 0.05)) == pytest.approx(1.0 + 5.0 * 3)
-    assert plant.constraint_names == ("at most 2 actuators",)
-    assert constraint_values(plant, (1.0, 1.0, 0.1, 0.05)) == pytest.approx([0.5])
-
-
 def test_distances_are_kept_where_theta_moves_them() -> None:
     corners = (("r", "r"), ("-r", "-r"), (0.0, 0.1), (0.1, 0.0))
     plant = placed(beam_of_nodes(0), Places(GRID, corners, corners, apart=0.2), ("k", "r"))
@@ -161,7 +145,6 @@ def test_what_does_not_match_is_one_sentence() -> None:
     for places, words in (
         (Places(GRID[:-1], POINTS), "19, the plant has 20 inputs"),
         (Places(GRID, (("x",),)), "has 1 coordinates, a node 2"),
-        (Places(GRID, POINTS, present=(1.0,)), "1 numbers for 3 actuators"),
         (Places(line, POINTS), "on one line"),
     ):
         with pytest.raises(PlantError, match=words):

@@ -16,8 +16,7 @@ from ccd_casadi.inner_problem.kinds import bandwidth_gradient
 from ccd_casadi.inner_problem.problem import scaled_plant, true_design, true_inner
 from ccd_casadi.inner_problem.true_function import TrueQuantities
 from ccd_casadi.sampling.store import SampleStore
-from ccd_casadi.synthesis.compliance import compliance_of
-from ccd_casadi.synthesis.statics import compliance_words
+from ccd_casadi.synthesis.statics import compliance_of, compliance_words
 from ccd_casadi.synthesis.synthesis import synthesise
 
 THETA = (60.0, 62.0)
@@ -110,7 +109,7 @@ def test_it_is_a_constraint_of_the_outer_problem() -> None:
     program = lifted_program(case, quantities, exact_hessian=False)
     x = np.array([*THETA, *np.log(POINT)])
     design = quantities.at(x)
-    assert program.constraints[:3] == ("S_max", "S_low", "compliance_max")
+    assert program.g.shape[0] == 3
     _, g, jacobian, names = lagrangian_parts(case, x, design)
     row = names.index("compliance_max")
     assert g[row] == pytest.approx(np.log(design.figures.compliance / 2.7e-5))

@@ -34,7 +34,16 @@
     return b > a ? y + (z - y) * (x - a) / (b - a) : z;
   }
 
-  const short = (v) => Number(v.toPrecision(4)).toString();
+  const raised = (n) => [...String(n)].map((c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]).join("");
+  const short = (v) => {  // three digits, which is what is read off
+    const n = v ? Math.floor(Math.log10(Math.abs(v))) : 0;
+    const digits = (x) => Number(x.toPrecision(3)).toString();
+    return n > 4 || n < -3 ? `${digits(v / 10 ** n)}·10${raised(n)}` : digits(v);
+  };
+  const unit = (label) => {
+    const found = label.match(/\(([^)]*)\)$/);
+    return found && found[1] !== "–" ? ` ${found[1]}` : "";
+  };
 
   function show(kind, v) {
     for (const p of panels) {
@@ -47,9 +56,9 @@
         p.line.setAttribute(key, to);
       const found = p.curves.map(([name, points]) => {
         const y = at(points, x);
-        return y === null ? "" : `${name || p.d.y.replace(/ \(.*/, "")} ${short(p.value(Y, y))}`;
+        return y === null ? "" : `${name || p.d.y.replace(/ \(.*/, "")} ${short(p.value(Y, y))}${unit(p.d.y)}`;
       });
-      p.words.textContent = [short(v), ...found.filter(Boolean)].join(" · ");
+      p.words.textContent = [short(v) + unit(kind), ...found.filter(Boolean)].join(" · ");
       const left = x < (X[3] + X[4]) / 2;
       p.words.setAttribute("x", left ? X[4] : X[3] + 2);
       p.words.setAttribute("text-anchor", left ? "end" : "start");

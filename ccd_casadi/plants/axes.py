@@ -1,0 +1,66 @@
+"""Inputs and outputs together along chosen motions, whatever their number; quiet modes left alone.
+
+    [φ_quiet, 1, x, y, φ_damped] at the points = Q R
+
+All act by the columns of Q after the quiet ones. They have length 1 and are normal to each other
+and to what quiet modes show at the points.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import eigh
+
+from ccd_casadi.plants.modal import RIGID_RATIO
+from ccd_casadi.support.arrays import Array
+from ccd_casadi.support.errors import PlantError
+
+
+def in_axes(
+    W: Array, dW: Array, motions: Array, dmotions: Array, quiet: int
+) -> tuple[Array, Array]:
+    """Weights of nodes (N, m) combined to those of axes, and the slopes.
+
+    `motions` (N, c) are those of the nodes, of which the first `quiet` are left alone. Raises
+    PlantError where the points do not tell them apart.
+    """
+    A, dA = W.T @ motions, dW.transpose(0, 2, 1) @ motions + W.T @ dmotions
+    Q, dQ = (part[..., quiet:] for part in _orthonormal(A, dA))
+    return W @ Q, dW @ Q + W @ dQ
+
+
+def followed_modes(
+    M: Array, K: Array, dM: Array, dK: Array, numbers: Sequence[int]
+) -> tuple[Array, Array]:
+    """Shapes of flexible modes, from 1 by frequency, as columns, and their slopes.
+
+    φ' = Σ_j φ_j φ_jᵀ(K' - λ M')φ/(λ - λ_j) - φ φᵀM'φ/2,   j over all other modes
+    """
+    lam, modes = eigh(K, M)
+    flexible = np.flatnonzero(lam > RIGID_RATIO**2 * lam[-1])
+    if max(numbers, default=0) > len(flexible):
+        raise PlantError(f"places: mode {max(numbers)} is beyond the {len(flexible)} flexible ones")
+    at = flexible[[number - 1 for number in numbers]]
+    modes[:, at] *= np.where(modes[np.abs(modes[:, at]).argmax(axis=0), at] < 0.0, -1.0, 1.0)
+    slopes = np.zeros((len(dM), len(M), len(at)))
+    for k, i in enumerate(at):
+        gap = lam[i] - lam
+        gap[i] = np.inf
+        moved = (dK - lam[i] * dM) @ modes[:, i]
+        own = 0.5 * (dM @ modes[:, i]) @ modes[:, i]
+        slopes[:, :, k] = (moved @ modes / gap) @ modes.T - own[:, None] * modes[:, i]
+    return modes[:, at], slopes
+
+
+def _orthonormal(A: Array, dA: Array) -> tuple[Array, Array]:
+    """Q of A = Q R with a positive diagonal of R, and its slopes: dQ = Q Ω + (I - Q Qᵀ) dA R⁻¹."""
+    Q, R = np.linalg.qr(A)
+    if np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
+        words = "places: forces or sensors are on one line, or a quiet or damped mode is not seen"
+        raise PlantError(f"{words} where they are; move one, or drop the mode")
+    sign = np.where(np.diag(R) < 0.0, -1.0, 1.0)
+    Q, R = Q * sign, sign[:, None] * R
+    step = dA @ np.linalg.inv(R)
+    turn = Q.T @ step
+    lower = np.tril(turn, -1)
+    return Q, Q @ (lower - lower.transpose(0, 2, 1)) + step - Q @ turn

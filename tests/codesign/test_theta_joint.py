@@ -1,0 +1,108 @@
+"""θ and controller in one search, on plants to first order in θ."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccd_casadi.cases.case import load_case
+from ccd_casadi.cases.case_problem import problem_of
+from ccd_casadi.codesign.theta_joint import JointModel, proposed, together
+from ccd_casadi.fixed_structure.figures import BESIDE, assess, hessians
+from ccd_casadi.fixed_structure.loop_problem import Constraints
+from ccd_casadi.inner_problem.objective import objective_of
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_plant_set import uncertain_plant, with_sections
+from ccd_casadi.inner_problem.sections_search import with_range
+from ccd_casadi.plants.plant import mechanics, to_first_order
+from ccd_casadi.sampling.sampler import Sampler
+from ccd_casadi.sampling.samples import BandwidthSample
+from ccd_casadi.sampling.store import SampleStore
+from ccd_casadi.support.process_pool import Workers
+
+ROOT = Path(__file__).parents[2]
+STORED = json.loads((ROOT / "benchmarks" / "shipped_designs.json").read_text())["two_mass_built"]
+
+
+def built(start: tuple[float, float] = (55.0, 55.0)) -> CoDesignProblem:
+    """runs/two_mass_built.toml from the controller that is stored, on the corners of its set."""
+    problem = with_range(problem_of(load_case(ROOT / "runs" / "two_mass_built.toml")))
+    corners = uncertain_plant(problem, problem.start).corners()
+    members = tuple((option, tuple(map(float, point))) for option, point in corners)
+    kappa = tuple(STORED["sections"]["kappa"])
+    return replace(with_sections(problem, anchors=(kappa,), members=members), start=start)
+
+
+def test_what_the_first_order_leaves_out_is_of_second_order() -> None:
+    plant = plant_of(built())
+    here, step = mechanics(plant, (60.0, 58.0)), np.array([0.4, -0.7])
+
+    def missed(share: float) -> float:
+        there = mechanics(plant, tuple(np.array([60.0, 58.0]) + share * step))
+        told = to_first_order(here, share * step)
+        parts = [(there.K, told.K), (there.M, told.M), (there.B, told.B), (there.C, told.C)]
+        return max(float(np.abs(a - b).max() / np.abs(a).max()) for a, b in parts)
+
+    assert missed(1.0) < 1e-3
+    assert missed(0.5) <= 0.3 * missed(1.0) + 1e-12
+
+
+@pytest.mark.parametrize("direction", range(3))
+def test_second_derivatives_over_theta_and_controller_are_those_of_the_peaks(
+    direction: int,
+) -> None:
+    """Of peaks that move, along random directions, the frequency of each found anew."""
+    omega, stored = 2.0 * np.pi * STORED["bandwidth_hz"], tuple(STORED["sections"]["kappa"])
+    nan = float("nan")
+    sample = BandwidthSample((60.0, 60.0), omega, (nan, nan), nan, nan, (), "", 0.0, 1, stored)
+    model = JointModel(built(), sample, 0.1)
+    family, start = model.loops, model.start
+    z, kappa, tau = model.parts(start)
+    loops = family(z)
+    here = assess(loops, kappa, tau).peaks
+    assert here is not None
+    others = [family(z + BESIDE * unit) for unit in np.eye(2)]
+    chosen = here.only(here.value > -0.3)
+    H = hessians(loops, kappa, tau, chosen, others)
+    assert np.abs(H).max(axis=(1, 2)).min() > 0.0
+    d = np.random.default_rng(direction).normal(size=len(kappa) + 3)
+    e = 1e-4
+
+    def there(sign: float) -> Constraints:
+        at = start + sign * e * d
+        found = assess(family(at[:2]), at[2:-1], float(at[-1])).peaks
+        assert found is not None
+        return found
+
+    def same(found: Constraints, j: int) -> float:
+        like = (found.curve == chosen.curve[j]) & (found.plant == chosen.plant[j])
+        away = np.abs(np.log(found.v[like] / chosen.v[j]))
+        assert away.min() < 1e-2
+        return float(found.value[like][np.argmin(away)])
+
+    up, down = there(1.0), there(-1.0)
+    for j in range(len(chosen.v)):
+        bent = (same(up, j) - 2.0 * chosen.value[j] + same(down, j)) / e**2
+        told = float(d @ H[j] @ d)
+        assert told == pytest.approx(bent, rel=0.03, abs=0.03 * float(np.abs(H[j]).max()))
+
+
+def test_it_ends_where_no_more_is_promised(tmp_path: Path) -> None:
+    """From inside the box: J falls, a mass ends at its bound, and the true value says so."""
+    problem = built(start=(58.0, 57.0))
+    with SampleStore(tmp_path / "samples.sqlite") as store:
+        sampler = Sampler(problem, store, Workers(1))
+        first = sampler.bandwidths(np.array(problem.start))[0]
+        promised = proposed(problem, first, 0.05)
+        assert promised.gain > 0.0
+        last, best = together(sampler, np.array(problem.start))
+        assert best.feasible
+        assert objective_of(problem, best) < objective_of(problem, first) - 0.5 * promised.gain
+        assert best.theta == pytest.approx((55.0, 55.0), abs=1e-6)
+        assert best.bandwidth >= 0.99 * 2.0 * np.pi * STORED["bandwidth_hz"]
+        spent = last.spent.total
+        again = together(Sampler(problem, store, Workers(1)), np.array(problem.start))[1]
+        assert (again.theta, again.kappa) == (best.theta, best.kappa)  # all from the store
+        assert last.spent.total == spent
