@@ -14,8 +14,7 @@ import numpy as np
 
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
-from ccd_casadi.inner_problem.motion import FREE, motion_of
-from ccd_casadi.inner_problem.move_figures import exact_times
+from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import plants_of, with_sections
 from ccd_casadi.inner_problem.sections_search import least_from, prepared

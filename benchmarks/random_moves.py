@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, MoveDemand, motion_at
+from ccd_casadi.analysis.motor import Motion, MotionAt, Motor, motion_at
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.move_time import MoveTime
@@ -81,12 +81,13 @@ def drawn(rng: np.random.Generator) -> MoveCase:
                         crossover / 3.0, 3.0 * crossover, 10.0 * crossover, 0.7])  # fmt: skip
         limits = Limits(rng.uniform(0.01, 0.2), rng.uniform(0.3, 2.0), np.inf,
                         10.0 ** rng.uniform(2.5, 4.0), 10.0 ** rng.uniform(5.0, 6.5))  # fmt: skip
-        demand = MoveDemand(limits, 10.0 ** rng.uniform(-7.5, -5.5), rng.uniform(0.0, 0.2))
+        window, dwell = 10.0 ** rng.uniform(-7.5, -5.5), rng.uniform(0.0, 0.2)
         motor = Motor(
             (rng.uniform(20.0, 80.0),), (4.0,), (9.0,), rms_power=rng.uniform(20.0, 200.0)
         )
-        case = MoveCase(plant, np.array([carriage, k]), hold, kappa, Motion(demand, motor),
-                        rng.uniform(-0.05, 0.05))  # fmt: skip
+        motion = Motion(limits, window, dwell, motor=motor)
+        theta, shift = np.array([carriage, k]), rng.uniform(-0.05, 0.05)
+        case = MoveCase(plant, theta, hold, kappa, motion, shift)
         if np.isfinite(case.goal().at(kappa)[0]):
             return case
 
@@ -134,15 +135,15 @@ def compared(case: MoveCase, which: int) -> tuple[float, float, float, float]:
     goal, motion = case.goal(), case.at(case.theta)
     loop = Loop(goal.plants[which].plant_si(), state_space(STRUCTURE, case.kappa), case.hold)
     profile = motion.cycle.profile
-    move = simulate(loop, profile, axis=0, forces=motion.forward, window=motion.demand.window,
+    move = simulate(loop, profile, axis=0, forces=motion.forward, window=motion.motion.window,
                     bandwidth_hz=10.0 / profile.duration)  # fmt: skip
     own = judged(case, which, len(move.time))
-    outside = np.flatnonzero(np.abs(own) > motion.demand.window)
+    outside = np.flatnonzero(np.abs(own) > motion.motion.window)
     settled = outside[-1] + 1 if outside.size else 0
     smooth = max(goal.times(case.kappa)[which], motion.cycle.profile.duration)
     return (
         move.settled / case.hold.period - settled,
-        float(np.abs(own - move.error).max() / motion.demand.window),
+        float(np.abs(own - move.error).max() / motion.motion.window),
         max(move.settled, motion.cycle.profile.duration),
         smooth,
     )

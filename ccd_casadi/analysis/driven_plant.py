@@ -3,14 +3,15 @@
 M(θ) + m Σ b bᵀ,   f(θ) + price · P(θ),   peak force, motor power <= what the motor allows
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from operator import attrgetter
 
 import casadi as ca
 import numpy as np
 
-from ccd_casadi.analysis.motor import Motion, MotionAt, motion_at
+from ccd_casadi.analysis.motor import UNLIMITED, Motion, MotionAt, motion_at
 from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.plants.fixed import through
 from ccd_casadi.plants.modal import Suspension, modal_plant
@@ -86,20 +87,22 @@ def _hardware(plant: Plant, own: Moved, names: Sequence[str]) -> tuple[ca.Functi
     """(f, λ) of the plant and its motors, and the names of the motors' constraints."""
     theta, motor = ca.MX.sym("theta", len(names)), own.motion.motor
     f, lam = plant.hardware(ca.vertcat(*(theta[i] for i in range(len(names)) if i != own.place)))
-    limits = {}
-    if motor is not None and own.motion.demand.required:
-        limits = {"peak force": "peak_share"} if np.isfinite(motor.peak_current[0]) else {}
+    limits: dict[str, str] = {}
+    if motor is not None and own.motion.required:
+        limits = {"peak force": "peak_share"} if motor.peak_current[0] < UNLIMITED else {}
         limits |= {} if motor.rms_power is None else {"motor power": "heat_share"}
     if motor is None or not (limits or motor.price):
         return ca.Function("hardware", [theta], [f, lam]), []
     figures, price = ("power", *limits.values()), motor.price
     at = lru_cache(maxsize=REMEMBERED)(own.at)
 
-    def kept(read: Callable[[MotionAt], list]) -> Callable[[Array], Array]:
-        return lambda x: np.array(read(at(tuple(x.tolist()))), float)
+    def values(x: Array) -> Array:
+        cycle = at(tuple(x.tolist())).cycle
+        return np.array([np.real(getattr(cycle, name)) for name in figures])
 
-    values = kept(lambda found: [np.real(getattr(found.cycle, name)) for name in figures])
-    slopes = kept(lambda found: [found.slopes(name) for name in figures])
+    def slopes(x: Array) -> Array:
+        return np.array([at(tuple(x.tolist())).slopes(attrgetter(name)) for name in figures])
+
     call = VectorCallback("motors", len(names), len(figures), values, slopes)
     own.keep = call  # CasADi does not
     found = call(theta)

@@ -1,4 +1,4 @@
-"""A linear motor and the move that it makes over and over: force, current and heat of a cycle.
+"""A linear motor and the move that it makes over and over: force and heat of a cycle.
 
     F = g(θ) r̈,   i = F/k_f,   P = R/k_f² · 1/T_c ∫ F² dt,   T_c = duration of the move + dwell
 
@@ -11,6 +11,7 @@ heat let it have. All of it is analytic in g and the mass: a step along the imag
 derivatives.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,7 +27,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError
 
 STEP = 1e-30  # along the imaginary axis
-FASTEST = 1e9  # m/s²: more than jerk and snap ever let a move reach
+UNLIMITED = 1e12  # A: a peak current that is none
 HELD = 1e-6  # of the moving force: a plant that holds its output by more has a spring
 
 
@@ -41,7 +42,7 @@ class Motor:
 
     force_constant: tuple[float, ...]
     resistance: tuple[float, ...]
-    peak_current: tuple[float, ...] = (np.inf,)
+    peak_current: tuple[float, ...] = (UNLIMITED,)
     moving_mass: tuple[float, ...] = (0.0,)
     rms_power: float | None = None
     size: str = ""
@@ -60,14 +61,15 @@ class Motor:
 
 
 @dataclass(frozen=True)
-class MoveDemand:
-    """The move in SI: `limits` (acceleration inf: what the motor allows), `window` in which it has
-    settled, `dwell` from its end to the next, the output `axis` that moves."""
+class Motion:
+    """A move in SI and its motor: `limits` (acceleration inf: what the motor allows), `window` in
+    which it has settled, `dwell` from its end to the next, the output `axis` that moves."""
 
     limits: Limits
     window: float
     dwell: float = 0.0
     axis: int = 0
+    motor: Motor | None = None
 
     @property
     def required(self) -> bool:
@@ -76,16 +78,8 @@ class MoveDemand:
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A move, and the motor that makes it, where one is known."""
-
-    demand: MoveDemand
-    motor: Motor | None = None
-
-
-@dataclass(frozen=True)
 class Cycle:
-    """The setpoint, the largest force and current of any motor, its RMS force, the heat of all.
+    """The setpoint, the largest and the RMS force of any motor, the heat of all.
 
     `peak_share` and `heat_share` of what the motor allows; `limits` of the move in words.
     """
@@ -93,7 +87,6 @@ class Cycle:
     profile: Setpoint
     peak_force: Any
     rms_force: Any
-    peak_current: Any = 0.0
     power: Any = 0.0
     peak_share: Any = 0.0
     heat_share: Any = 0.0
@@ -102,13 +95,11 @@ class Cycle:
 
 def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
     """The cycle with `forces` g (m,) per unit acceleration and a motor of this moving mass."""
-    allowed, motor = motion.demand.limits, motion.motor
+    allowed, motor = motion.limits, motion.motor
     acceleration, why = allowed.acceleration, "acceleration"
-    if motor is not None and not motion.demand.required:
+    if motor is not None and not motion.required:
         k, _, i_peak = motor.at(mass)
         acceleration, why = k * i_peak / _largest(forces), "peak force"
-        if not np.real(acceleration) < FASTEST:
-            acceleration = FASTEST
         if np.real(_cycle(motion, acceleration, forces, mass).heat_share) > 1.0:
             acceleration, why = _heated(motion, np.real(acceleration), forces, mass), "heat"
     found = _cycle(motion, acceleration, forces, mass)
@@ -123,20 +114,17 @@ def cycle_of(motion: Motion, forces: Array, mass: Any = 0.0) -> Cycle:
 
 def _cycle(motion: Motion, acceleration: Any, forces: Array, mass: Any) -> Cycle:
     """With an acceleration of so much at most."""
-    demand, motor = motion.demand, motion.motor
-    profile = setpoint(replace(demand.limits, acceleration=acceleration))
-    mean = profile.squared_acceleration / (profile.durations.sum() + demand.dwell)
+    profile, motor = setpoint(replace(motion.limits, acceleration=acceleration)), motion.motor
+    mean = profile.squared_acceleration / (profile.durations.sum() + motion.dwell)
     largest = _largest(forces)
     found = Cycle(profile, largest * profile.acceleration, largest * mean**0.5)
     if motor is None:
         return found
     k, R, i_peak = motor.at(mass)
     power = R / k**2 * (forces**2).sum() * mean
-    return replace(
-        found, peak_current=found.peak_force / k, power=power,
-        peak_share=found.peak_force / (k * i_peak),
-        heat_share=0.0 * power if motor.rms_power is None else power / motor.rms_power,
-    )  # fmt: skip
+    heat_share = power / (motor.rms_power or np.inf)
+    return replace(found, power=power, peak_share=found.peak_force / (k * i_peak),
+                   heat_share=heat_share)  # fmt: skip
 
 
 def _largest(forces: Array) -> Any:
@@ -163,26 +151,20 @@ def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
 
 @dataclass(frozen=True)
 class MotionAt:
-    """A move of a plant at one θ: its cycle, those with each parameter a `STEP` along the imaginary
-    axis away, and the feedforward F (5, m) per derivative of the setpoint with its slopes.
+    """A move of a plant at one θ, with a motor of this `mass`: its cycle, those with each parameter
+    a `STEP` along the imaginary axis away, and the feedforward F (5, m) per derivative of the
+    setpoint with its slopes."""
 
-    `mass`: of the motor.
-    """
-
-    demand: MoveDemand
+    motion: Motion
     mass: float
     cycle: Cycle
     stepped: tuple[Cycle, ...]
     forward: Array
     forward_slopes: Array
 
-    def slopes(self, *path: str) -> Array:
-        """Derivatives (n,) of a figure of the cycle; `profile`, `duration` is a path."""
-        found = []
-        for item in self.stepped:
-            value = getattr(item, path[0])
-            found.append(np.imag(value.durations.sum() if len(path) > 1 else value) / STEP)
-        return np.array(found, float)
+    def slopes(self, read: Callable[[Cycle], Any]) -> Array:
+        """Derivatives (n,) of a figure of the cycle."""
+        return np.array([np.imag(read(item)) / STEP for item in self.stepped], float)
 
 
 def motion_at(
@@ -192,19 +174,14 @@ def motion_at(
 
     Raises UserError where a spring holds the output.
     """
-    hold, axis = (
-        (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay),
-        (motion.demand.axis),
-    )
+    hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
-    ahead, slopes = F[:, :, axis], dF[:, :, :, axis]
-    limits, forces = motion.demand.limits, ahead[2]
-    held = np.abs(ahead[0]).max() * limits.stroke
-    found = cycle_of(motion, forces, mass)
-    if held > HELD * np.real(found.peak_force):
+    ahead, slopes = F[:, :, motion.axis], dF[:, :, :, motion.axis]
+    found = cycle_of(motion, ahead[2], mass)
+    if np.abs(ahead[0]).max() * motion.limits.stroke > HELD * found.peak_force:
         raise UserError("move: a spring holds the output that moves, and its force is not counted")
     stepped = tuple(
-        cycle_of(motion, forces + 1j * STEP * slope[2], mass + 1j * STEP * (i == place))
+        cycle_of(motion, ahead[2] + 1j * STEP * slope[2], mass + 1j * STEP * (i == place))
         for i, slope in enumerate(slopes)
     )
-    return MotionAt(motion.demand, mass, found, stepped, ahead, slopes)
+    return MotionAt(motion, mass, found, stepped, ahead, slopes)

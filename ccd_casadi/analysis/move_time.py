@@ -35,7 +35,7 @@ from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.recurrence import states
 
 SHARPNESS = 200.0  # of the largest of the plants: twelve that are equally late add 1.3 %
-ROUNDED = 0.005  # r: of the window, for each mode; a stage with 16 states loses 8 % of it
+ROUNDED, MOST_ROUNDED = 0.005, 0.1  # r: of the window, for each mode; and for all together
 NOTHING = 1e-30  # share of the envelope: a mode with less has died out
 NEWTON = 50  # steps at most
 
@@ -65,7 +65,7 @@ class _Crossing:
         k = float(np.max(-size / rate))
         for _ in range(NEWTON):
             alone = np.exp(size + k * rate)
-            rounded = np.hypot(alone, ROUNDED)
+            rounded = np.hypot(alone, min(ROUNDED, MOST_ROUNDED / len(alone)))
             self.shares = np.where(alone > NOTHING, alone**2 / rounded, 0.0)  # d ln of each
             step = float((1.0 - rounded.sum()) / (self.shares @ np.maximum(rate, -1e3)))
             if abs(step) < 1e-12 * len(r):
@@ -144,7 +144,7 @@ class MoveTime:
         T, tau = self.hold.period, self.hold.delay
         value, weights, by_duration = self._together(found)
         K = tustin(state_space(self.structure, kappa), T)
-        gradient = by_duration * motion.slopes("profile", "duration")
+        gradient = by_duration * motion.slopes(lambda cycle: cycle.profile.durations.sum())
         signals = [
             forward_force(item.profile, motion.forward + step * slope, self._time, T)
             for item, slope in zip(motion.stepped, motion.forward_slopes, strict=True)
@@ -185,7 +185,7 @@ class MoveTime:
         T, motion = self.hold.period, self.motion
         K = tustin(state_space(self.structure, kappa), T)
         r, f = forward_force(motion.cycle.profile, motion.forward, self._time, T)
-        return [_Crossing(G, K, r, f, motion.demand.window, T) for G in self._sampled]
+        return [_Crossing(G, K, r, f, motion.motion.window, T) for G in self._sampled]
 
     def _together(self, found: Sequence[_Crossing]) -> tuple[float, Array, float]:
         """v, ∂v/∂t_i and ∂v/∂t_0."""

@@ -11,7 +11,7 @@ from ccd_casadi.cases.motion import motion_problem
 from ccd_casadi.cases.places import places_of
 from ccd_casadi.cases.sections import Case, RobustSection
 from ccd_casadi.inner_problem.controller_problem import MixedSensitivityProblem, RobustSet
-from ccd_casadi.inner_problem.motion import require_motion
+from ccd_casadi.inner_problem.move_figures import require_motion
 from ccd_casadi.inner_problem.plant_source import PlantSource
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_plant_set import with_options
@@ -93,7 +93,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
         problem.controller.require_plants(plants)
         if problem.source.motion is not None:
-            require_motion(problem)
+            require_motion(problem, problem.source.motion)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:

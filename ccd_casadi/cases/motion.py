@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ccd_casadi.analysis.motor import Motion, Motor, MoveDemand
+from ccd_casadi.analysis.motor import UNLIMITED, Motion, Motor
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.cases.checks import POSITIVE, closest, count, key, number, one_or_more, text
 
@@ -128,26 +128,23 @@ def check_motion(
 
 
 def motion_problem(move: MoveSection, motor: MotorSection, rate_hz: float | None) -> Motion | None:
-    """The move and its motor; None for a case without a move."""
+    """The move and its motor in SI; None for a case without a move."""
     if move == MoveSection():
         return None
-    numbers = {item.name: getattr(move, item.name) for item in fields(move)}
+    given = {item.name: getattr(move, item.name) for item in fields(move)}
     shortest = SHORTEST if rate_hz is None else 1.0 / rate_hz
-    snap = numbers["jerk"] / shortest if move.snap is None else move.snap
-    acceleration = float("inf") if move.acceleration is None else move.acceleration
-    limits = Limits(numbers["distance"], numbers["velocity"], acceleration, numbers["jerk"], snap)
-    demand = MoveDemand(limits, numbers["settle_band"], move.dwell, move.axis - 1)
-    if motor == MotorSection():
-        return Motion(demand)
+    limits = Limits(
+        given["distance"], given["velocity"], move.acceleration or float("inf"), given["jerk"],
+        move.snap or given["jerk"] / shortest,
+    )  # fmt: skip
     k, current = _listed(motor.force_constant), _listed(motor.peak_current)
     if motor.peak_force is not None:
-        pairs = zip(_listed(motor.peak_force), k, strict=True)
-        current = tuple(force / constant for force, constant in pairs)
-    none = (float("inf"),) * len(k)
-    return Motion(demand, Motor(
-        k, _listed(motor.resistance), current or none, _listed(motor.moving_mass) or (0.0,),
-        motor.rms_power, motor.size, motor.price,
-    ))  # fmt: skip
+        current = tuple(F / each for F, each in zip(_listed(motor.peak_force), k, strict=True))
+    made = None if motor == MotorSection() else Motor(
+        k, _listed(motor.resistance), current or (UNLIMITED,) * len(k),
+        _listed(motor.moving_mass) or (0.0,), motor.rms_power, motor.size, motor.price,
+    )  # fmt: skip
+    return Motion(limits, given["settle_band"], move.dwell, move.axis - 1, made)
 
 
 def _listed(value: Numbers) -> tuple[float, ...]:

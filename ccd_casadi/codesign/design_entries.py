@@ -8,8 +8,7 @@ from ccd_casadi.analysis.loop_figures import loop_entry
 from ccd_casadi.budget import BudgetFigures, SourceFigures
 from ccd_casadi.inner_problem.design_loops import LoopBudget, loop_budget
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.motion import FREE, motion_of
-from ccd_casadi.inner_problem.move_figures import exact_times
+from ccd_casadi.inner_problem.move_figures import FREE, exact_times, motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, scaled_plant
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.support.units import HZ
@@ -90,19 +89,23 @@ def move_entry(
         return {}
     motion, free = motion_of(problem, theta), replace(problem, suspension=FREE)
     times = exact_times(problem, motion, kind_of(free).plants(theta), controller)
-    cycle, demand, motor = motion.cycle, motion.demand, problem.source.motion.motor
-    shown = ("peak_force", "rms_force", "peak_current", "power", "peak_share", "heat_share")
+    cycle, own = motion.cycle, problem.source.motion
+    shown: tuple[str, ...] = ("peak_force", "rms_force")
+    if own.motor is not None:
+        shown += ("power", "peak_share", "heat_share")
     return {"move": {
         "duration": cycle.profile.duration,
         "settled": float(times[0]),
         "settled_latest": float(times.max()),
         "plants": len(times),
-        "window": demand.window,
-        "dwell": demand.dwell,
+        "window": own.window,
+        "dwell": own.dwell,
         "reached": {key: float(getattr(cycle.profile, key))
                     for key in ("velocity", "acceleration", "jerk")},
         "limits": list(cycle.limits),
-        **{key: float(getattr(cycle, key)) for key in shown[: 2 if motor is None else None]},
+        **{key: float(getattr(cycle, key)) for key in shown},
+        **({} if own.motor is None else {
+            "peak_current": cycle.peak_force / own.motor.at(motion.mass)[0]}),
         "feedforward": motion.forward.tolist(),
     }}  # fmt: skip
 

@@ -24,7 +24,6 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.move_figures import ToldTime
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
@@ -55,7 +54,7 @@ class VerifiedSections(Verified):
     rounds: int
     costs: Costs
     gap: Gap | None
-    told: ToldTime | None = None
+    told: tuple[float, Yield | None] | None = None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.
@@ -120,8 +119,8 @@ class VerifiedSections(Verified):
                 "error_anchors": [list(kappa) for kappa in sections.error_anchors],
             }
         if self.told is not None:
-            drawn = self.told.drawn
-            found |= {"move_time": self.told.time,
+            time, drawn = self.told
+            found |= {"move_time": time,
                       "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
         if sections.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
@@ -147,7 +146,7 @@ class VerifiedSections(Verified):
         }
 
     def checks(self) -> dict[str, bool]:
-        drawn = None if self.told is None else self.told.drawn
+        drawn = None if self.told is None else self.told[1]
         later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
         return {"robust": self.kept, **later}
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.machinery import SourceFileLoader
@@ -100,18 +100,39 @@ def plant_from(
     return _own_plant(source.pinned(), names, lower, upper)
 
 
-@lru_cache(maxsize=8)
-def _plant_with_motion(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
+Names = tuple[str, ...]
+Ends = tuple[float, ...]
+
+
+def _below(
+    source: PlantSource, taken: Sequence[str], names: Names, lower: Ends, upper: Ends
 ) -> Plant:
+    """The plant of a source as a function of the parameters that are not `taken`."""
+    at = [i for i, name in enumerate(names) if name not in taken]
+    fixed = tuple(item for item in source.fixed if item[0] not in taken)
+    return plant_from(
+        replace(source, fixed=fixed), tuple(names[i] for i in at), tuple(lower[i] for i in at),
+        tuple(upper[i] for i in at),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _plant_with_motion(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
     motion = source.motion
     assert motion is not None
-    size = "" if motion.motor is None else motion.motor.size
-    kept = [i for i, name in enumerate(names) if name != size]
-    own = (tuple(values[i] for i in kept) for values in (names, lower, upper))
-    fixed = tuple(item for item in source.fixed if item[0] != size)
-    plant = plant_from(replace(source, motion=None, fixed=fixed), *own)  # type: ignore[arg-type]
+    size = () if motion.motor is None else (motion.motor.size,)
+    plant = _below(replace(source, motion=None), size, names, lower, upper)
     return with_motion(plant, motion, names, source.held)
+
+
+@lru_cache(maxsize=8)
+def _placed_plant(source: PlantSource, names: Names, lower: Ends, upper: Ends) -> Plant:
+    places = source.places
+    assert places is not None
+    held = {name: value for name, value in source.held.items() if name in places.names}
+    plant = _below(replace(source, places=None), places.names, names, lower, upper)
+    whole = placed(plant, places, (*names, *held))
+    return with_fixed(whole, held) if held else whole
 
 
 @lru_cache(maxsize=8)
@@ -120,23 +141,6 @@ def _shipped_plant(source: PlantSource, names: tuple[str, ...]) -> Plant:
     assert model is not None
     plant = model.build((*names, *held), **dict(source.options))
     return with_fixed(plant, held) if held else plant
-
-
-@lru_cache(maxsize=8)
-def _placed_plant(
-    source: PlantSource, names: tuple[str, ...], lower: tuple[float, ...], upper: tuple[float, ...]
-) -> Plant:
-    places = source.places
-    assert places is not None
-    at = [i for i, name in enumerate(names) if name not in places.names]
-    own = tuple(item for item in source.fixed if item[0] not in places.names)
-    held = {name: value for name, value in source.held.items() if name in places.names}
-    plant = plant_from(
-        replace(source, places=None, fixed=own), tuple(names[i] for i in at),
-        tuple(lower[i] for i in at), tuple(upper[i] for i in at),
-    )  # fmt: skip
-    whole = placed(plant, places, (*names, *held))
-    return with_fixed(whole, held) if held else whole
 
 
 @lru_cache(maxsize=8)

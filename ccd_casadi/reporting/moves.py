@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.analysis import loop_figures
-from ccd_casadi.analysis.motor import cycle_of
+from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
@@ -25,7 +25,7 @@ from ccd_casadi.drawing.content import (
 )
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
-from ccd_casadi.inner_problem.motion import motion_of
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -53,7 +53,7 @@ def move_parts(
     """
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
-        profile, axis, window = motion.cycle.profile, motion.demand.axis, motion.demand.window
+        profile, axis, window = motion.cycle.profile, motion.motion.axis, motion.motion.window
         name, other = "feedforward up to snap", "the move of [move]"
         ahead: Array | None = motion.forward
     else:
@@ -94,54 +94,45 @@ def cycle_section(
 ) -> list[Section]:
     """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
     that is allowed; nothing for a case without a motor."""
-    own = problem.source.motion
-    if own is None or own.motor is None or "move" not in result:
+    own, told = problem.source.motion, result.get("move")
+    if own is None or own.motor is None or not told:
         return []
-    found, motor, figures = motion_of(problem, theta), own.motor, result["move"]
-    profile, forces = found.cycle.profile, found.forward[2]
-    k, R, i_peak = motor.at(found.mass)
-    cycle = profile.duration + found.demand.dwell
-    time = np.linspace(0.0, cycle, POINTS)
+    found, motor = motion_of(problem, theta), own.motor
+    profile, forces, settled = found.cycle.profile, found.forward[2], told["settled_latest"]
+    k, R, _ = motor.at(found.mass)
+    time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
     force = np.outer(profile.at(time)[2], forces)
     heat = R / k**2 * (force**2).sum(axis=1)
     end = Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
-    panels = [Panel("time (ms)", "force of a motor (N)", (Curve(1e3 * time, force[:, 0]),),
-                    levels=(end,)),
-              Panel("time (ms)", "heat (W)", (Curve(1e3 * time, heat),),
-                    levels=(Level(figures["power"], "mean"),))]  # fmt: skip
-    table: tuple[Table, ...] = (over_time(("ms", "N", "W"), 1e3 * time, force[:, 0], heat),)
-    settling = figures["settled_latest"]
-    if not own.demand.required:
-        watts = figures["power"] * np.linspace(0.1, 2.0, 39)
+    mean = Level(told["power"], "mean")
+    ms = 1e3 * time
+    panels = [
+        Panel("time (ms)", "force of a motor (N)", (Curve(ms, force[:, 0]),), levels=(end,)),
+        Panel("time (ms)", "heat (W)", (Curve(ms, heat),), levels=(mean,)),
+    ]
+    if not own.required:
+        watts = told["power"] * np.linspace(0.1, 2.0, 39)
         limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
-        times = np.array([cycle_of(each, forces, found.mass).profile.duration for each in limited])
-        late = np.inf if settling is None else settling - profile.duration
-        panels.append(Panel(
-            "heat that is allowed (W)", "time of a move (ms)",
-            (Curve(watts, 1e3 * times, "setpoint"),
-             *((Curve(watts, 1e3 * (times + late), "with this settling", ORANGE),)
-               if np.isfinite(late) else ())), legend="upper right",
-        ))  # fmt: skip
-        table += (
-            Table(("W", "ms"), tuple(zip(watts.tolist(), (1e3 * times).tolist(), strict=True))),
-        )
-    share = [f"{number(100.0 * figures['peak_share'], 3)} % of the peak force"] * bool(
-        np.isfinite(i_peak)
-    )
-    if motor.rms_power is not None:
-        share.append(f"{number(100.0 * figures['heat_share'], 3)} % of the heat")
-    late_words = "does not settle on the whole set" if settling is None else (
-        f"has settled after {number(1e3 * settling, 4)} ms on every plant of the set, "
-        f"{number(1e3 * (settling - profile.duration), 3)} ms of it after its end"
+        times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
+        late = 0.0 if settled is None else settled - profile.duration
+        curve = Curve(watts, 1e3 * (np.array(times) + late))
+        panels.append(Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+    share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
+    if motor.peak_current[0] < UNLIMITED:
+        share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
+    settling = "it does not settle on the whole set" if settled is None else (
+        f"on every plant of the set it has settled after {number(1e3 * settled, 4)} ms"
     )  # fmt: skip
     words = (
-        f"A cycle of {number(1e3 * cycle, 4)} ms: {number(figures['peak_force'], 4)} N and "
-        f"{number(figures['peak_current'], 3)} A at most, {number(figures['rms_force'], 4)} N RMS, "
-        f"{number(figures['power'], 4)} W of heat: {' and '.join(share)} that the motor allows. "
-        f"The setpoint is limited by {', '.join(figures['limits'])}; the move {late_words}."
+        f"A cycle of {number(ms[-1], 4)} ms: {number(told['peak_force'], 4)} N and "
+        f"{number(told['peak_current'], 3)} A at most, {number(told['rms_force'], 4)} N RMS, "
+        f"{number(told['power'], 4)} W: {share} that the motor allows. The setpoint takes "
+        f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
+        f"{settling}."
     )
+    table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
     lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
-    return [Section("The motor", (Figure(lines, words, table),))]
+    return [Section("The motor", (Figure(lines, words, (table,)),))]
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:

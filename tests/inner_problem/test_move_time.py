@@ -10,14 +10,14 @@ from case_documents import TWO_MASS
 from differences import slopes
 
 from ccd_casadi.analysis.driven_plant import with_motion
-from ccd_casadi.analysis.motor import STEP, Motion, Motor, MoveDemand, cycle_of
+from ccd_casadi.analysis.motor import STEP, UNLIMITED, Motion, Motor, cycle_of
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.move_time import _Crossing
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.inner_problem.figure import MOVE_TIME
-from ccd_casadi.inner_problem.motion import motion_of
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import sections_value
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
@@ -39,8 +39,8 @@ BANG = Limits(0.1, 1e3, np.inf, 1e9, 1e16)  # no velocity, jerk or snap that a m
 MOTOR = Motor((30.0,), (4.0,), (10.0,), (2.0,), 50.0)
 
 
-def demand(limits: Limits = BANG, **more: float) -> MoveDemand:
-    return MoveDemand(limits, 1e-6, **more)
+def moving(motor: Motor, limits: Limits = BANG, dwell: float = 0.0) -> Motion:
+    return Motion(limits, 1e-6, dwell, motor=motor)
 
 
 # ---- analysis -----------------------------------------------------------------------------------
@@ -49,13 +49,13 @@ def demand(limits: Limits = BANG, **more: float) -> MoveDemand:
 def test_a_rigid_body_moves_bang_bang() -> None:
     """T = 2 √(d m/F) at peak force, and P = R (F/k)² without a dwell."""
     mass, F = 5.0, 300.0
-    found = cycle_of(Motion(demand(), replace(MOTOR, rms_power=None)), np.array([mass]))
+    found = cycle_of(moving(replace(MOTOR, rms_power=None)), np.array([mass]))
     assert found.profile.duration == pytest.approx(2.0 * np.sqrt(0.1 * mass / F), rel=1e-4)
     assert found.peak_force == pytest.approx(F)
     assert found.rms_force == pytest.approx(F, rel=1e-4)
     assert found.power == pytest.approx(4.0 * (F / 30.0) ** 2, rel=1e-4)
     assert "peak force" in found.limits
-    hot = cycle_of(Motion(demand(), MOTOR), np.array([mass]))
+    hot = cycle_of(moving(MOTOR), np.array([mass]))
     a = np.sqrt(50.0 / 4.0) * 30.0 / mass
     assert hot.profile.duration == pytest.approx(2.0 * np.sqrt(0.1 / a), rel=1e-4)
     assert hot.power == pytest.approx(50.0, rel=1e-10)
@@ -63,9 +63,9 @@ def test_a_rigid_body_moves_bang_bang() -> None:
 
 
 def test_a_longer_motor_gives_force_as_the_root_of_mass_and_power() -> None:
-    one, four = (replace(MOTOR, size="m", peak_current=(np.inf,)) for _ in range(2))
+    one, four = (replace(MOTOR, size="m", peak_current=(UNLIMITED,)) for _ in range(2))
     forces = [
-        cycle_of(Motion(demand(), motor), np.array([5.0]), mass).rms_force
+        cycle_of(moving(motor), np.array([5.0]), mass).rms_force
         for motor, mass in ((one, 2.0), (four, 8.0))
     ]
     assert forces[1] == pytest.approx(2.0 * forces[0], rel=1e-3)
@@ -78,7 +78,7 @@ def test_one_mode_has_the_residual_vibration_of_a_bang_bang_move() -> None:
     plant = StateSpace(A, np.array([[0.0], [1.0 / mass]]), np.eye(2)[:1], np.zeros((1, 1)))
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.zeros((1, 1)))
     hold = Sampling(50e3)
-    motion = Motion(demand(), replace(MOTOR, rms_power=None))
+    motion = moving(replace(MOTOR, rms_power=None))
     profile = cycle_of(motion, np.array([mass])).profile
     forward = np.zeros((5, 1))
     forward[2] = mass
@@ -114,15 +114,14 @@ def test_random_moves_settle_at_the_sample_of_another_simulation() -> None:
 def test_its_derivatives(seed: int) -> None:
     case = moves.drawn(np.random.default_rng(seed))
     # a narrower window is nearer to the rounding of a position, which differences magnify
-    motion = replace(case.motion, demand=replace(case.motion.demand, window=1e-6))
-    case = replace(case, motion=motion)
+    case = replace(case, motion=replace(case.motion, window=1e-6))
     goal = case.goal()
     value, to_kappa = goal.at(case.kappa)
     assert value >= np.log(goal.motion.cycle.profile.duration)
     numeric = slopes(lambda kappa: np.array([goal.at(kappa)[0]]), case.kappa, 5e-5)[0]
     assert to_kappa == pytest.approx(numeric, abs=1e-6)
-    fixed = replace(case.motion.demand.limits, acceleration=5.0)
-    still = replace(case, motion=Motion(replace(case.motion.demand, limits=fixed)))
+    fixed = replace(case.motion.limits, acceleration=5.0)
+    still = replace(case, motion=replace(case.motion, limits=fixed, motor=None))
     for one, step, known in ((still, 1e-4, 1e-6), (case, 1e-6, 1e-4)):
         # where the motor sets the acceleration the setpoint's switches pass samples: small kinks
         slope = one.goal().to_theta(case.kappa) * case.theta
@@ -131,7 +130,7 @@ def test_its_derivatives(seed: int) -> None:
             np.ones(2), step,
         )[0]  # fmt: skip
         assert slope == pytest.approx(numeric, abs=known)
-    slope = case.at(case.theta).slopes("profile", "duration") * case.theta
+    slope = case.at(case.theta).slopes(lambda cycle: cycle.profile.durations.sum()) * case.theta
     numeric = slopes(
         lambda s: np.array([case.at(s * case.theta).cycle.profile.duration]), np.ones(2), 1e-3
     )[0]
@@ -150,7 +149,7 @@ def test_the_motor_on_the_plant() -> None:
     """Its mass where the force enters, its limits as λ(θ), its heat in the cost; all slopes."""
     motor = replace(MOTOR, size="m", price=0.1)
     limits = replace(BANG, acceleration=20.0, jerk=1e3, snap=1e5)
-    motion = Motion(demand(limits, dwell=0.1), motor)
+    motion = moving(motor, limits, 0.1)
     plant = build_plant(moves.axis, moves.NAMES, {})
     names = ("carriage", "m", "stiffness")
     driven, theta = with_motion(plant, motion, names, {}), np.array([4.0, 2.5, 1e6])

@@ -12,8 +12,7 @@ from ccd_casadi.budget import ErrorBudget, Kind, ShapedSpectrum, Source, Tabulat
 from ccd_casadi.cases.case import CaseError, load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.fixed_structure import Structure, certify, synthesise_sections
-from ccd_casadi.fixed_structure.least_value import least_value
-from ccd_casadi.fixed_structure.rms_error import RmsError
+from ccd_casadi.fixed_structure.least_value import RmsError, least_value
 from ccd_casadi.support.units import HZ
 
 BUDGET = ErrorBudget((
