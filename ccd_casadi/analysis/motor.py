@@ -142,9 +142,10 @@ def _heated(motion: Motion, most: float, forces: Array, mass: Any) -> Any:
     def share(acceleration: Any) -> Any:
         return _cycle(motion, acceleration, np.real(forces), np.real(mass)).heat_share
 
-    top = float(np.log(most))
-    root = brentq(lambda x: np.real(share(np.exp(x))) - 1.0, top - 60.0, top, xtol=1e-14)
-    a = float(np.exp(root))
+    low = most  # far below it durations are so long that rounding fills them
+    while np.real(share(low)) > 1.0:
+        low *= 0.1
+    a = float(brentq(lambda a: np.real(share(a)) - 1.0, low, most, xtol=1e-14 * low))
     slope = np.imag(share(a + 1j * STEP)) / STEP
     return a - (_cycle(motion, a, forces, mass).heat_share - 1.0) / slope
 
