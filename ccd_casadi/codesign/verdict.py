@@ -274,7 +274,9 @@ def survives(
 
 def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line:
     """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
-    figures = margin_figures(found)
+    figures: dict[str, float] = {}
+    if found is not None:
+        figures = {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
     if sampling is not None:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
@@ -290,13 +292,6 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
-
-
-def margin_figures(found: Survival | None) -> dict[str, float]:
-    """The margins that a computer's delay takes from."""
-    if found is None:
-        return {}
-    return {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
 
 
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:
