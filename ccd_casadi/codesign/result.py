@@ -86,7 +86,7 @@ def result_dict(
         "inner_gap": verified.inner_gap,
         "kkt": kkt_dict(verified.kkt),
         "globality": globality_dict(outcome.outer),
-        "box_look": _box_look(look),
+        "box_look": {} if look is None else look.entry,
         "notes": list(plant.notes(verified.theta)),
         "iterates": [asdict(iterate) for iterate in outcome.iterates],
         **run_entry(spent, seconds, seed, look is not None and look.moved),
@@ -207,14 +207,6 @@ def globality_dict(solution: OuterSolution | None) -> dict[str, Any]:
             for item in solution.optima
         ],
     }
-
-
-def _box_look(look: BoxLook | None) -> dict[str, Any]:
-    """What was looked at besides the formulation's own way; nothing where there was no look."""
-    if look is None:
-        return {}
-    found = {key: value for key, value in vars(look).items() if key != "x"}
-    return found | {"moved": look.moved}
 
 
 def at_solve(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:

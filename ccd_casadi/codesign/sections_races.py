@@ -38,10 +38,6 @@ class Seeds:
     words: str
 
 
-def _seeded(problem: CoDesignProblem, seed: int) -> CoDesignProblem:
-    return with_range(replace(problem, controller=replace(sections_of_problem(problem), seed=seed)))
-
-
 def seeded_and_prepared(
     store: SampleStore,
     problem: CoDesignProblem,
@@ -53,7 +49,8 @@ def seeded_and_prepared(
 
     Second, in words, why there are no anchors; empty where there are.
     """
-    problem = _seeded(problem, seed)
+    own = replace(sections_of_problem(problem), seed=seed)
+    problem = with_range(replace(problem, controller=own))
     owner = problem_hash({"seeds": problem.identity(), "inner": problem.inner_identity()})
 
     def found() -> Seeds:
