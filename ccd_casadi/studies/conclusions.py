@@ -100,7 +100,7 @@ def _sequential(run: dict[str, Any], best: dict[str, Any], name: str) -> tuple[d
     found = {"hardware_cost_percent": cost, "bandwidth_percent": speed}
     words = (
         f"Against the {LABELS[name].replace(',', ' design,')} (hardware cost "
-        f"{run['hardware_cost']:.5g}, {run['bandwidth_hz']:.2f} Hz) co-design changes the hardware cost by {cost:+.1f} % and "
-        f"the bandwidth by {speed:+.1f} %."
+        f"{run['hardware_cost']:.5g}, {run['bandwidth_hz']:.2f} Hz) co-design "
+        f"changes the hardware cost by {cost:+.1f} % and the bandwidth by {speed:+.1f} %."
     )
     return found, words
