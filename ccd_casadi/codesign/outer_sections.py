@@ -34,7 +34,8 @@ from ccd_casadi.codesign.theta_kkt import SMOOTH, theta_kkt
 from ccd_casadi.codesign.verified_sections import Costs, VerifiedSections, costs_of
 from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import unmet
-from ccd_casadi.inner_problem.figure import BANDWIDTH
+from ccd_casadi.inner_problem.figure import BANDWIDTH, MOVE_TIME
+from ccd_casadi.inner_problem.move_figures import told_time
 from ccd_casadi.inner_problem.objective import objective_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, box, plant_of
 from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value, valued
@@ -246,6 +247,9 @@ class SectionsOuter(ThetaOuter):
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)
             gap = known_gap(problem, best.theta)
+            told = None
+            if problem.figure is MOVE_TIME:
+                told = told_time(problem, best.theta, made.controller, best.value)
             bar.advance()
         return VerifiedSections(
             problem=problem,
@@ -268,6 +272,7 @@ class SectionsOuter(ThetaOuter):
             rounds=rounds,
             costs=costs,
             gap=gap,
+            told=told,
         )
 
     def responses(self, x: Array) -> PostOptimal:

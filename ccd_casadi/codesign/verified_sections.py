@@ -66,7 +66,8 @@ class VerifiedSections(Verified):
     `wide` is the judge's certificate on a lattice of `checked` plants of the box; `proof` is for
     the whole of it; `drawn`, where that is not proven, how many random plants of it survive;
     `worst` the worst plant that was found. `raced` is a multi-start search at θ,
-    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches.
+    `costs` what easier problems have there, and `gap`, of ω_b, what no controller reaches; `told`
+    the time of its move, where that counts.
     """
 
     design: SectionsDesign
@@ -79,6 +80,7 @@ class VerifiedSections(Verified):
     rounds: int
     costs: Costs
     gap: Gap | None
+    told: tuple[float, Yield | None] | None = None
 
     # Of ∇J: the envelope gradient of a controller that is itself optimal to 1e-3 is right to 2e-3,
     # and differences of two such say nothing of a small curvature.
@@ -135,12 +137,17 @@ class VerifiedSections(Verified):
             "gap": None if self.gap is None else self.gap.entry(self.bandwidth),
         }
         if sections.figure is not BANDWIDTH:
+            entry = sections.figure.entry
             found |= {
-                "error_rms_of_set": self.value,
-                "surrogate_error_rms": predicted,
-                "error_rms_raced": self.raced.value,
+                f"{entry}_of_set": self.value,
+                f"surrogate_{entry}": predicted,
+                f"{entry}_raced": self.raced.value,
                 "error_anchors": [list(kappa) for kappa in sections.error_anchors],
             }
+        if self.told is not None:
+            time, drawn = self.told
+            found |= {"move_time": time,
+                      "move_time_fresh": None if drawn is None else drawn.entry}  # fmt: skip
         if sections.weighted_level is None:
             words = "KS and T are not bounded: the case gives no controller.weighted_level"
             found["notes"] = [*plant_of(self.problem).notes(self.theta), words]
@@ -165,7 +172,9 @@ class VerifiedSections(Verified):
         }
 
     def checks(self) -> dict[str, bool]:
-        return {"robust": self.kept}
+        drawn = None if self.told is None else self.told[1]
+        later = {} if drawn is None else {"move_time": drawn.survived == drawn.draws}
+        return {"robust": self.kept, **later}
 
     def controller_entry(self) -> dict[str, Any]:
         return sections_controller(self.problem, self.design)
