@@ -1,14 +1,13 @@
 """A verified design with a controller of fixed structure: its figures, checks and lines."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ccd_casadi.analysis.yield_bound import Yield
-from ccd_casadi.codesign.costs import Costs
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.sections_entries import (
     active_of,
@@ -24,13 +23,40 @@ from ccd_casadi.fixed_structure.worst_plant import Excess
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.figure import BANDWIDTH
 from ccd_casadi.inner_problem.kinds import kind_of
-from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue
-from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem
+from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
+from ccd_casadi.inner_problem.sections_bandwidth import SectionsValue, sections_value
+from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
+from ccd_casadi.inner_problem.sections_problem import SectionsProblem
+from ccd_casadi.inner_problem.sections_search import joined
 from ccd_casadi.limitations.of_problem import Gap
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.json_files import clean
 from ccd_casadi.support.units import HZ, counted
+
+
+@dataclass(frozen=True)
+class Costs:
+    """ω_b in rad/s (NaN: none certified) at the ends of climbs from the design: `on_model` on the
+    model alone, `continuous` on the set without hold and delay. At least that much is reached.
+    """
+
+    on_model: float
+    continuous: float
+
+
+def costs_of(problem: CoDesignProblem, theta: Sequence[float], kappa: Array) -> Costs:
+    """The climbs from a certified design with parameters κ (SI)."""
+    sections = replace(sections_of_problem(problem), minimise="bandwidth")
+    model = tuple(map(float, uncertain_plant(problem, theta).nominal))
+
+    def climbed(easier: SectionsProblem) -> float:
+        value = sections_value(joined(replace(problem, controller=easier), kappa, ()), theta)
+        return value.bandwidth if value.feasible else float("nan")
+
+    return Costs(
+        climbed(replace(sections, members=((0, model),))), climbed(replace(sections, sampling=None))
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
