@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.codesign.design_entries import budget_entry
+from ccd_casadi.codesign.design_entries import budget_entry, move_entry
 from ccd_casadi.codesign.formulation import BoxLook, FormulationResult
 from ccd_casadi.codesign.gaussian_processes import quality_dict
 from ccd_casadi.codesign.outer_problem import OuterSolution
@@ -93,6 +93,7 @@ def result_dict(
         "surrogate_quality": quality_dict(quality),
         **verified.evidence(promised),
         **budget_entry(problem, verified.theta, verified.controller),
+        **move_entry(problem, verified.theta, verified.controller),
     }
     return clean(result)
 
