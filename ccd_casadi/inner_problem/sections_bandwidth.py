@@ -35,13 +35,9 @@ from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
-MOST_ANCHORS = 3
-DISTINCT = 0.1  # relative: local optima further below the best are no anchors
-ROUNDS = 6  # of a design on the set and a search for plants that are worse
 FURTHER = 5  # climbs at most at a θ, of which the last go on from an end that is not optimal yet
 LOST = 1e-6  # relative: of the bandwidth, by rounding
 FEW = 8  # starts of the search at a θ where no anchor ends certified
-SLOWEST, FASTEST = 1e-3, 30.0  # of K's frequencies, over ω₀ and over the fastest pole at the start
 
 
 @dataclass(frozen=True)
