@@ -14,7 +14,6 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
@@ -71,11 +70,7 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
     free = ca.MX.sym("theta", len(place))
     entries = iter(ca.vertsplit(free))
     theta = [fixed[name] if name in fixed else next(entries) for name in plant.names]
-    nearby, domain, shapes, drawing = plant.nearby, plant.domain, plant.shapes, plant.drawing
-
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert nearby is not None
-        return of(nearby(own.at(theta), reach, pool))
+    domain, shapes, drawing = plant.domain, plant.shapes, plant.drawing
 
     def shown(theta: Sequence[float], count: int) -> ModeShapes:
         assert shapes is not None
@@ -93,7 +88,6 @@ def with_fixed(plant: Plant, fixed: Mapping[str, float]) -> Plant:
         references={name: of(closer) for name, closer in plant.references.items()},
         values=None if plant.values is None else of(plant.values),
         notes=lambda theta: plant.notes(own.at(theta)),
-        nearby=None if nearby is None else near,
         domain=None if domain is None else (domain[0][place], domain[1][place]),
         doubt=lambda theta: plant.doubt(own.at(theta)),
         shapes=None if shapes is None else shown,

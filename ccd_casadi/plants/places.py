@@ -24,7 +24,6 @@ from ccd_casadi.plants.nodes import Between, Point, Points, names_in
 from ccd_casadi.plants.plant import Evaluate, Mechanics, Plant
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import PlantError
-from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
 
 
@@ -83,10 +82,6 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     def below(theta: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(theta[i]) for i in own)
 
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert plant.nearby is not None
-        return of(plant.nearby(below(theta), reach, pool))
-
     def notes(theta: Sequence[float]) -> tuple[str, ...]:
         whole = plant.evaluate(below(theta))
         error = between.left_out(_flexible(whole)[1].T @ whole.B)
@@ -111,7 +106,6 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         exact_hessian=plant.exact_hessian,
         values=None if plant.values is None else of(plant.values),
         notes=notes,
-        nearby=None if plant.nearby is None else near,
         domain=_domain(plant, places, nodes, names),
         doubt=lambda theta: plant.doubt(below(theta)),
         shapes=whole.shapes if nodes.shape[1] == 2 else None,
