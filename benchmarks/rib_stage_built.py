@@ -10,29 +10,33 @@ any side, ten or twenty modes, the shipped mesh (every fourth group: no payload,
 within it every flexible mode is shifted on its own within ±2 % and the damping factor lies between
 0.5 and 2. `--anywhere` puts the payload anywhere within 30 mm, on the plate between the ribs too,
 where the case's set has none. Every loop is closed with K by Tustin's rule, hold and delay exact
-(`deployment.sampled`, which the synthesis does not use): eigenvalues, ‖S‖∞, ω_b; the worst plant is
+(`robust.sampled`, which the synthesis does not use): eigenvalues, ‖S‖∞, ω_b; the worst plant is
 run sample by sample too. `--write` keeps every group in benchmarks/rib_stage_built.json and goes on
 from there.
 """
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.signal import cont2discrete
 
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
+
+from sampled_simulation import measure_set
+
 from ccd_casadi.case_studies.rib_stage.geometry import NAMES
 from ccd_casadi.case_studies.rib_stage.plant import rib_stage
-from ccd_casadi.deployment.sampled import sampled_figures
-from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import mechanics
+from ccd_casadi.robust.sampled import sampled_figures
 
 RESULTS = Path(__file__).with_suffix(".json")
 DESIGN = Path(__file__).parent / "rib_stage_design"

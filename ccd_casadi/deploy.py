@@ -60,10 +60,10 @@ def command(options: argparse.Namespace) -> ExitCode:
     moved = None
     if kind_of(finished.problem).as_designed:  # one way where a rate was given
         channels, count = 0, 1 if finished.problem.sampling else count
-    steps = channels + count + 2 + (options.saturation is not None)
+    steps = channels + count + 1 + (options.saturation is not None)
     with Progress(steps, "deploying", options.quiet) as bar:
         found = deploy(
-            finished, timing, saturation=options.saturation, seed=options.seed,
+            finished, timing, saturation=options.saturation,
             progress=lambda words: bar.advance(note=words),
         )  # fmt: skip
         if found.stable:
@@ -97,7 +97,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.reporting.moves import way_words
 
     if moved is not None and not options.quiet:
-        say(f"{'a move':13s} {way_words(moved.ways[-1])}")
+        say(f"{'a move':13s} {way_words(moved.ways[-1].words, moved.ways[-1].move)}")
 
     page = deploy_page(finished, found, moved, index_of(folder))
     publish(finished.folder, folder / "report.html", page)
@@ -123,12 +123,12 @@ def _summary(run: "FinishedRun", found: "Deployment") -> str:
                  f"{found.conversion.label}; needed {needed}"),
         *((name.lower(), f"{value}, {words}") for name, value, words in figure_rows(run, found)),
     ]  # fmt: skip
-    if found.measured is None:
+    if not found.stable:
         lines.append(("", found.shortfalls[0]))
     if found.members:
-        worst, count = found.worst, 1 + len(found.measured_members)
+        worst = found.worst
         peak = f"largest peak {worst.figures.sensitivity_peak:.6g}" if found.stable else "unstable"
-        words = f"{1 + len(found.members)} plants, {count} simulated: {peak}"
+        words = f"{1 + len(found.members)} plants: {peak}"
         lines.append(("robust set", f"{words} ({place_words(worst.at)})"))
     if found.statics is not None:
         lines.append(("at rest", found.statics.words))

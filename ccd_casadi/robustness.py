@@ -10,10 +10,7 @@ from ccd_casadi.support.command_line import ExitCode, run, run_folder, run_parse
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.options import number, positive, whole
 from ccd_casadi.support.process_pool import PATIENCE, Workers
-from ccd_casadi.support.progress import Progress
 from ccd_casadi.support.terminal import say
-
-LIMIT = 30.0  # s for the structured singular value, which of many modes takes long
 
 
 def command(options: argparse.Namespace) -> ExitCode:
@@ -21,7 +18,7 @@ def command(options: argparse.Namespace) -> ExitCode:
     from ccd_casadi.cases.run_folder import read_run
     from ccd_casadi.codesign.result import told
     from ccd_casadi.deployment.given_controller import as_it_runs, with_controller
-    from ccd_casadi.robust.study import study_dict, survival_line, tried, with_structured_bound
+    from ccd_casadi.robust.study import robustness, study_dict, survival_line
     from ccd_casadi.support.json_files import write_json
     from ccd_casadi.support.versions import versions
 
@@ -53,20 +50,10 @@ def command(options: argparse.Namespace) -> ExitCode:
         axis=options.axis - 1,
     )
     with Workers(options.workers, PATIENCE) as workers:
-        found = tried(finished, demands, options.seed, options.quiet, workers)
-
-    def write() -> None:
-        answer = study_dict(finished, found)
-        answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
-        write_json(folder / "robustness.json", answer)
-
-    write()  # the last of the figures may not come within its time
-    with Progress(
-        1, f"structured singular value, at most {options.limit:g} s", options.quiet
-    ) as bar:
-        found = with_structured_bound(finished, found, options.limit)
-        bar.advance()
-    write()
+        found = robustness(finished, demands, options.seed, options.quiet, workers)
+    answer = study_dict(finished, found)
+    answer |= {"seed": options.seed, "versions": versions(), "seconds": perf_counter() - began}
+    write_json(folder / "robustness.json", answer)
     from ccd_casadi.reporting.index import index_of, publish  # matplotlib is slow to import
     from ccd_casadi.reporting.robustness_page import conclusion, robustness_page
 
@@ -104,8 +91,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="density of the force at every actuator, N/√Hz; default 1")  # fmt: skip
     add("--axis", type=whole(1), default=1, metavar="N", help="output that moves; default 1")
     add_move_options(arguments)
-    add("--limit", type=positive, default=LIMIT, metavar="SECONDS",
-        help=f"time limit of the structured singular value; default {LIMIT:g}")  # fmt: skip
     return run(command, arguments, argv, needs=["ccd_casadi.robust.study"])
 
 

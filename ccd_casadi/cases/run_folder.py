@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, str
 from ccd_casadi.inner_problem.sections_problem import ChannelProblem, SectionsProblem
 from ccd_casadi.inner_problem.sections_robustness import judged_corners
 from ccd_casadi.inner_problem.sections_search import with_range
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.scaling import ScaledPlant
@@ -42,31 +43,13 @@ if TYPE_CHECKING:
 SHORTFALL = 1e-6  # relative: a stored γ is met when the norm measured now is no further above it
 
 
-class SampledController(Protocol):
-    """A controller that runs every `period` (s), its hold and delay exact on any plant."""
-
-    @property
-    def period(self) -> float:
-        """Of sampling, in s."""
-
-    @property
-    def delay(self) -> float:
-        """From reading y to the new u, in s."""
-
-    def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
-        """Stability, ω_b (rad/s), ‖S‖∞ and rate of growth (1/s) of the loop on a plant."""
-
-    def loop(self, plant: ScaledPlant) -> Loop:
-        """The loop on a plant, for its responses and signals."""
-
-
 @dataclass(frozen=True)
 class FinishedRun(Shown):
     """The design that a run ended with, in SI: θ, weights W_S, W_KS, W_T and controller (e to u).
 
     `figures` are measured when the folder is read, on the plant as the case describes it now;
-    `result` is result.json as it was written. `sampled` is a controller in discrete time in place
-    of the run's own, where one is judged.
+    `result` is result.json as it was written. `sampling`: how a controller in discrete time
+    runs, where one is judged in place of the run's own.
     """
 
     folder: Path
@@ -78,8 +61,12 @@ class FinishedRun(Shown):
     controller: StateSpace
     figures: DesignFigures
     result: Mapping[str, Any]
-    sampled: "SampledController | None" = None
+    sampling: Sampling | None = None
     kappa: Array | None = None  # of a fixed structure, SI
+
+    def loop_on(self, plant: StateSpace) -> Loop:
+        """The loop on a plant in SI, as it runs."""
+        return Loop(plant, self.controller, self.sampling)
 
     def to_control(self) -> "tuple[control.StateSpace, control.StateSpace]":
         """G (N to m) and K (e = r - y to N) in continuous time, SI, for python-control.
@@ -196,7 +183,7 @@ def with_function(
 def sections_kappa(folder: Path, structure: Structure | ChannelStructure) -> tuple[float, ...]:
     """κ in SI of the controller.json of a folder. Raises UserError where it is of another kind."""
     path = folder / "controller.json"
-    words = f"is no list of the {len(structure.names)} parameters of the case's structure"
+    words = f"is not a list of the {len(structure.names)} parameters of the case's structure"
     try:
         kappa = np.array(read_json(path)["sections"]["kappa"], dtype=np.float64)
         good = kappa.shape == (len(structure.names),) and bool((np.abs(kappa) < 200.0).all())

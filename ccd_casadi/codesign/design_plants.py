@@ -7,9 +7,9 @@ the plant alone the set is widened step by step, each design polished on the pro
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -28,43 +28,38 @@ from ccd_casadi.synthesis.synthesis import DesignFigures
 
 FIRST = 0.25  # share of the range of the first step of a continuation
 POLISHES = 5  # at most in a continuation
+TOLD = ("status", "objective", "reason", "theta", "bandwidth_hz")  # of each design plant
 LEAST = 1.0 / 16.0  # share of the range under which a step is given up
 
 
-@dataclass(frozen=True)
-class Reached:
-    """The end of a continuation: x = (θ, ln ω_S, ln ω_T) and the share of the range held there."""
+def widen(sampler: Sampler, x: Array) -> tuple[Array, float]:
+    """From a design of the plant alone towards the whole set of a problem with one design plant.
 
-    x: Array
-    share: float
-
-
-def widen(sampler: Sampler, x: Array) -> Reached:
-    """From a design of the plant alone towards the whole set of a problem with one design plant."""
+    x = (θ, ln ω_S, ln ω_T) and the share of the range held there.
+    """
     problem = sampler.problem
     assert problem.robust is not None
-    reached, step = Reached(np.asarray(x, float), 0.0), FIRST
+    x, held, step = np.asarray(x, float), 0.0, FIRST
     for _ in range(POLISHES):
-        if reached.share >= 1.0 or step < LEAST:
+        if held >= 1.0 or step < LEAST:
             break
-        share = min(1.0, reached.share + step)
+        share = min(1.0, held + step)
         narrower = replace(problem, robust=problem.robust.scaled(share))
-        found, made = polish(sampler.of(narrower, traced=share == 1.0), reached.x)
+        found, made = polish(sampler.of(narrower, traced=share == 1.0), x)
         if acceptable(narrower, found, made):
-            reached, step = Reached(found, share), 2.0 * step
+            x, held, step = found, share, 2.0 * step
         else:
             step *= 0.5
-    return reached
+    return x, held
 
 
 def continued(sampler: Sampler, x: Array) -> tuple[FormulationResult | None, float]:
     """What a formulation would hand on at the end of `widen`, None short of it; the share held."""
-    reached = widen(sampler, x)
-    if reached.share < 1.0:
-        return None, reached.share
-    made = sampler.truth.at(reached.x)
+    x, held = widen(sampler, x)
+    if held < 1.0:
+        return None, held
     words = "reached by continuation from narrower ranges"
-    return FormulationResult(reached.x, made, (), (), None, True, words), 1.0
+    return FormulationResult(x, sampler.truth.at(x), agreed=True, message=words), 1.0
 
 
 def best_over_design_plants(
@@ -101,7 +96,8 @@ def best_over_design_plants(
     }
     if problem.robust is not None:
         names = [_at(choice) for choice in choices]
-        tried = {name: _tried(item.result) for name, item in zip(names, found, strict=True)}
+        told = [{key: item.result[key] for key in TOLD if key in item.result} for item in found]
+        tried = dict(zip(names, told, strict=True))
         result["robust"] = result.get("robust", {}) | {"design_at": names[best], "tried": tried}
     sampler.nearest = samplers[best].nearest
     result["reason"] = explain(sampler, found[best], share)
@@ -116,10 +112,6 @@ def _holds(item: Solution) -> bool:
     )
 
 
-def _verified(item: Solution) -> bool:
-    return bool(item.result["status"] == "verified")
-
-
 def order(item: Solution) -> tuple[int, int, float]:
     """Verified first, then what fails the fewest checks, then the least J."""
     result = item.result
@@ -128,15 +120,10 @@ def order(item: Solution) -> tuple[int, int, float]:
     return status, failed, result.get("objective", np.inf)
 
 
-def _tried(result: dict[str, Any]) -> dict[str, Any]:
-    keys = ("status", "objective", "reason", "theta", "bandwidth_hz")
-    return {key: result[key] for key in keys if key in result}
-
-
 def failure_words(sampler: Sampler, best: Solution, share: float | None) -> str:
     """Why a search failed: where it looked, how near it came, what may be tried."""
     problem, words = sampler.problem, str(best.result["reason"])
-    if _verified(best):
+    if best.result["status"] == "verified":
         return words
     if best.verified is not None:
         missed = missed_words(problem, cast(VerifiedDesign, best.verified).design.figures)

@@ -63,11 +63,11 @@ def solve_direct(sampler: Sampler, options: Direct, *, seed: int) -> Formulation
     if not certified:
         reason = quantities.at(first).figures.outcome.value
         message = f"none of {len(points)} starting designs is certified; the first: {reason}"
-        return FormulationResult(None, None, (), (), None, False, message)
+        return FormulationResult(message=message)
     try:
         solution = solve_program(program, np.array(certified))
     except OuterFailure as error:
-        return FormulationResult(None, None, (), (), None, False, str(error))
+        return FormulationResult(message=str(error))
     for optimum in solution.optima:
         if acceptable(problem, optimum.x, quantities.at(optimum.x)):
             chosen = quantities.at(optimum.x)

@@ -75,7 +75,7 @@ def solve_nested(
         thetas = given.thetas
     samples = sampler.bandwidths(thetas)
     if not any(sample.feasible for sample in samples):
-        return FormulationResult(None, None, (), (), None, False, "no sampled theta is feasible")
+        return FormulationResult(message="no sampled theta is feasible")
     iterates: list[Iterate] = []
 
     def value_of(sample: BandwidthSample) -> float:
@@ -222,15 +222,9 @@ def _iterate(
     radius: float,
 ) -> Iterate:
     lower, upper = box(problem)
-    error = abs(predicted / sample.value - 1.0) if sample.feasible else np.inf
-    step = np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max()
-    return Iterate(
-        theta=sample.theta,
-        predicted=predicted,
-        truth=sample.value,
-        predicted_objective=objective(problem, sample.theta, predicted),
-        objective=objective(problem, sample.theta, sample.value) if sample.feasible else np.inf,
-        error=float(error),
-        step=float(step),
-        radius=radius,
-    )
+    promised, J, error = objective(problem, sample.theta, predicted), np.inf, np.inf
+    if sample.feasible:
+        J = objective(problem, sample.theta, sample.value)
+        error = float(abs(predicted / sample.value - 1.0))
+    step = float(np.abs((np.array(sample.theta) - best.theta) / (upper - lower)).max())
+    return Iterate(sample.theta, predicted, sample.value, promised, J, error, step, radius)

@@ -100,7 +100,7 @@ class Job:
             return known
         began, outer, sampler = perf_counter(), self.outer, self.outer.sampler
         words = unmet_constraint(sampler.problem, self.case.outer.starts, self.seed)
-        outcome = FormulationResult(None, None, (), (), None, False, words)
+        outcome = FormulationResult(message=words)
         if not words:
             outcome = self._trained(mark["tolerance"])
             if outcome.x is None:
@@ -137,7 +137,7 @@ class Job:
         given = self._known()
         if given is None:
             words = "too few points where the truth has a value"
-            return FormulationResult(None, None, (), (), None, False, words)
+            return FormulationResult(message=words)
         sampled = 2 * len(self.outer.problem.names) + 2 if self.over_theta else 1
         rounds = min(int(self.left / (self._cost(len(given.thetas)) * sampled)), ROUNDS)
         options = formulation_of(self.case, name)

@@ -54,7 +54,7 @@ def searched(
         if known is None:
             outcome = outer.formulated(formulation, seed, given)
         else:
-            outcome = FormulationResult(known, None, (), (), None, True, "")
+            outcome = FormulationResult(known, agreed=True)
         if outcome.x is None:
             outcome = outer.rescued(outcome, seed)
         if outcome.x is None:
@@ -153,4 +153,4 @@ def concluded_at(
 
 def nothing_found(outer: Outer, words: str) -> Searched:
     """No design, and why."""
-    return Searched(outer, FormulationResult(None, None, (), (), None, False, words), None, 0)
+    return Searched(outer, FormulationResult(message=words), None, 0)

@@ -151,15 +151,15 @@ def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
         "theta": dict(zip(problem.names, best.theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), best.theta),
         "bandwidth_hz": best.bandwidth / HZ,
-        "error_rms_of_set": best.error,
+        f"{problem.figure.entry}_of_set": best.value,
     }
-    outcome = FormulationResult(np.array(best.theta), None, (), (), None, True, "")
+    outcome = FormulationResult(np.array(best.theta), agreed=True)
     return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))
 
 
 def _nothing(words: str) -> Solution:
     result = {"status": "infeasible", "reason": words, "syntheses": 0}
-    return Solution(result, FormulationResult(None, None, (), (), None, False, words), None)
+    return Solution(result, FormulationResult(message=words), None)
 
 
 def _allowed(problem: CoDesignProblem, theta: Array) -> Array | None:

@@ -51,7 +51,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
     good = [one for one in good if np.isfinite(objective_of(problem, one))]
     if not good:
         message = f"none of {len(points)} starting designs is certified"
-        return FormulationResult(None, None, (), (), None, False, message)
+        return FormulationResult(message=message)
     if starts > 1:
         good = [pieces_from(truth, one, SETTLED, LONG)[0] for one in good]
     best = min(good, key=lambda one: objective_of(problem, one))
@@ -87,4 +87,5 @@ def pieces_from(
     end = descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
     met = (found for found in map(local, truth.known.values()) if found is not None)
     jumped = any(found.value > end.value and jumps(end, found) for found in met)
-    return min(truth.known.values(), key=lambda sample: objective_of(problem, sample)), jumped
+    found = (best, *truth.known.values())  # where nothing is promised nothing was asked for
+    return min(found, key=lambda sample: objective_of(problem, sample)), jumped

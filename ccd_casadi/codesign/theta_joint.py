@@ -40,7 +40,7 @@ from ccd_casadi.support.arrays import Array
 REACH, LARGEST, LEAST = 0.1, 0.3, 1e-4  # of the box of θ, in which the first order counts
 GOOD, POOR = 0.7, 0.3  # of the promised gain: the reach grows, or shrinks
 CYCLES = 20  # sets of plants at most
-STEPS = 60  # of a search
+STEPS = 40  # of a search
 FIRST, WIDEST, NARROWEST = 0.05, 0.5, 1e-7  # radii of κ and z
 LEAST_GAIN = 1e-6  # of w2 ω_b
 SETTLED = 1e-5  # of J: less is not worth another set of plants

@@ -19,7 +19,7 @@ from ccd_casadi.codesign.survival import FACTORS, REACH, Survival
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.figure import BANDWIDTH, Figure
 from ccd_casadi.optim.kkt import Kink, KktCertificate
-from ccd_casadi.support.units import counted, metres
+from ccd_casadi.support.units import counted, metres, shown
 
 SADDLE = -1e-3  # least scaled eigenvalue of the reduced Hessian that is no downward curvature
 LEAST_SHIFT = 0.02  # of all flexible resonances: what a finite-element model is good for at best
@@ -67,15 +67,6 @@ class Verdict:
         return tuple((item.name, getattr(self, item.name)) for item in fields(self))
 
 
-@dataclass(frozen=True)
-class CloserModel:
-    """The controller on a closer model of the plant: stable, and its peak of S."""
-
-    name: str
-    stable: bool
-    peak: float
-
-
 def optimal(
     kkt: KktCertificate,
     *,
@@ -97,7 +88,7 @@ def optimal(
     if not gap <= tolerance:
         return Line(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):
-        return Line(State.WARNED, f"{unknown}: a limit of ours; {known}", figures)
+        return Line(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
         return Line(State.FAILED, words, figures)
@@ -217,12 +208,13 @@ def survives(
     robust: bool | None = None,
     robust_words: str = "",
     other_damping: str = "",
-    closer: Sequence[CloserModel] = (),
+    closer: Sequence[tuple[str, bool, float]] = (),
     figures: Mapping[str, Any] | None = None,
 ) -> Line:
     """A loop on plants off its model; `robust`: whether the case's own set is kept (None: none).
 
-    `other_damping`: what that set does not keep, in words; `figures`: more of them.
+    `other_damping`: what that set does not keep, in words; `closer` models of the plant by name:
+    stable, and the peak of S; `figures`: more of them.
     """
     if found is None:
         if robust is False:
@@ -243,14 +235,13 @@ def survives(
         state = State.WARNED
         at = ", ".join(f"{hz:.4g}" for hz in found.unstable_poles_hz[:3])
         said.append(f"K itself is unstable (poles at {at} Hz)")
-    for model in closer:
-        if model.stable and model.peak > (1.0 + CLOSER_PEAK) * S_max:
-            state = State.WARNED
-            said.append(f"peak of S {model.peak:.3g} on {model.name}")
-    for model in closer:
-        if not model.stable:
+    for name, stable, peak in closer:
+        if stable and peak > (1.0 + CLOSER_PEAK) * S_max:
+            state = state if state is State.FAILED else State.WARNED
+            said.append(f"peak of S {peak:.3g} on {name}")
+        elif not stable:
             state = State.FAILED
-            said.insert(0, f"unstable on {model.name}")
+            said.insert(0, f"unstable on {name}")
     said[:0] = [words for words in (robust_words, other_damping) if words]
     if robust is False:
         state = State.FAILED
@@ -276,14 +267,16 @@ def survives(
         "static_compliance": rest.compliance,
         "static_share": rest.share,
         "robust_set": robust,
-        "closer_models": {m.name: {"stable": m.stable, "peak": m.peak} for m in closer},
+        "closer_models": {name: {"stable": good, "peak": peak} for name, good, peak in closer},
     }
     return Line(state, "; ".join(said), figures)
 
 
 def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line:
     """Before `deploy`: whether it is designed as it runs, or what delay its margins leave."""
-    figures = margin_figures(found)
+    figures: dict[str, float] = {}
+    if found is not None:
+        figures = {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
     if sampling is not None:
         words = (
             f"designed and judged at {sampling.rate_hz:g} Hz with {sampling.delay_us:g} us, hold "
@@ -295,17 +288,10 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
-        f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
-    )
+        f"run deploy; the loops' least delay margin is {shown(found.delay, 's')}, and below "
+        f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
+    ).replace("µ", "u")
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
-
-
-def margin_figures(found: Survival | None) -> dict[str, float]:
-    """The margins that a computer's delay takes from."""
-    if found is None:
-        return {}
-    return {"delay_margin": found.delay, "phase_margin_deg": found.phase_deg}
 
 
 def verdict_dict(verdict: Verdict) -> dict[str, Any]:

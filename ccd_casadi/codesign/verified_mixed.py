@@ -11,7 +11,7 @@ from ccd_casadi.codesign.design_entries import (
     loop_of_design,
 )
 from ccd_casadi.codesign.robust_check import ReferenceCheck, RobustCheck
-from ccd_casadi.codesign.verdict import CloserModel, Line, State, survives
+from ccd_casadi.codesign.verdict import Line, State, survives
 from ccd_casadi.codesign.verified import Verified
 from ccd_casadi.inner_problem.constraints import touched
 from ccd_casadi.inner_problem.sweep import active_constraints
@@ -129,17 +129,16 @@ class VerifiedDesign(Verified):
         return Line(State.PASSED if good else State.FAILED, words, figures)
 
     def survives_line(self) -> Line:
-        closer = (
-            (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
-            for check in self.references
-        )
         return survives(
             self.survival,
             S_max=self.problem.inner.S_max,
             robust=None if self.robust is None else self.robust.passed,
             robust_words="" if self.robust is None else self.robust.words,
             other_damping="" if self.damping is None else self.damping.words,
-            closer=tuple(CloserModel(*item) for item in closer),
+            closer=[
+                (check.name, check.figures.certificate.stable, check.figures.sensitivity_peak)
+                for check in self.references
+            ],
         )
 
     def gap_words(self) -> str:

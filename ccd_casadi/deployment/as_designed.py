@@ -31,11 +31,7 @@ DESIGNED_EXCESS = 1e-3  # of S_max: of a loop that was designed as sampled
 
 
 def deploy_as_designed(
-    run: FinishedRun,
-    timing: Timing,
-    saturation: float | None,
-    seed: int,
-    progress: Callable[[str], None],
+    run: FinishedRun, timing: Timing, saturation: float | None, progress: Callable[[str], None]
 ) -> Deployment:
     """The sections as they are: nothing is reduced, at the case's rate and delay by Tustin's rule.
 
@@ -69,10 +65,9 @@ def deploy_as_designed(
     plants = SampledSet(
         run, dense, _channels(run), best.conversion, rate, timing.delay_at(rate), saturation
     )
-    progress("simulation")
     return plants.deployment(
         Limits(inner.S_max, inner.S_low, np.inf, full.bandwidth), K, full, trials, target,
-        seed=seed, compliance_max=sections_of_problem(run.problem).compliance_max,
+        sections_of_problem(run.problem).compliance_max,
     )  # fmt: skip
 
 

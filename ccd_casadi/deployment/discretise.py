@@ -6,11 +6,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from ccd_casadi.deployment.sampled import SampledFigures, sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled, tustin
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.sampled import SampledFigures, sampled_figures
 
 SLOWEST, FASTEST = 4.0, 4000.0  # rates tried, over ω_b/2π
 CLOSE = 1e-3  # relative: how closely the rate that is needed is bracketed

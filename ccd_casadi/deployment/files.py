@@ -7,9 +7,9 @@ from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.deployment.on_hardware import OnHardware, hardware_dict
 from ccd_casadi.deployment.outcome import ChannelOrders, Deployment
 from ccd_casadi.deployment.robust_set import MemberLoop, SetPlace
-from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.deployment.sections import Root, sections_of
 from ccd_casadi.inner_problem.sections_words import sections_dict
+from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.json_files import write_json
 from ccd_casadi.support.units import HZ
 from ccd_casadi.support.versions import versions
@@ -62,16 +62,10 @@ def controller_dict(found: Deployment) -> dict[str, Any]:
 
 def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str, Any]:
     """deploy.json: every figure of the way; frequencies in Hz."""
-    m, inner, limits = found.measured, run.problem.inner, found.limits
+    inner, limits = run.problem.inner, found.limits
     unverified = f"the run is not verified: {found.unverified}" if found.unverified else ""
-    simulated = None if m is None else {
-        "sensitivity_peak": m.sensitivity_peak,
-        "sensitivity_peak_hz": m.sensitivity_peak_frequency / HZ,
-        "bandwidth_hz": m.bandwidth / HZ, "periods": m.periods, "leftover": m.leftover,
-    }  # fmt: skip
     robust = None if not found.members else {
-        "plants": 1 + len(found.members), "simulated": 1 + len(found.measured_members),
-        "stable": found.stable, "worst": _member(found.worst),
+        "plants": 1 + len(found.members), "stable": found.stable, "worst": _member(found.worst),
         "members": [_member(item) for item in found.members],
     }  # fmt: skip
     return {
@@ -91,7 +85,6 @@ def deployment_dict(run: FinishedRun, found: Deployment, seed: int) -> dict[str,
         "full": _figures(run.figures),
         "reduced": _figures(found.reduced_figures),
         "sampled": _sampled(found.sampled) | {"bandwidth_hz": found.sampled.bandwidth / HZ},
-        "simulated": simulated,
         "compliance_peak": None if found.compliance is None else found.compliance[1],
         "static_stiffness": None if found.statics is None else found.statics.stiffness,
         "static_compliance": None if found.statics is None else found.statics.compliance,

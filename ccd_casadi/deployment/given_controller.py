@@ -21,12 +21,9 @@ from typing import Any
 import numpy as np
 
 from ccd_casadi.cases.run_folder import FinishedRun, read_json
-from ccd_casadi.deployment.sampled import sampled_figures
-from ccd_casadi.lti.closed_loop import closed_loop
-from ccd_casadi.lti.hold import Sampling, sampled, tustin
-from ccd_casadi.lti.loop import Loop
+from ccd_casadi.lti.hold import Sampling, tustin
 from ccd_casadi.lti.state_space import StateSpace
-from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure
@@ -52,35 +49,6 @@ class Given:
     delay: float = 0.0
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """A controller in discrete time with its delay in s; see `SampledController`."""
-
-    system: StateSpace
-    delay: float
-
-    @property
-    def period(self) -> float:
-        """Of sampling, in s."""
-        return self.system.period
-
-    def judge(self, plant: ScaledPlant) -> tuple[bool, float, float, float]:
-        """Stability, ω_b, ‖S‖∞ and rate of growth of the sampled loop."""
-        held = sampled(plant.plant_si(), self.period, self.delay)
-        f = sampled_figures(closed_loop(held, self.system).S)
-        growth = np.log(max(f.spectral_radius, 1e-300)) / self.period
-        return f.stable, f.bandwidth, f.sensitivity_peak, float(growth)
-
-    def loop(self, plant: ScaledPlant) -> Loop:
-        """The loop on a plant, hold and delay exact."""
-        return Loop(plant.plant_si(), self.system, Sampling(1.0 / self.period, 1e6 * self.delay))
-
-
-def in_discrete_time(controller: StateSpace, at: Sampling) -> Sampled:
-    """K(z) by Tustin's rule, as loops of fixed structure are designed to run."""
-    return Sampled(tustin(controller, at.period), at.delay)
-
-
 def as_it_runs(run: FinishedRun) -> FinishedRun:
     """A run whose case has a sampled loop with its controller as it runs there, by Tustin's rule.
 
@@ -88,10 +56,8 @@ def as_it_runs(run: FinishedRun) -> FinishedRun:
     """
     if run.problem.sampling is None:
         return run
-    sampled = in_discrete_time(run.controller, run.problem.sampling)
-    _, bandwidth, peak, _ = sampled.judge(run.plant)
-    figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
-    return replace(run, controller=sampled.system, figures=figures, sampled=sampled)
+    at = run.problem.sampling
+    return _measured(replace(run, controller=tustin(run.controller, at.period), sampling=at))
 
 
 def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
@@ -113,13 +79,20 @@ def with_controller(run: FinishedRun, path: Path) -> FinishedRun:
             pole = figures.certificate.max_real_pole
             raise UserError(f"{path}: the loop is not stable with it (a pole at {pole:.4g} 1/s)")
         return replace(run, controller=K, figures=figures)
-    sampled = Sampled(K, given.delay)
-    stable, bandwidth, peak, growth = sampled.judge(run.plant)
-    if not stable:
+    sampling = Sampling(1.0 / K.period, 1e6 * given.delay)
+    found = _measured(replace(run, controller=K, sampling=sampling))
+    if not np.isfinite(found.figures.sensitivity_peak):
+        growth = found.loop_on(run.plant.plant_si()).poles.real.max()
         words = f"the sampled loop is not stable with it (it grows by {growth:.4g} 1/s)"
         raise UserError(f"{path}: {words}")
-    figures = replace(run.figures, bandwidth=bandwidth, sensitivity_peak=peak)
-    return replace(run, controller=K, figures=figures, sampled=sampled)
+    return found
+
+
+def _measured(run: FinishedRun) -> FinishedRun:
+    """The run with ω_b and ‖S‖∞ of its sampled loop; NaN where that is unstable."""
+    f = sampled_figures(run.loop_on(run.plant.plant_si()).closed.S)
+    figures = replace(run.figures, bandwidth=f.bandwidth, sensitivity_peak=f.sensitivity_peak)
+    return replace(run, figures=figures)
 
 
 def read_controller(path: Path) -> Given:

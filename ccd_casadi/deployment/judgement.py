@@ -1,6 +1,6 @@
-"""A realised controller on the plants of a set: exact sampled figures, then a simulation."""
+"""A realised controller on the plants of a set: the exact figures of every sampled loop."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from ccd_casadi.cases.run_folder import FinishedRun
@@ -10,12 +10,11 @@ from ccd_casadi.deployment.outcome import ChannelOrders, Deployment, Trial
 from ccd_casadi.deployment.realisation import realise
 from ccd_casadi.deployment.reduction import Limits
 from ccd_casadi.deployment.robust_set import Member, MemberLoop
-from ccd_casadi.deployment.sampled import sampled_compliance, sampled_figures
-from ccd_casadi.deployment.simulation import measure_set
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.robust.sampled import sampled_compliance, sampled_figures
 from ccd_casadi.synthesis.statics import Statics, statics
 from ccd_casadi.synthesis.synthesis import DesignFigures
 
@@ -42,39 +41,26 @@ class SampledSet:
         held = {at: sampled(plant, period, delay) for at, plant in self.free.items()}
         loops = {at: closed_loop(G, self.realisation.system).S for at, G in held.items()}
         figures = {at: sampled_figures(loop) for at, loop in loops.items()}
-        self.held, self.loops, self.sampled = held, loops, figures.pop(Perturbation())
+        self.held, self.loops = held[Perturbation()], loops
+        self.sampled = figures.pop(Perturbation())
         self.checked = tuple(MemberLoop(at, item) for at, item in figures.items())
 
     def deployment(
         self, limits: Limits, reduced: StateSpace, reduced_figures: DesignFigures,
-        trials: Sequence[Trial], target: Target, *, simulated: Collection[Perturbation] = (),
-        compliance_max: float | None, seed: int,
+        trials: Sequence[Trial], target: Target, compliance_max: float | None,
     ) -> Deployment:  # fmt: skip
-        """All that was found, with a simulation on the worst member and those named."""
-        run, K = self.run, self.realisation.system
-        worst = [max(self.checked, key=lambda m: m.badness).at] if self.checked else []
+        """All that was found."""
+        run = self.run
         found = Deployment(
             self.orders, limits, reduced, reduced_figures, tuple(trials), target, self.rate_hz,
-            self.delay, self.conversion, self.held[Perturbation()], self.realisation, self.sampled,
-            None, self.checked, unverified=unverified(run), statics=statics_of(run, K),
+            self.delay, self.conversion, self.held, self.realisation, self.sampled, self.checked,
+            unverified=unverified(run), statics=statics_of(run, self.realisation.system),
             compliance_max=compliance_max,
         )  # fmt: skip
-        if not found.stable:
+        if compliance_max is None or not found.stable:
             return found
-        shown = [item.at for item in self.checked if item.at in {*simulated, *worst}]
-        nominal, *rest = measure_set(
-            [found.plant, *(self.held[at] for at in shown)], K, run.figures.bandwidth, seed
-        )
-        compliance = None if compliance_max is None else self._compliance()
-        return replace(
-            found, measured=nominal, compliance=compliance,
-            measured_members=tuple(zip(shown, rest, strict=True)),
-        )  # fmt: skip
-
-    def _compliance(self) -> tuple[Perturbation, float]:
-        """The largest |GS| in m/N of all plants, and where; every sampled loop is stable."""
-        found = {at: sampled_compliance(self.free[at], loop) for at, loop in self.loops.items()}
-        return max(found.items(), key=lambda pair: pair[1])
+        gains = {at: sampled_compliance(self.free[at], loop) for at, loop in self.loops.items()}
+        return replace(found, compliance=max(gains.items(), key=lambda pair: pair[1]))
 
 
 def unverified(run: FinishedRun) -> str:

@@ -2,19 +2,16 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ccd_casadi.deployment.channels import Channel
 from ccd_casadi.deployment.discretise import Conversion, Target
 from ccd_casadi.deployment.realisation import Realisation
 from ccd_casadi.deployment.reduction import Limits, Reduced
 from ccd_casadi.deployment.robust_set import MemberLoop, place_words
-from ccd_casadi.deployment.sampled import SampledFigures
-from ccd_casadi.deployment.simulation import MeasuredSensitivity
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.inner_problem.sweep import missed_by
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation
+from ccd_casadi.robust.sampled import SampledFigures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.statics import Statics
@@ -54,11 +51,10 @@ class Trial:
 class Deployment:
     """Everything that was found out on the way from a run's controller to the deployed one.
 
-    `sampled` are the exact figures of the sampled loop on the nominal plant, `measured` those of
-    its simulation (None where it is unstable on any plant); `members` and `measured_members` those
-    on every other plant of the run's [robust] set. `unverified`: why the run itself is not
-    verified, empty where it is. `compliance`: the largest |GS| in m/N and on which plant, where the
-    case bounds it.
+    `sampled` are the exact figures of the sampled loop on the nominal plant, `members` those on
+    every other plant of the run's [robust] set. `unverified`: why the run itself is not verified,
+    empty where it is. `compliance`: the largest |GS| in m/N and on which plant, where the case
+    bounds it.
     """
 
     orders: tuple[ChannelOrders, ...]
@@ -73,9 +69,7 @@ class Deployment:
     plant: StateSpace
     realisation: Realisation
     sampled: SampledFigures
-    measured: MeasuredSensitivity | None
     members: tuple[MemberLoop, ...] = ()
-    measured_members: tuple[tuple[Perturbation, MeasuredSensitivity], ...] = ()
     unverified: str = ""
     statics: Statics | None = None
     compliance: tuple[Perturbation, float] | None = None
@@ -116,19 +110,11 @@ class Deployment:
             if gain > (1.0 + self.target.excess) * self.compliance_max:
                 missed = missed_by(gain, self.compliance_max)
                 words.append(f"compliance |GS| in m/N {missed} ({place_words(at)})")
-        if words or self.measured is None:
-            return tuple(words)
-        pairs = [(Perturbation(), self.measured), *self.measured_members]
-        return tuple(
-            f"the simulation has a peak of S of {m.sensitivity_peak:.6g} and a bandwidth of "
-            f"{m.bandwidth / HZ:.6g} Hz ({place_words(at)})"
-            for at, m in pairs
-            if not (self.target.met if at == Perturbation() else self.target.held)(_as_figures(m))
-        )
+        return tuple(words)
 
     @property
     def passed(self) -> bool:
-        """Whether every sampled loop keeps its target, exactly and simulated, of a verified run."""
+        """Whether every sampled loop of a verified run keeps its target."""
         return not self.shortfalls and not self.unverified
 
 
@@ -140,9 +126,3 @@ def _fault(found: Deployment, item: MemberLoop) -> str:
         return f"peak of S {missed_by(f.sensitivity_peak, found.target.S_max)}"
     change = 100.0 * (f.bandwidth / found.target.bandwidth - 1.0)
     return f"bandwidth {f.bandwidth / HZ:.6g} Hz ({change:+.2f} %)"
-
-
-def _as_figures(m: MeasuredSensitivity) -> SampledFigures:
-    return SampledFigures(
-        True, np.nan, m.sensitivity_peak, m.sensitivity_peak_frequency, m.bandwidth
-    )

@@ -1,4 +1,4 @@
-"""Certified controller → reduced → sampled → verified → realised → measured in a simulation."""
+"""Certified controller → reduced → sampled → verified → realised."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,16 +40,15 @@ def deploy(
     timing: Timing,
     *,
     saturation: float | None = None,
-    seed: int = 0,
     progress: Callable[[str], None] = lambda words: None,
 ) -> Deployment:
-    """Reduce, discretise and verify the controller of a run; `progress` is told each step.
+    """Reduce, discretise and verify the controller of a run; `progress` is called at each step.
 
     All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
     where no sampling rate is enough, or the given one is no rate for this loop.
     """
     if kind_of(run.problem).as_designed:
-        return deploy_as_designed(run, timing, saturation, seed, progress)
+        return deploy_as_designed(run, timing, saturation, progress)
     inner, full = run.problem.inner, run.figures
     bandwidth_hz = full.bandwidth / HZ
     if timing.rate_hz is not None and timing.rate_hz < LEAST_RATE * bandwidth_hz:
@@ -83,11 +82,7 @@ def deploy(
             break
         # between the plants of the case's set the peak is larger: that plant counts from now on
         family = (*family, *(item for item in dense if item.at == outside.at))
-    progress("simulation")
-    return plants.deployment(
-        limits, reduced, reduced_figures, trials, target, seed=seed,
-        simulated={item.at for item in family}, compliance_max=inner.compliance_max,
-    )  # fmt: skip
+    return plants.deployment(limits, reduced, reduced_figures, trials, target, inner.compliance_max)
 
 
 def _orders(

@@ -17,9 +17,9 @@ from ccd_casadi.deployment.discretise import (
 )
 from ccd_casadi.deployment.outcome import Trial
 from ccd_casadi.deployment.robust_set import Member, WorstFirst
-from ccd_casadi.deployment.sampled import SampledFigures, together
 from ccd_casadi.deployment.timing import Discretisation, Timing
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.sampled import SampledFigures, together
 from ccd_casadi.support.errors import UserError
 from ccd_casadi.support.units import HZ
 

@@ -12,13 +12,13 @@ import numpy as np
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.codesign.robust_check import DENSE
 from ccd_casadi.deployment.channels import Channel
-from ccd_casadi.deployment.sampled import SampledFigures
 from ccd_casadi.fixed_structure.worst_plant import lattice
 from ccd_casadi.inner_problem.problem import plant_of
 from ccd_casadi.inner_problem.sections_plant_set import sections_of_problem, uncertain_plant
 from ccd_casadi.plants.modal import Perturbation, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.plants.scaling import ScaledPlant, scale_plant
+from ccd_casadi.robust.sampled import SampledFigures
 
 LATTICE = 41  # plants of a box that a deployed loop of sections is looked at on, besides its set
 

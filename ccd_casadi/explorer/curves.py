@@ -9,7 +9,6 @@ from ccd_casadi.analysis.loop_view import LoopView, loop_view
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.given_controller import in_discrete_time
 from ccd_casadi.explorer.designs import Look, Standing
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.kinds import kind_of
@@ -20,6 +19,7 @@ from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.scaling import ScaledPlant
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.units import HZ
 
@@ -133,9 +133,9 @@ def as_sampled(
     plant: ScaledPlant, controller: StateSpace, rate_hz: float, delay_us: float
 ) -> AsSampled:
     """A controller in discrete time on a plant: stability, ω_b and ‖S‖∞, hold and delay exact."""
-    sampled = in_discrete_time(controller, Sampling(rate_hz, delay_us))
-    stable, bandwidth, peak, _ = sampled.judge(plant)
+    loop = Loop(plant.plant_si(), controller, Sampling(rate_hz, delay_us))
+    f = sampled_figures(loop.closed.S)
     near = plant.grid * plant.omega_0 / HZ
     hz = frequency_grid(1e-4 * rate_hz, 0.499 * rate_hz, POINTS, near)
-    S = sampled.loop(plant).sensitivity(HZ * hz)
-    return AsSampled(stable, bandwidth / HZ, peak, hz, largest(S))
+    gain = largest(loop.sensitivity(HZ * hz))
+    return AsSampled(f.stable, f.bandwidth / HZ, f.sensitivity_peak, hz, gain)

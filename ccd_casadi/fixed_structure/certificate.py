@@ -33,6 +33,7 @@ from ccd_casadi.support.units import counted
 
 TOLERANCE = 1e-5  # relative: by how much a figure may pass its bound and still count as met
 AT_ONCE = 64  # plants
+ROUNDING = 10.0 * float(np.finfo(float).eps)
 REST = 1e-3  # of the lowest frequency of the grid: 0 Hz, seen from the figures' digits
 
 
@@ -45,10 +46,10 @@ class ChannelFigures:
     """
 
     name: str
-    S_peak: float
-    S_peak_frequency: float
-    bandwidth: float
-    weighted_KS: float
+    S_peak: float = np.nan
+    S_peak_frequency: float = np.nan
+    bandwidth: float = np.nan
+    weighted_KS: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -64,19 +65,19 @@ class PlantFigures:
 
     stable: bool
     stability: float
-    S_peak: float
-    S_peak_frequency: float
-    S_low: float
-    crossing: float
-    bandwidth: float
-    KS: float
-    T: float
-    GS: float
-    weighted_KS: float
-    weighted_T: float
-    static_compliance: float
-    low_compliance: float
-    confirmed: bool
+    S_peak: float = np.nan
+    S_peak_frequency: float = np.nan
+    S_low: float = np.nan
+    crossing: float = np.nan
+    bandwidth: float = np.nan
+    KS: float = np.nan
+    T: float = np.nan
+    GS: float = np.nan
+    weighted_KS: float = np.nan
+    weighted_T: float = np.nan
+    static_compliance: float = np.nan
+    low_compliance: float = np.nan
+    confirmed: bool = False
     channels: tuple[ChannelFigures, ...] = ()
 
 
@@ -164,8 +165,9 @@ def judged(
     loops = [_sensitivity(one, held) for one in G]
     poles = [np.linalg.eigvals(S.A) for S in loops]
     grown = [float(p.real.max() if sampling is None else np.abs(p).max() - 1.0) for p in poles]
-    found = [_unstable(one) for one in grown]
-    good = [i for i, S in enumerate(loops) if grown[i] < -_rounding(S.A)]
+    found = [PlantFigures(False, one) for one in grown]
+    # A pole that is no further from the axis than rounding may move it may lie on it.
+    good = [i for i, S in enumerate(loops) if grown[i] < -ROUNDING * np.linalg.norm(S.A)]
     if not good:
         return found
     corner = 0.0
@@ -231,29 +233,16 @@ def _rows(
     integrator: bool,
 ) -> tuple[list[ChannelFigures], np.ndarray]:
     """The figures of one channel's row on every plant, and whether its peak is confirmed."""
-    nan = np.nan
     if not own.given:
-        return [ChannelFigures(own.name, nan, nan, nan, nan)] * len(grid), np.ones(len(grid), bool)
+        return [ChannelFigures(own.name)] * len(grid), np.ones(len(grid), bool)
     curve, u = f"S of {own.name}", np.array([own.output])
     rows = [StateSpace(S.A, S.B, u @ S.C, u @ S.D) for S in loops]
     norm, confirmed = norms(rows, table, *tops[curve], row=own.output)
     _, bandwidth = crossing_and_bandwidth(table, grid, values[curve], integrator, own.output)
-    missing = np.full(len(grid), nan)
+    missing = np.full(len(grid), np.nan)
     weighted = tops.get(f"weighted KS of {own.name}", (missing, missing))[0]
     numbers = np.stack([norm, tops[curve][1], bandwidth, weighted], axis=1)
     return [ChannelFigures(own.name, *figures) for figures in numbers.tolist()], confirmed
-
-
-def _rounding(A: Array) -> float:
-    """What rounding may move a pole by: one that is no further from the axis may lie on it."""
-    return float(10.0 * np.finfo(float).eps * np.linalg.norm(A))
-
-
-def _unstable(stability: float) -> PlantFigures:
-    nan = np.nan
-    return PlantFigures(
-        False, stability, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, False
-    )
 
 
 def _sensitivity(G: StateSpace, K: StateSpace) -> StateSpace:

@@ -1,7 +1,7 @@
 """A system as a state space, continuous or in discrete time, with its response, poles and zeros.
 
 The judge `fixed_structure.certificate` and the compiled kernels form loops of their own, and
-`deployment.simulation` and `.move` run them sample by sample: these stay independent of this.
+`deployment.move` runs them sample by sample: it stays independent of this.
 """
 
 from dataclasses import dataclass, field

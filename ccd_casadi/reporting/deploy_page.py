@@ -23,7 +23,7 @@ from ccd_casadi.drawing.content import (
     Table,
     Words,
 )
-from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, ORANGE
+from ccd_casadi.drawing.svg import BLUE, GREEN, ORANGE
 from ccd_casadi.inner_problem.sections_words import gain_of, section_words
 from ccd_casadi.lti.closed_loop import largest, sensitivity
 from ccd_casadi.lti.grid import frequency_grid
@@ -34,7 +34,7 @@ from ccd_casadi.reporting.loops import bandwidth_level, over_hz, sensitivity_pan
 from ccd_casadi.reporting.moves import move_blocks
 from ccd_casadi.reporting.robustness_figures import named
 from ccd_casadi.reporting.sections_page import sections_table
-from ccd_casadi.reporting.tables import over_frequency, over_time, spread
+from ccd_casadi.reporting.tables import over_frequency, over_time
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.support.units import HZ, number, shown
 
@@ -97,13 +97,6 @@ def _loop(run: FinishedRun, found: Deployment) -> Figure:
         curves.append(Curve(hz, largest(sensitivity(G @ K)), label, colour, line))
         drawn.append(Curve(hz, largest(K), "", colour, line))
     gains, controllers = ([curve.y for curve in each] for each in (curves, drawn))
-    if found.measured is not None:
-        first = int(np.searchsorted(found.measured.omega / HZ, low))
-        at = [first + i for i in spread(found.measured.omega[first:])]
-        curves.append(
-            Curve(found.measured.omega[at] / HZ, found.measured.gain[at],
-                  "measured in the simulation", BLACK, "", ".")
-        )  # fmt: skip
     S_max = run.problem.inner.S_max
     bandwidth = run.figures.bandwidth / HZ
     crossing = bandwidth_level(bandwidth, text=", continuous")

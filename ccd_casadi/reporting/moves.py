@@ -1,17 +1,31 @@
 """A move and a step of force of a design on every plant of its set; a move on the machine."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ccd_casadi.analysis import loop_figures
+from ccd_casadi.analysis.motor import UNLIMITED, cycle_of
 from ccd_casadi.analysis.move import Move, mass_feedforward, moves
 from ccd_casadi.analysis.move_limits import LIMITS, WINDOW
 from ccd_casadi.analysis.setpoint import setpoint
-from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware, Way
-from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table, Words
+from ccd_casadi.deployment.on_hardware import WATCHED, OnHardware
+from ccd_casadi.drawing.content import (
+    Band,
+    Curve,
+    Figure,
+    Level,
+    Lines,
+    Panel,
+    Section,
+    Table,
+    Words,
+)
 from ccd_casadi.drawing.svg import BLACK, BLUE, GREEN, GREY, ORANGE
 from ccd_casadi.inner_problem.design_loops import free_loops
+from ccd_casadi.inner_problem.move_figures import motion_of
 from ccd_casadi.inner_problem.problem import CoDesignProblem, plant_of
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
@@ -19,13 +33,14 @@ from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
 from ccd_casadi.reporting.tables import over_time
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import counted, number, shown
+from ccd_casadi.support.units import counted, number, shown, shown_unit
 
 AFTER = 1.0  # of the move's duration, that is shown after its end
 POINTS = 600
 SETTLED = 4.0  # time constants of the slowest pole that the force step is shown for
 STEPS = 200  # points of it
 DRAWN = 1200  # points of a curve of a move on the machine
+FLAT = 30.0  # an error so many times smaller than another is flat beside it
 COLOURS = (GREY, BLUE, ORANGE, GREEN, BLACK)
 
 
@@ -33,14 +48,22 @@ def move_parts(
     problem: CoDesignProblem, theta: Sequence[float], controller: StateSpace,
     loops: Sequence[Loop], bandwidth_hz: float,
 ) -> tuple[Lines, str, Table]:  # fmt: skip
-    """Error of the default move of `robustness` on the plants of `loops`, their rigid bodies free:
-    without and with mass feedforward (the last panel), its words and numbers."""
-    profile = setpoint(LIMITS)
-    modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
-    ahead = mass_feedforward(modal, 0)
-    ways = {"without feedforward": None} | ({} if ahead is None else {"mass feedforward": ahead})
+    """Error of the case's move, or of the default one of `robustness`, on the plants of `loops`,
+    their rigid bodies free: without and with feedforward (the last panel), its words and numbers.
+    """
+    if problem.source.motion is not None:
+        motion = motion_of(problem, theta)
+        profile, window = motion.cycle.profile, motion.motion.window
+        name, other = "feedforward up to snap", "the move of [move]"
+        ahead: Array | None = motion.forward
+    else:
+        profile, window = setpoint(LIMITS), WINDOW
+        modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
+        name, ahead = "mass feedforward", mass_feedforward(modal, 0)
+        other = "for other moves [move] of the case, or the options of robustness"
+    ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, controller)
-    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=WINDOW,
+    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=bandwidth_hz)  # fmt: skip
     end = profile.duration
     time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)
@@ -58,12 +81,58 @@ def move_parts(
     how = "hold and delay exact, at the instants" if sampled else "continuous loop"
     where = "without the suspension" if found[0][0].free else "on the soft suspension"
     caption = (
-        f"{number(1e3 * LIMITS.stroke)} mm in {number(1e3 * end, 4)} ms "
-        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; for other moves "
-        f"the options of robustness). {' '.join(words)}"
+        f"{number(1e3 * float(profile.at(np.array([end]))[0, 0]))} mm in {number(1e3 * end, 4)} ms "
+        f"{'on every plant of the set ' if len(loops) > 1 else ''}{where} ({how}; {other}). "
+        f"{' '.join(words)}"
     )
     lines = Lines((tuple(panels),), "Error of a move", (3.2,))
     return lines, caption, over_time(heads, *columns)
+
+
+def cycle_section(
+    problem: CoDesignProblem, theta: Sequence[float], result: Mapping[str, Any]
+) -> list[Section]:
+    """Force and heat over a cycle of the case's move, what limits it, and its time over the heat
+    that is allowed; nothing for a case without a motor."""
+    own, told = problem.source.motion, result.get("move")
+    if own is None or own.motor is None or not told:
+        return []
+    found, motor = motion_of(problem, theta), own.motor
+    profile, forces, settled = found.cycle.profile, found.forward[2], told["settled_latest"]
+    k, R, _ = motor.at(found.mass)
+    time = np.linspace(0.0, profile.duration + own.dwell, POINTS)
+    force = np.outer(profile.at(time)[2], forces)
+    heat = R / k**2 * (force**2).sum(axis=1)
+    end = Level(1e3 * profile.duration, "end of the setpoint", vertical=True)
+    mean = Level(told["power"], "mean")
+    ms = 1e3 * time
+    panels = [
+        Panel("time (ms)", "force of a motor (N)", (Curve(ms, force[:, 0]),), levels=(end,)),
+        Panel("time (ms)", "heat (W)", (Curve(ms, heat),), levels=(mean,)),
+    ]
+    if not own.required:
+        watts = told["power"] * np.linspace(0.1, 2.0, 39)
+        limited = [replace(own, motor=replace(motor, rms_power=float(watt))) for watt in watts]
+        times = [cycle_of(each, forces, found.mass).profile.duration for each in limited]
+        late = 0.0 if settled is None else settled - profile.duration
+        curve = Curve(watts, 1e3 * (np.array(times) + late))
+        panels.append(Panel("heat that is allowed (W)", "move and settling (ms)", (curve,)))
+    share = f"{number(100.0 * told['heat_share'], 3)} % of the heat"
+    if motor.peak_current[0] < UNLIMITED:
+        share += f" and {number(100.0 * told['peak_share'], 3)} % of the peak force"
+    settling = "it does not settle on the whole set" if settled is None else (
+        f"on every plant of the set it has settled after {number(1e3 * settled, 4)} ms"
+    )  # fmt: skip
+    words = (
+        f"A cycle of {number(ms[-1], 4)} ms: {number(told['peak_force'], 4)} N and "
+        f"{number(told['peak_current'], 3)} A at most, {number(told['rms_force'], 4)} N RMS, "
+        f"{number(told['power'], 4)} W: {share} that the motor allows. The setpoint takes "
+        f"{number(1e3 * profile.duration, 4)} ms, limited by {', '.join(told['limits'])}; "
+        f"{settling}."
+    )
+    table = over_time(("ms", "N", "W"), ms, force[:, 0], heat)
+    lines = Lines((tuple(panels),), "A cycle of the motor", (3.0,))
+    return [Section("The motor", (Figure(lines, words, (table,)),))]
 
 
 def force_step(loops: Sequence[Loop], bandwidth_hz: float) -> Figure:
@@ -115,42 +184,71 @@ def _words(name: str, made: Sequence[Move]) -> str:
 
 def move_blocks(found: OnHardware) -> tuple[Figure, Words]:
     """Error and force over time in every way, a table, and how much force the move needs."""
-    drawn = [way for way in found.ways if way.move.peak_error < 1e3 * found.ways[0].move.peak_error]
-    error, force = [], []
-    for way, colour in zip(found.ways, COLOURS, strict=False):
-        if way not in drawn:
-            continue
-        m = way.move
-        at = np.unique(np.linspace(0, len(m.time) - 1, DRAWN).astype(int))
-        ms = 1e3 * m.time[at]
-        error.append(Curve(ms, 1e6 * m.error[at, 0], way.words, colour))
-        force.append(Curve(ms, m.force[at, 0], "", colour))
-    end = Level(1e3 * found.profile.duration, "setpoint ends", vertical=True)
-    lines = Lines(
-        ((Panel("time (ms)", "error (µm)", tuple(error), levels=(end,), legend="upper right"),),
-         (Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)),)),
-        "A move of output 1, sampled with hold and delay", (3.0, 2.2),
-    )  # fmt: skip
-    head = ("way", "settled after, ms", "peak error, µm", "last error, µm", "peak force, N",
-            "at the limit")  # fmt: skip
+    ways = {way.words: way.move for way in found.ways}
+    words = "The plant has its soft suspension, hold and delay are exact."
+    return ways_figure(ways, words), Words(_limit_words(found))
+
+
+def ways_figure(ways: Mapping[str, Move], words: str) -> Figure:
+    """Error and first force of one move made in several ways, and a table; `words` end the
+    caption."""
+    moves = list(ways.values())
+    first, until = moves[0], max(map(shown_until, moves))
+    end = Level(1e3 * first.duration, "setpoint ends", vertical=True)
+    kept = [(name, m, colour) for (name, m), colour in zip(ways.items(), COLOURS, strict=False)
+            if m.peak_error < 1e3 * first.peak_error]  # fmt: skip
+    top = max(m.peak_error for _, m, _ in kept)
+    panels, force = [], []
+    for large in (True, False):  # those that are flat beside the large ones by themselves
+        same = [way for way in kept if (FLAT * way[1].peak_error > top) == large]
+        unit, scale = shown_unit("m", max((m.peak_error for _, m, _ in same), default=0.0))
+        curves = []
+        for name, m, colour in same:
+            at = np.flatnonzero(m.time <= until)
+            at = at[np.unique(np.linspace(0, at.size - 1, DRAWN).astype(int))]
+            ms = 1e3 * m.time[at]
+            curves.append(Curve(ms, scale * _error(m)[at], name, colour))
+            force.append(Curve(ms, m.force[at, 0], "", colour))
+        if curves:
+            panels.append(Panel("time (ms)", f"error ({unit})", tuple(curves), levels=(end,),
+                                legend="upper right"))  # fmt: skip
+    heights = (*[2.6] * len(panels), 2.2)
+    panels.append(Panel("time (ms)", "force 1 (N)", tuple(force), levels=(end,)))
+    lines = Lines(tuple((panel,) for panel in panels), "Error and force of a move", heights)
+    head = ("way", "settled after, ms", "RMS error, µm", "peak error, µm", "last error, µm",
+            "peak force, N", "at the limit")  # fmt: skip
     rows = tuple(
-        (way.words, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.peak_error,
-         1e6 * m.last_error(WATCHED), float(m.peak_force.max()), f"{100.0 * m.saturated:.3g} %")
-        for way in found.ways for m in (way.move,)
+        (name, "not" if np.isinf(m.settled) else number(1e3 * m.settled), 1e6 * m.rms_error,
+         1e6 * m.peak_error, 1e6 * m.last_error(WATCHED), float(m.peak_force.max()),
+         f"{100.0 * m.saturated:.3g} %")
+        for name, m in ways.items()
     )  # fmt: skip
+    ends = "; ".join(way_words(*way, until) for way in ways.items())
     caption = (
-        f"{'; '.join(map(way_words, found.ways))}. Settled is what stays within "
-        f"{shown(found.window, 'm')}; the last error of the table is the largest over the last "
-        "quarter. The plant has its soft suspension, hold and delay are exact."
+        f"{ends}. Settled is what stays within {shown(first.window, 'm')}; the last error of the "
+        f"table is the largest over the last quarter. {words}"
     )
-    return Figure(lines, caption, (Table(head, rows),)), Words(_limit_words(found))
+    return Figure(lines, caption, (Table(head, rows),))
 
 
-def way_words(way: Way) -> str:
-    """How a move ends."""
-    m = way.move
+def _error(m: Move) -> Array:
+    """Of the moving output."""
+    return m.error if m.error.ndim == 1 else np.asarray(m.error[:, 0])
+
+
+def shown_until(found: Move) -> float:
+    """Where the figure of a move ends, s."""
+    return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
+
+
+def way_words(name: str, m: Move, until: float = np.inf) -> str:
+    """How a move ends, and what is left of its error after `until` s, where a figure ends."""
     when = "does not settle" if np.isinf(m.settled) else f"settled after {shown(m.settled, 's')}"
-    return f"{way.words}: {when}, error of at most {shown(m.peak_error, 'm')}"
+    words = f"{name}: {when}, error of at most {shown(m.peak_error, 'm')}"
+    after = np.abs(_error(m)[m.time > until])
+    if not after.size or m.settled <= until:
+        return words
+    return f"{words}, of {shown(float(after.max()), 'm')} after the figure's end"
 
 
 def _limit_words(found: OnHardware) -> str:

@@ -2,16 +2,15 @@
 
 import numpy as np
 
-from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Band, Curve, Figure, Level, Lines, Panel, Table
 from ccd_casadi.drawing.svg import BLUE, CYCLE, GREY, ORANGE
 from ccd_casadi.reporting.loops import over_hz
-from ccd_casadi.reporting.tables import ROWS, over_frequency, over_time
+from ccd_casadi.reporting.tables import ROWS, over_frequency
 from ccd_casadi.robust.structured import StructuredBound
 from ccd_casadi.robust.study import Study
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.units import HZ, shown_unit
+from ccd_casadi.support.units import HZ
 
 SHOWN_PEAK = 3.0  # of S_max: a loop near instability has any peak
 DRAWN = 1500  # points of a curve in time
@@ -131,40 +130,3 @@ def structured(bound: StructuredBound, caption: str) -> Figure:
     best = np.sort(np.argsort(-bound.mu)[:ROWS])
     table = Table.of(("Hz", "μ, complex errors"), bound.hz[best], bound.mu[best])
     return Figure(Lines(((panel,),), "Structured singular value"), caption, (table,))
-
-
-def shown_until(found: Move) -> float:
-    """Where the figure of a move ends, s."""
-    return found.duration + max(0.5 * found.duration, min(found.settling, 2.0 * found.duration))
-
-
-def move(found: Move, caption: str) -> Figure:
-    """Setpoint, error and forces over time, the first part of the tail included."""
-    shown = found.time <= shown_until(found)
-    pick = np.flatnonzero(shown)[:: max(1, int(shown.sum()) // DRAWN)]
-    t = 1e3 * found.time[pick]
-    end = Level(1e3 * found.duration, "setpoint ends", vertical=True)
-    unit, scale = shown_unit("m", found.peak_error)
-    window = (
-        Level(scale * found.window, "window", colour=GREY),
-        Level(-scale * found.window, "", colour=GREY),
-    )
-    forces = tuple(
-        Curve(t, found.force[pick, j], f"u{j + 1}" if found.force.shape[1] > 1 else "", colour)
-        for j, colour in zip(range(found.force.shape[1]), CYCLE * 4, strict=False)
-    )
-    error = Curve(t, scale * found.error[pick], colour=ORANGE)
-    near = window if found.window < 3.0 * found.peak_error else ()
-    rows = (
-        (Panel("time (ms)", "position (mm)", (Curve(t, 1e3 * found.position[pick]),)),
-         Panel("time (ms)", "acceleration (m/s²)", (Curve(t, found.acceleration[pick]),))),
-        (Panel("time (ms)", f"error ({unit})", (error,), levels=(end, *near)),
-         Panel("time (ms)", "force (N)", forces)),
-    )  # fmt: skip
-    names = [f"u{j + 1} N" for j in range(found.force.shape[1])]
-    head = ("ms", "position mm", "acceleration m/s²", f"error {unit}", *names)
-    columns = (1e3 * found.time, 1e3 * found.position, found.acceleration, scale * found.error)
-    n = int(np.count_nonzero(found.time <= 2.0 * found.duration))
-    table = over_time(head, *(column[:n] for column in (*columns, *found.force.T)))
-    lines = Lines(rows, "Position, acceleration, error and force of a move")
-    return Figure(lines, caption, (table,))

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.run_folder import FinishedRun
 from ccd_casadi.drawing.content import Facts, Heading, Page, Section, Table, Words
 from ccd_casadi.reporting import robustness_figures as figures
 from ccd_casadi.reporting.facts import theta_words
+from ccd_casadi.reporting.moves import ways_figure
 from ccd_casadi.reporting.verdict import head_of
 from ccd_casadi.robust.margins import DiskMargin
 from ccd_casadi.robust.perturbed import Judged, Line
@@ -55,9 +55,9 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     reach, hard, S_max = found.demands.shift, found.tolerances, run.problem.inner.S_max
     low, high = found.shift.stable
     words = [
-        f"Stable for resonance shifts of {_share(low, reach)} to {_share(high, reach)}; ‖S‖∞ stays "
-        f"within S_max = {S_max:g} from {_share(found.shift.within[0], reach)} to "
-        f"{_share(found.shift.within[1], reach)}.",
+        f"Stable for resonance shifts of {100.0 * low:+.2f} to {100.0 * high:+.2f} % (tried to "
+        f"±{100.0 * reach:g} %); ‖S‖∞ stays within S_max = {S_max:g} from "
+        f"{100.0 * found.shift.within[0]:+.2f} to {100.0 * found.shift.within[1]:+.2f} %.",
         f"Damping times {found.demands.damping[0]:g} to {found.demands.damping[1]:g}: "
         + _damping(found.damping, found.demands.damping)
         + f" Shift and damping together: worst at {100 * found.box.place[0]:+.2f} % and damping × "
@@ -82,12 +82,10 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
             f"{100 * bound.stiffness:.3g} % (every frequency by {100 * bound.shift:.3g} %), "
             "each mode by itself; proven on a grid of frequencies."
         )
-    if found.overrun is not None:
-        words.append(f"Structured singular value: not computed within {found.overrun:g} s.")
     words.append(found.statics.words)
     words += [_moved(found, i) for i in range(len(found.moves))]
-    if run.sampled is not None:
-        step = f"{1e6 * run.sampled.period:.5g} µs"
+    if run.sampling is not None:
+        step = f"{1e6 * run.sampling.period:.5g} µs"
         words.append(
             f"A controller in discrete time, a step every {step}, hold and "
             "delay exact at the instants; noise and the structured singular value are of "
@@ -131,22 +129,6 @@ def _place(omega: float) -> str:
     if omega in (0.0, np.inf):
         return "at rest" if omega == 0.0 else "towards infinite frequency"
     return f"at {number(omega / HZ, 4)} Hz"
-
-
-def _cut(move: Move) -> str:
-    """What the figure does not show of a move that settles after its end."""
-    until = figures.shown_until(move)
-    later = np.abs(move.error[move.time > until])
-    if move.duration + move.settling <= until or not later.size:
-        return ""
-    most = metres(float(later.max()))
-    return f" The figure ends before, at {shown(until, 's')}: after that the error is up to {most}."
-
-
-def _share(value: float, reach: float) -> str:
-    """A shift in %, and whether that is only as far as was looked."""
-    more = " (the end of what was tried)" if abs(value) >= reach * (1.0 - 1e-9) else ""
-    return f"{100.0 * value:+.2f} %{more}"
 
 
 def _damping(line: Line, ends: tuple[float, float]) -> str:
@@ -257,9 +239,6 @@ def _tolerances(run: FinishedRun, found: Study) -> Section:
 
 def _structured(found: Study) -> list[Section]:
     bound = found.structured
-    if found.overrun is not None:
-        words = f"Not computed within {found.overrun:g} s. Give it longer with --limit."
-        return [Section("Structured singular value", (Words(words),))]
     if bound is None:
         return []
     caption = (
@@ -277,12 +256,11 @@ def _move(found: Study) -> Section:
         if found.moves[0].free
         else "on its soft suspension, without which the loop is not stable"
     )
-    moves = [
-        figures.move(move, f"{_moved(found, i)}{_cut(move)}") for i, move in enumerate(found.moves)
-    ]
+    ways = {"with mass feedforward" if m.feedforward else "without feedforward": m
+            for m in found.moves}  # fmt: skip
     words = (
         f"A fourth-order setpoint for output {found.demands.axis + 1}, simulated exactly on the "
         f"plant {plant}. It reaches {number(found.setpoint.velocity)} m/s, "
         f"{number(found.setpoint.acceleration)} m/s² and {number(found.setpoint.jerk)} m/s³."
     )
-    return Section("A move", (Words(words), *moves))
+    return Section("A move", (Words(words), ways_figure(ways, "The loop is simulated exactly.")))

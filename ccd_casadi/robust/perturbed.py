@@ -12,11 +12,11 @@ from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.survival import damping_range, excess_of, growth_of, shift_range
 from ccd_casadi.inner_problem.kinds import kind_of
 from ccd_casadi.inner_problem.problem import plant_of
-from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.plants.modal import ModalPlant, Perturbation, modal_plant
 from ccd_casadi.plants.plant import Mechanics, mechanics
 from ccd_casadi.plants.scaling import scale_plant
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.progress import Progress
 from ccd_casadi.synthesis.closed_loop import measure
@@ -57,15 +57,14 @@ class Line:
 
 def judge(run: FinishedRun, modal: ModalPlant, place: tuple[float, ...]) -> Judged:
     """The run's controller on a plant."""
-    if run.sampled is not None:
-        good, omega, height, growth = run.sampled.judge(scale_plant(modal, run.problem.weights.M_K))
-        return Judged(place, good, omega, height if good else np.inf, growth)
+    plant = scale_plant(modal, run.problem.weights.M_K)
+    if run.sampling is not None:
+        loop = run.loop_on(plant.plant_si()).closed.S
+        f = sampled_figures(loop)
+        height, growth = f.sensitivity_peak if f.stable else np.inf, float(loop.rates.real.max())
+        return Judged(place, f.stable, f.bandwidth, height, growth)
     figures: DesignFigures = measure(
-        scale_plant(modal, run.problem.weights.M_K),
-        run.controller,
-        run.weights,
-        gamma=UNBOUNDED,
-        omega_low=run.problem.inner.omega_low,
+        plant, run.controller, run.weights, gamma=UNBOUNDED, omega_low=run.problem.inner.omega_low
     )
     stable = figures.certificate.stable
     peak = figures.sensitivity_peak if stable else np.inf
@@ -107,9 +106,7 @@ def damping_line(
 
 def _loops(run: FinishedRun, system: Mechanics) -> LoopsOffModel:
     """The loops of which the verdict of a solve reads its ranges."""
-    at = run.sampled
-    sampling = None if at is None else Sampling(1.0 / at.period, 1e6 * at.delay)
-    return loops_off_model(system, run.problem.suspension, run.controller, sampling)
+    return loops_off_model(system, run.problem.suspension, run.controller, run.sampling)
 
 
 def _ends(

@@ -26,7 +26,7 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import ModalPlant
 from ccd_casadi.plants.scaling import ScaledPlant
-from ccd_casadi.robust.mu_bound import balanced_bound, mu_bound
+from ccd_casadi.robust.mu_bound import mu_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.closed_loop import responses
 
@@ -37,8 +37,6 @@ FLANKS = np.linspace(-12.0, 12.0, 97)  # in their real parts
 SAME = 1e-6  # relative
 ROUNDS, FINE = 8, 8  # refinements around the worst frequency, and points a side
 BISECTIONS = 25
-GAIN = 1.25  # more than the best scaling gains on a balanced matrix (up to 1.08 was seen)
-AT_ONCE = 16  # matrices scaled at a time
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def structured_bound(
         M = np.array(
             [_errors(modal, kept, 2.0 * np.pi * f, k) for f, k in zip(new, K, strict=True)]
         )
-        mu = _bounds(M)
+        mu = mu_bound(M)
         known = np.vstack([known, np.column_stack([new, mu])])
         found = _largest(M, 1.0 / mu.max(), allowed)
         if found is not None:
@@ -101,18 +99,6 @@ def _errors(modal: ModalPlant, kept: NDArray[np.intp], omega: float, K: NDArray)
     return -root[:, None] * np.linalg.inv(Z)[np.ix_(kept, kept)] * root
 
 
-def _bounds(M: NDArray) -> Array:
-    """Bounds of μ: of balanced matrices, and the least ones where that decides which is largest."""
-    mu = balanced_bound(M)
-    open_ = np.ones(len(M), dtype=bool)
-    while open_[mu.argmax()]:
-        top = np.flatnonzero(open_)
-        top = top[np.argsort(-mu[top])[:AT_ONCE]]
-        mu[top] = np.minimum(mu[top], mu_bound(M[top]))
-        open_[top] = False
-    return mu
-
-
 def _stand(M: NDArray, r: float) -> NDArray[np.bool_]:
     """Whether some disk around [-r, r] is free of singular points, for matrices (k, n, n)."""
     diagonal = np.einsum("kii->ki", M)
@@ -126,12 +112,10 @@ def _stand(M: NDArray, r: float) -> NDArray[np.bool_]:
             np.eye(M.shape[1]) - 1j * kappa * r * M[left] * side[left], M[left]
         )
         turned *= r * np.sqrt(1.0 + kappa**2)
-        # cheapest first: the two norms that bound σ_max, a balanced matrix, the best scaling
+        # cheapest first: the two norms that bound σ_max
         size = np.abs(turned)
         bound = np.sqrt(size.sum(axis=1).max(axis=1) * size.sum(axis=2).max(axis=1))
         open_ = bound >= 1.0
-        bound[open_] = balanced_bound(turned[open_])
-        open_ = (bound >= 1.0) & (bound < GAIN)
         bound[open_] = mu_bound(turned[open_])
         standing[left] = bound < 1.0
     return standing

@@ -32,7 +32,6 @@ from ccd_casadi.robust.structured import StructuredBound, structured_bound
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.process_pool import Pool
 from ccd_casadi.support.units import HZ
-from ccd_casadi.support.worker_process import Overrun, Runner
 from ccd_casadi.synthesis.statics import Statics, statics
 
 NYQUIST = 0.999  # of half the sampling rate: where a grid ends
@@ -44,9 +43,8 @@ class Study:
     the frequencies in rad/s (0: at rest), which the grid does not decide; `moves` the move without
     and with feedforward.
 
-    `structured` is None where no flexible mode is in the loop, and where the bound was not computed
-    within the `overrun` seconds that it was given. Of a controller in discrete time there is no
-    `noise` and no `structured` bound.
+    `structured` is None where no flexible mode is in the loop. Of a controller in discrete time
+    there is no `noise` and no `structured` bound.
     """
 
     demands: Demands
@@ -64,7 +62,6 @@ class Study:
     structured: StructuredBound | None
     setpoint: Setpoint
     moves: tuple[Move, ...]
-    overrun: float | None = None
 
     @property
     def survives(self) -> bool:
@@ -74,41 +71,14 @@ class Study:
 
 
 def robustness(
-    run: FinishedRun, demands: Demands | None = None, seed: int = 0, quiet: bool = True
-) -> Study:
-    """Put a run's controller through all that is demanded; nothing is designed anew."""
-    return with_structured_bound(run, tried(run, demands, seed, quiet))
-
-
-def with_structured_bound(run: FinishedRun, found: Study, seconds: float | None = None) -> Study:
-    """The study with its bound of the structured singular value.
-
-    Given `seconds`, it is computed in a process of its own, which is ended after them.
-    """
-    if run.sampled is not None:
-        return found
-    modal = modal_plant(system_of(run), run.problem.suspension)
-    if seconds is None:
-        bound = structured_bound(run.plant, modal, run.controller, found.hz)
-        return replace(found, structured=bound, overrun=None)
-    with Runner() as runner:
-        try:
-            bound = runner.call(
-                seconds, structured_bound, run.plant, modal, run.controller, found.hz
-            )
-        except Overrun:
-            return replace(found, structured=None, overrun=seconds)
-    return replace(found, structured=bound, overrun=None)
-
-
-def tried(
     run: FinishedRun,
     demands: Demands | None = None,
     seed: int = 0,
     quiet: bool = True,
     workers: Pool | None = None,
 ) -> Study:
-    """Everything but the structured singular value; `workers` share what they can."""
+    """Study a run's controller on all demands; nothing is designed. `workers`
+    share what they can."""
     d = demands or Demands()
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)
     sampled = loop.sampling is not None
@@ -133,7 +103,11 @@ def tried(
         modes=single_modes(run, system, d.shift),
         box=worst_in_box(run, system, d.shift, d.damping, quiet),
         tolerances=tolerances(run, d.tolerance, d.samples, seed, quiet, workers),
-        structured=None,
+        structured=None
+        if sampled
+        else structured_bound(
+            run.plant, modal_plant(system, run.problem.suspension), run.controller, hz
+        ),
         setpoint=profile,
         moves=_moves(run, profile, d),
     )
@@ -143,7 +117,7 @@ def _statics(run: FinishedRun) -> Statics:
     return statics(
         run.plant.plant_si(), run.controller, bandwidth=run.figures.bandwidth,
         omega_low=run.problem.inner.omega_low,
-        period=0.0 if run.sampled is None else run.sampled.period,
+        period=0.0 if run.sampling is None else run.sampling.period,
     )  # fmt: skip
 
 
@@ -162,9 +136,7 @@ def _moves(run: FinishedRun, profile: Setpoint, demands: Demands) -> tuple[Move,
 
 def loop_of(run: FinishedRun) -> Loop:
     """The run's loop on its plant, as it runs."""
-    if run.sampled is not None:
-        return run.sampled.loop(run.plant)
-    return Loop(run.plant.plant_si(), run.controller)
+    return run.loop_on(run.plant.plant_si())
 
 
 def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
@@ -198,7 +170,7 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
         "static_stiffness": at.stiffness,
         "static_compliance": at.compliance,
         "static_share": at.share,
-        "period": None if run.sampled is None else run.sampled.period,
+        "period": None if run.sampling is None else run.sampling.period,
         "noise": noise,
         "resonance_shift": _line(found.shift, "shift"),
         "damping": _line(found.damping, "factor"),
@@ -216,7 +188,6 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             | _judged(hard.worst),
         },
         "structured": structured,
-        "structured_not_computed_within_s": found.overrun,
         "move": {
             "limits": vars(d.limits) | {"window": d.window, "axis": d.axis + 1},
             "duration": found.setpoint.duration,

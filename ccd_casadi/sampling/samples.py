@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ccd_casadi.inner_problem.sweep import InnerProblem
-from ccd_casadi.sampling.rows import Sample
+from ccd_casadi.sampling.rows import COLUMNS, Sample
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.synthesis.derivatives import Sensitivities
 from ccd_casadi.synthesis.synthesis import DesignFigures
@@ -16,7 +16,8 @@ class BandwidthSample:
     """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
 
     An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
-    `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
+    `error`, the least RMS error in m or time of a move in s, the gradient is of that, and ω_b that
+    of its controller.
     """
 
     theta: tuple[float, ...]
@@ -77,29 +78,14 @@ def sample_of(
     if design is not None:
         whole = np.hstack([design.to_theta, design.to_break_frequencies])
         gradients = tuple(float(v) for v in whole.ravel())
-    certificate = figures.certificate
-    return Sample(
-        key=key,
-        theta=theta,
-        omega_S=figures.omega_S,
-        omega_T=figures.omega_T,
-        outcome=figures.outcome.name.lower(),
-        reason=figures.outcome.value,
-        gamma_opt=figures.gamma_opt,
-        gamma_lower_bound=figures.gamma_lower_bound,
-        gamma=figures.gamma,
-        bandwidth=figures.bandwidth,
-        sensitivity_peak=figures.sensitivity_peak,
-        sensitivity_peak_frequency=figures.sensitivity_peak_frequency,
-        sensitivity_low=figures.sensitivity_low,
-        max_real_pole=certificate.max_real_pole,
-        norm=certificate.norm,
-        norm_bound=certificate.norm_bound,
-        certified=figures.certified,
-        seconds=seconds,
-        gradients=gradients,
-        compliance=figures.compliance,
-    )
+    known = {
+        name: getattr(source, name)
+        for source in (figures.certificate, figures)
+        for name in COLUMNS
+        if hasattr(source, name)
+    }
+    own = {"outcome": figures.outcome.name.lower(), "reason": figures.outcome.value}
+    return Sample(**known | own, key=key, theta=theta, seconds=seconds, gradients=gradients)
 
 
 def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample:

@@ -55,11 +55,11 @@ def test_a_range_is_reached_from_the_plant_alone(tmp_path) -> None:  # type: ign
     with SampleStore(tmp_path / "s.sqlite") as store, Workers(1, 60.0) as pool:
         sampler = Sampler(case, store, pool)
         assert not acceptable(case, x, sampler.truth.at(x))
-        reached = widen(sampler, x)
-        assert 0.0 < reached.share <= 1.0
-        held = replace(case, robust=OPEN.scaled(reached.share) if case.robust else None)
-        held = replace(held, robust=replace(held.robust, design_shift=-0.02 * reached.share))
-        assert acceptable(held, reached.x, Sampler(held, store, pool).truth.at(reached.x))
+        reached, share = widen(sampler, x)
+        assert 0.0 < share <= 1.0
+        held = replace(case, robust=OPEN.scaled(share) if case.robust else None)
+        held = replace(held, robust=replace(held.robust, design_shift=-0.02 * share))
+        assert acceptable(held, reached, Sampler(held, store, pool).truth.at(reached))
 
 
 @pytest.mark.parametrize("share", [2e-1, 1e-3, 1e-6, 1e-9, 1e-12])

@@ -14,7 +14,6 @@ from ccd_casadi.codesign.loops_off_model import LoopsOffModel, loops_off_model
 from ccd_casadi.codesign.robust_check import OtherDamping, survived
 from ccd_casadi.codesign.survival import FACTORS, PEAK, REACH, Survival, reach, survival
 from ccd_casadi.codesign.verdict import State, survives
-from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Sampling
 from ccd_casadi.inner_problem.controller_problem import RobustSet
 from ccd_casadi.lti.closed_loop import closed_loop
@@ -24,6 +23,7 @@ from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Perturbation, Suspension, modal_plant
 from ccd_casadi.plants.plant import Mechanics
 from ccd_casadi.robust import perturbed
+from ccd_casadi.robust.sampled import sampled_figures
 
 SUSPENSION = Suspension(0.5, 0.7)
 CROSSOVER = 100.0  # rad/s

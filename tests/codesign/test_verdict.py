@@ -104,17 +104,17 @@ def test_an_unstable_controller_a_narrow_damping_and_a_high_closer_peak_are_warn
     for item in (
         v.survives(replace(SOUND, unstable_poles_hz=(143.0,)), S_max=2.0),
         v.survives(replace(SOUND, stable_damping=(0.7, 10.0)), S_max=2.0),
-        v.survives(SOUND, S_max=2.0, closer=[v.CloserModel("20 modes", True, 2.3)]),
+        v.survives(SOUND, S_max=2.0, closer=[("20 modes", True, 2.3)]),
     ):
         assert item.state is v.State.WARNED
-    calm = v.survives(SOUND, S_max=2.0, closer=[v.CloserModel("20 modes", True, 2.1)])
+    calm = v.survives(SOUND, S_max=2.0, closer=[("20 modes", True, 2.1)])
     assert calm.state is v.State.PASSED
 
 
 def test_its_own_set_or_an_unstable_closer_model_fails() -> None:
     assert v.survives(SOUND, S_max=2.0, robust=False).state is v.State.FAILED
     assert v.survives(SOUND, S_max=2.0, robust=True).state is v.State.PASSED
-    lost = v.survives(SOUND, S_max=2.0, closer=[v.CloserModel("20 modes", False, math.inf)])
+    lost = v.survives(SOUND, S_max=2.0, closer=[("20 modes", False, math.inf)])
     assert lost.state is v.State.FAILED
     assert "20 modes" in lost.words
 

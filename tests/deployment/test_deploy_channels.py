@@ -16,7 +16,6 @@ from ccd_casadi.deploy import main as deploy_main
 from ccd_casadi.deployment.files import deployment_dict
 from ccd_casadi.deployment.outcome import Deployment
 from ccd_casadi.deployment.pipeline import deploy
-from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Timing
 from ccd_casadi.drawing.paint import painted
 from ccd_casadi.fixed_structure.channel_structure import ChannelStructure
@@ -25,6 +24,7 @@ from ccd_casadi.inner_problem.sections_plant_set import structure_of, uncertain_
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.reporting.deploy_page import deploy_page
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.solve import main as solve_main
 from ccd_casadi.support.units import HZ
 from ccd_casadi.synthesis.closed_loop import measure

@@ -7,15 +7,15 @@ import pytest
 from helpers import few
 from hypothesis import given
 from hypothesis import strategies as st
+from sampled_simulation import measure_set, simulate
 from scipy.linalg import expm
 
 from ccd_casadi.deployment.discretise import Conversion, Target, discretise, needed_rate, nice_rate
-from ccd_casadi.deployment.sampled import SampledFigures, sampled_figures, together
-from ccd_casadi.deployment.simulation import measure_set, simulate
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.sampled import SampledFigures, sampled_figures, together
 
 HZ = 2.0 * np.pi
 

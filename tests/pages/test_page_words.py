@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ccd_casadi.analysis.move import Move
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.deployment.words import against
@@ -15,8 +16,8 @@ from ccd_casadi.inner_problem.sections_problem import SectionsProblem
 from ccd_casadi.reporting.facts import conclusion
 from ccd_casadi.reporting.insight import front_answer
 from ccd_casadi.reporting.loops import above
-from ccd_casadi.reporting.robustness_figures import shown_peak, shown_until
-from ccd_casadi.reporting.robustness_page import _cut
+from ccd_casadi.reporting.moves import shown_until, ways_figure
+from ccd_casadi.reporting.robustness_figures import shown_peak
 from ccd_casadi.reporting.verdict import LINES, advice
 from ccd_casadi.studies.conclusions import conclusions
 from ccd_casadi.support.units import HZ
@@ -74,6 +75,9 @@ def test_a_prediction_of_a_sample_by_itself_is_no_figure() -> None:
 def test_a_page_says_first_whether_to_build_it(states: dict, said: str) -> None:
     assert advice(result_of(**states)).startswith(said)
     assert advice({"status": "verified"}) == ""
+    alone = result_of(survives="warned")  # nothing was found against it
+    alone["verdict"]["survives"]["words"] = "[robust] names no plant but the model; stable for"
+    assert advice(alone).startswith("Do not build this yet: it was judged on the model alone.")
 
 
 def test_a_peak_is_above_or_below_what_it_is_held_against() -> None:
@@ -88,11 +92,12 @@ def test_an_axis_and_a_figure_that_end_early_say_so() -> None:
     found = SimpleNamespace(tolerances=SimpleNamespace(judged=judged))
     assert shown_peak(run, found) == 3.0 * 1.75
     time = np.linspace(0.0, 8.0, 801)
-    move = SimpleNamespace(duration=0.18, settling=5.69, time=time, error=1e-4 * np.exp(-time))
+    rest, error = np.zeros(801), 1e-4 * np.exp(-time)
+    move = Move(time, rest, rest, error, rest[:, None], False, 0.18, window=1e-6)
     assert shown_until(move) == pytest.approx(0.54)
-    assert "The figure ends before, at 540 ms: after that the error is up to" in _cut(move)
-    move.settling = 0.0
-    assert _cut(move) == ""
+    assert "of 57.7 µm after the figure's end" in ways_figure({"one": move}, "").caption
+    soon = replace(move, error=1e-6 * np.exp(-time))
+    assert "after the figure's end" not in ways_figure({"one": soon}, "").caption
 
 
 def test_insight_and_compare_begin_with_their_answer() -> None:

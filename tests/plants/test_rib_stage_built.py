@@ -12,7 +12,6 @@ from ccd_casadi.case_studies.rib_stage.plant import rib_stage
 from ccd_casadi.cases.case import load_case
 from ccd_casadi.cases.case_problem import problem_of
 from ccd_casadi.cases.run_folder import sections_kappa
-from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.fixed_structure import Structure
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
 from ccd_casadi.inner import main as inner_main
@@ -21,6 +20,7 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.plants.modal import Suspension
 from ccd_casadi.plants.plant import hardware_cost, mechanics
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import UserError
 
 built = benchmark("rib_stage_built")

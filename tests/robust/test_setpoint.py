@@ -14,13 +14,12 @@ from ccd_casadi.analysis.move import mass_feedforward, simulate
 from ccd_casadi.analysis.move_limits import Limits
 from ccd_casadi.analysis.setpoint import Setpoint, setpoint
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.given_controller import Sampled
 from ccd_casadi.deployment.timing import Discretisation
+from ccd_casadi.lti.hold import Sampling
 from ccd_casadi.lti.loop import Loop
 from ccd_casadi.lti.state_space import StateSpace
 from ccd_casadi.plants.modal import Suspension, modal_plant
 from ccd_casadi.plants.plant import mechanics
-from ccd_casadi.plants.scaling import scale_state_space
 
 # ---- the setpoint -------------------------------------------------------------------------------
 
@@ -151,9 +150,9 @@ def test_a_sampled_move_tends_to_the_continuous_one() -> None:
     for rate in (4e3, 8e3):
         period = 1.0 / rate
         tustin = Conversion(Discretisation.TUSTIN, False, 100.0)
-        K = Sampled(discretise(controller, tustin, period, 0.5 * period), 0.5 * period)
-        found = simulate(K.loop(scale_state_space(plant, 1e5)), profile, axis=0, forces=None,
-                         window=1e-7, bandwidth_hz=15.0)  # fmt: skip
+        K = discretise(controller, tustin, period, 0.5 * period)
+        found = simulate(Loop(plant, K, Sampling(rate, 0.5e6 * period)), profile, axis=0,
+                         forces=None, window=1e-7, bandwidth_hz=15.0)  # fmt: skip
         there = np.interp(found.time, move.time, move.error)[found.time <= move.duration]
         apart.append(np.abs(found.error[: len(there)] - there).max() / move.peak_error)
     assert apart[0] < 0.05

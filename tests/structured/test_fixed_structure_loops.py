@@ -9,7 +9,6 @@ from fixed_structure_channels import closed
 from fixed_structure_loops import BOUNDS, FAST, LATE, SLOW, by_curve, loop, plant
 
 from ccd_casadi.deployment.discretise import Conversion, discretise
-from ccd_casadi.deployment.sampled import sampled_figures
 from ccd_casadi.deployment.timing import Discretisation
 from ccd_casadi.fixed_structure import Sampling, ShapeEnd, Structure
 from ccd_casadi.fixed_structure.certificate_curves import frequency_grid
@@ -32,6 +31,7 @@ from ccd_casadi.lti.closed_loop import closed_loop
 from ccd_casadi.lti.hold import sampled
 from ccd_casadi.lti.norms import hinf_norm
 from ccd_casadi.lti.state_space import StateSpace
+from ccd_casadi.robust.sampled import sampled_figures
 from ccd_casadi.support.errors import PlantError
 
 STRUCTURES = [
