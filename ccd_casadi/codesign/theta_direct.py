@@ -12,7 +12,7 @@ from ccd_casadi.support.arrays import Array
 from surrogates import design
 
 SETTLED = 1e-7  # of J: what steps promise less than that is not looked for
-LONG = 0.1  # of the box: first steps from a start that may lie anywhere
+FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 
@@ -53,7 +53,7 @@ def solve_direct_value(sampler: Sampler, starts: int, *, seed: int) -> Formulati
         message = f"none of {len(points)} starting designs is certified"
         return FormulationResult(message=message)
     if starts > 1:
-        good = [pieces_from(truth, one, SETTLED, LONG)[0] for one in good]
+        good = [pieces_from(truth, one, SETTLED, FAR)[0] for one in good]
     best = min(good, key=lambda one: objective_of(problem, one))
     return FormulationResult(np.array(best.theta), None, (), (), None, True, "")
 
