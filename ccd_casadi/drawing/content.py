@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ccd_casadi.drawing.pictures import ModeShapes
-from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE
+from ccd_casadi.drawing.svg import BLACK, BLUE, GREY, ORANGE, require_shapes
 from ccd_casadi.support.arrays import Array
 
 Corner = Literal["best", "lower left", "lower right", "upper left", "upper right", "center left",
@@ -124,9 +124,16 @@ def _cell(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Picture:
-    """An <svg> element that a plant or a machine has drawn of itself."""
+    """An <svg> element that a plant or a machine has drawn of itself.
+
+    Raises ValueError where it holds more than shapes and words: it goes into a page as it is, and a
+    report.json may come from a stranger.
+    """
 
     svg: str
+
+    def __post_init__(self) -> None:
+        require_shapes(self.svg)
 
 
 @dataclass(frozen=True, eq=False)
