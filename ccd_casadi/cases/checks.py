@@ -165,7 +165,7 @@ factors = every(POSITIVE, "give a list of numbers above 0")
 numbers = every(ANY, "give a list of numbers", 1)
 listed = Check(numbers.test, _list(ANY.schema, 2))
 named = Check(
-    lambda value: None if value and isinstance(value, str) else "is no text",
+    lambda value: None if value and isinstance(value, str) else "is not text",
     {"type": "string", "minLength": 1},
 )
 files = every(named, "give a list of file names in quotes")

@@ -94,4 +94,4 @@ class ThetaOuter(Outer, ABC):
         return NestedLearner(self.sampler, seed=seed)
 
     def responses(self, x: Array) -> PostOptimal:
-        raise UserError("insight knows no responses of an optimum of this kind of controller")
+        raise UserError("insight has no derivatives of an optimum of this kind of controller")

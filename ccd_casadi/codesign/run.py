@@ -84,14 +84,14 @@ def co_design(
     """
     if sampler.problem.listed:
         if given is not None:
-            raise UserError("--surrogate: starts no solve with lists of values; leave it out")
+            raise UserError("--surrogate: cannot start a solve with lists of values; leave it out")
         return _of_lists(sampler, formulation, seed)
     began = perf_counter()
     name, tolerance = type(formulation).__name__.lower(), formulation.tolerance
     outer = outer_of(sampler)
     require_solvable(sampler.problem)
     if given is not None and not outer.learns_from_others:
-        raise UserError("--surrogate: starts no solve of this kind; solve the case without it")
+        raise UserError("--surrogate: cannot start a solve of this kind; solve the case without it")
     forbidden = unmet_constraint(sampler.problem, formulation.starts, seed)
     if forbidden:
         return concluded(nothing_found(outer, forbidden), name, tolerance, seed, began)
@@ -122,7 +122,7 @@ OUTERS: dict[type[ControllerProblem], type[Outer]] = {
 
 
 def verify(sampler: Sampler, x: Array) -> Verified:
-    """The design at x polished on the truth, held against the whole inner problem, and judged.
+    """Polish the design at x on the truth, compare it with the whole inner problem, judge it.
 
     x is θ, followed by ln ω_S and ln ω_T for mixed sensitivity.
     """

@@ -88,7 +88,7 @@ def optimal(
     if not gap <= tolerance:
         return Line(State.FAILED, f"not optimal: {better}; {known}", figures)
     if unknown and not math.isfinite(residual):
-        return Line(State.WARNED, f"{unknown}: a limit of ours; {known}", figures)
+        return Line(State.WARNED, f"{unknown}: a limit of the program; {known}", figures)
     if not residual <= level:
         words = f"not optimal: KKT residual {residual:.1e} over theta, above {level:g}; {known}"
         return Line(State.FAILED, words, figures)
@@ -286,8 +286,8 @@ def deployable(found: Survival | None, sampling: Sampling | None = None) -> Line
         return Line(State.UNKNOWN, "run deploy", figures)
     rate = DELAY_PERIODS / found.delay
     words = (
-        f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, so that hold "
-        f"and one period of delay alone use it up below {float(f'{rate:.3g}'):g} Hz"
+        f"run deploy; the loops' least delay margin is {1e6 * found.delay:.3g} us, and below "
+        f"{float(f'{rate:.3g}'):g} Hz hold and one period of delay exceed it"
     )
     return Line(State.UNKNOWN, words, figures | {"unstable_below_rate_hz": rate})
 

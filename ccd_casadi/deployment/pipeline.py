@@ -42,7 +42,7 @@ def deploy(
     saturation: float | None = None,
     progress: Callable[[str], None] = lambda words: None,
 ) -> Deployment:
-    """Reduce, discretise and verify the controller of a run; `progress` is told each step.
+    """Reduce, discretise and verify the controller of a run; `progress` is called at each step.
 
     All of it on the nominal plant and on every plant of the run's [robust] set. Raises UserError
     where no sampling rate is enough, or the given one is no rate for this loop.

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 from scipy.signal import find_peaks
 
 from ccd_casadi.support.arrays import Array
 from ccd_casadi.support.errors import UserError, described
 from ccd_casadi.support.units import HZ
+from ccd_casadi.synthesis.interchange import mat_variables
 
 BELOW = 3  # decades that a response is followed below its first line
 PER_DECADE = 25
@@ -119,7 +119,7 @@ def read_frequency_response(path: str | Path) -> MeasuredResponse:
     if path.suffix.lower() == ".npz":
         return _of_columns(_npz(path), path)
     if path.suffix.lower() == ".mat":
-        return _of_columns(_mat(path), path)
+        return _of_columns(_named(mat_variables(path)), path)
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
@@ -160,21 +160,9 @@ def _named(variables: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def _mat(path: Path) -> dict[str, np.ndarray]:
-    try:
-        variables = loadmat(path)
-    except OSError as error:
-        words = f"cannot be read as a frequency response: {error.strerror or error}"
-        raise UserError(f"{path}: {words}") from None
-    except Exception as error:  # whatever its reader stumbles over in a damaged or newer file
-        words = f"is not a .mat file of version 7 or older ({described(error)}); save -v7, or a CSV"
-        raise UserError(f"{path}: {words}") from None
-    return _named(variables)
-
-
 def _of_columns(columns: dict[str, np.ndarray], path: Path) -> MeasuredResponse:
     if "hz" not in columns:
-        raise UserError(f"{path}: has no column f_hz; name the frequencies so")
+        raise UserError(f"{path}: has no column f_hz; give the frequencies that name")
     hz = np.real(columns["hz"]).astype(float)
     if "G" in columns:
         G = np.asarray(columns["G"], complex)

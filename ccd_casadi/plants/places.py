@@ -76,9 +76,15 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         words = f"need {axes + len(places.quiet)} actuators and sensors or more"
         raise PlantError(f"places.axes, quiet and damped {words}; add some, or drop a mode")
     between, own = Between(nodes), [list(names).index(name) for name in plant.names]
+    points = Points(places.actuators, names), Points(places.sensors, names)
+    for group in points:
+        still, slack = ~group.slope.any(axis=2), 1e-9 * np.ptp(nodes, axis=0)
+        beyond = np.clip(group.constant, nodes.min(axis=0) - slack, nodes.max(axis=0) + slack)
+        if (still & (beyond != group.constant)).any():
+            raise PlantError("places: a force or sensor is beyond the nodes; move it between them")
 
     def of(evaluate: Evaluate) -> PlacedMechanics:
-        return PlacedMechanics(evaluate, places, between, tuple(names), own)
+        return PlacedMechanics(evaluate, places, between, *points, own)
 
     def below(theta: Sequence[float]) -> tuple[float, ...]:
         return tuple(float(theta[i]) for i in own)
@@ -99,12 +105,12 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
     whole = of(plant.evaluate)
     x = ca.MX.sym("theta", len(names))
     f, lam = plant.hardware(ca.vertcat(*(x[i] for i in own)))
-    lam = ca.vertcat(lam, *_rules(places, whole, x).values())
+    rules = _rules(whole, x)
     return Plant(
         names=tuple(names),
-        constraint_names=(*plant.constraint_names, *_rules(places, whole, x)),
+        constraint_names=(*plant.constraint_names, *rules),
         evaluate=whole,
-        hardware=ca.Function("hardware", [x], [f, lam]),
+        hardware=ca.Function("hardware", [x], [f, ca.vertcat(lam, *rules.values())]),
         outputs=axes or len(places.sensors) or plant.outputs,
         inputs=axes or len(places.actuators),
         references={name: of(closer) for name, closer in plant.references.items()},
@@ -112,7 +118,7 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
         values=None if plant.values is None else of(plant.values),
         notes=notes,
         nearby=None if plant.nearby is None else near,
-        domain=_domain(plant, places, nodes, names),
+        domain=_domain(plant, whole, len(names)),
         doubt=lambda theta: plant.doubt(below(theta)),
         shapes=whole.shapes if nodes.shape[1] == 2 else None,
         drawing=whole.drawing if nodes.shape[1] < 3 else None,
@@ -121,23 +127,14 @@ def placed(plant: Plant, places: Places, names: Sequence[str]) -> Plant:
 
 @dataclass(frozen=True)
 class PlacedMechanics:
-    """θ in the order of `names` -> Mechanics; `evaluate` takes the parameters `own` of them."""
+    """θ -> Mechanics; `evaluate` takes the parameters `own` of it, the points are moved by all."""
 
     evaluate: Evaluate
     places: Places
     between: Between
-    names: tuple[str, ...]
+    actuators: Points
+    sensors: Points
     own: list[int]
-
-    @property
-    def actuators(self) -> Points:
-        """Where they are."""
-        return Points(self.places.actuators, self.names)
-
-    @property
-    def sensors(self) -> Points:
-        """Where they are."""
-        return Points(self.places.sensors, self.names)
 
     def __call__(self, theta: Sequence[float]) -> Mechanics:
         values = np.asarray(theta, float)
@@ -216,37 +213,30 @@ def _flexible(system: Mechanics) -> tuple[Array, Array]:
     return np.sqrt(lam[flexible]), modes[:, flexible]
 
 
-def _rules(places: Places, of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
+def _rules(of: PlacedMechanics, theta: ca.MX) -> dict[str, ca.MX]:
     """λ by name: least distances, where θ moves them."""
-    found: dict[str, ca.MX] = {}
-    seen: set[frozenset[Point]] = set()
-    for word, points, group in (("actuators", places.actuators, of.actuators),
-                                ("sensors", places.sensors, of.sensors)):  # fmt: skip
-        at = group.symbols(theta) if places.apart else []
+    found: dict[frozenset[Point], tuple[str, ca.MX]] = {}  # a force and its sensor are one place
+    for word, points, group in (("actuators", of.places.actuators, of.actuators),
+                                ("sensors", of.places.sensors, of.sensors)):  # fmt: skip
+        at = group.symbols(theta) if of.places.apart else []
         for i, j in combinations(range(len(at)), 2):
-            pair = frozenset((points[i], points[j]))  # a force and its sensor are at one place
-            if (group.slope[i] != group.slope[j]).any() and pair not in seen:
-                seen.add(pair)
-                away = at[i] - at[j]
-                found[f"{word} {i + 1} and {j + 1} apart"] = 1.0 - ca.sumsqr(away) / places.apart**2
-    return found
+            if (group.slope[i] != group.slope[j]).any():
+                name = f"{word} {i + 1} and {j + 1} apart"
+                lam = 1.0 - ca.sumsqr(at[i] - at[j]) / of.places.apart**2
+                found.setdefault(frozenset((points[i], points[j])), (name, lam))
+    return dict(found.values())
 
 
-def _domain(
-    plant: Plant, places: Places, nodes: Array, names: Sequence[str]
-) -> tuple[Array, Array]:
+def _domain(plant: Plant, of: PlacedMechanics, count: int) -> tuple[Array, Array]:
     """The plant's, and for positions the box around the nodes."""
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
     if plant.domain is not None:
-        own = [list(names).index(name) for name in plant.names]
-        low[own], high[own] = plant.domain
-    first, last = nodes.min(axis=0), nodes.max(axis=0)
-    for point in (*places.actuators, *places.sensors):
-        for axis, value in enumerate(point):
-            if isinstance(value, str):
-                i = list(names).index(value.removeprefix("-"))
-                least, most = (-last, -first) if value.startswith("-") else (first, last)
-                low[i], high[i] = max(low[i], least[axis]), min(high[i], most[axis])
+        low[of.own], high[of.own] = plant.domain
+    ends = of.between.nodes.min(axis=0), of.between.nodes.max(axis=0)
+    for points in (of.actuators, of.sensors):
+        for point, axis, k in np.argwhere(points.slope):
+            least, most = sorted(points.slope[point, axis, k] * end[axis] for end in ends)
+            low[k], high[k] = max(low[k], least), min(high[k], most)
     return low, high
 
 

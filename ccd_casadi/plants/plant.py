@@ -59,7 +59,7 @@ def to_first_order(system: Mechanics, step: Array) -> Mechanics:
 
 @dataclass(frozen=True)
 class Plant:
-    """A model bound to its parameters: what the design loop asks of any plant.
+    """A plant model bound to its parameters, as the design loop uses it.
 
     `evaluate` gives M, D, K, B, C and their derivatives at θ, from CasADi or from finite elements;
     `hardware` maps θ to (f, λ) as a casadi.Function in either case. `references` are the same

@@ -55,9 +55,9 @@ def conclusion(run: FinishedRun, found: Study) -> list[str]:
     reach, hard, S_max = found.demands.shift, found.tolerances, run.problem.inner.S_max
     low, high = found.shift.stable
     words = [
-        f"Stable for resonance shifts of {_share(low, reach)} to {_share(high, reach)}; ‖S‖∞ stays "
-        f"within S_max = {S_max:g} from {_share(found.shift.within[0], reach)} to "
-        f"{_share(found.shift.within[1], reach)}.",
+        f"Stable for resonance shifts of {100.0 * low:+.2f} to {100.0 * high:+.2f} % (tried to "
+        f"±{100.0 * reach:g} %); ‖S‖∞ stays within S_max = {S_max:g} from "
+        f"{100.0 * found.shift.within[0]:+.2f} to {100.0 * found.shift.within[1]:+.2f} %.",
         f"Damping times {found.demands.damping[0]:g} to {found.demands.damping[1]:g}: "
         + _damping(found.damping, found.demands.damping)
         + f" Shift and damping together: worst at {100 * found.box.place[0]:+.2f} % and damping × "
@@ -129,12 +129,6 @@ def _place(omega: float) -> str:
     if omega in (0.0, np.inf):
         return "at rest" if omega == 0.0 else "towards infinite frequency"
     return f"at {number(omega / HZ, 4)} Hz"
-
-
-def _share(value: float, reach: float) -> str:
-    """A shift in %, and whether that is only as far as was looked."""
-    more = " (the end of what was tried)" if abs(value) >= reach * (1.0 - 1e-9) else ""
-    return f"{100.0 * value:+.2f} %{more}"
 
 
 def _damping(line: Line, ends: tuple[float, float]) -> str:

@@ -77,7 +77,7 @@ def robustness(
     quiet: bool = True,
     workers: Pool | None = None,
 ) -> Study:
-    """Put a run's controller through all that is demanded; nothing is designed anew. `workers`
+    """Study a run's controller on all demands; nothing is designed. `workers`
     share what they can."""
     d = demands or Demands()
     system, loop, profile = system_of(run), loop_of(run), setpoint(d.limits)

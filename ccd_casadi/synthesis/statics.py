@@ -49,15 +49,12 @@ class Statics:
     @property
     def words(self) -> str:
         """One or two sentences."""
-        low = f"at {self.low_hz:.3g} Hz {metres(self.low)} (GS there)"
+        low = f"1 N at {self.low_hz:.3g} Hz moves it {metres(self.low)}"
         if self.integrates:
-            return (
-                "The controller integrates: at rest a constant force moves the stage by nothing; "
-                f"1 N moves it {low}."
-            )
+            return f"The controller integrates: a constant force does not move the stage; {low}."
         found = (
             f"Static stiffness K(0) = {shown(self.stiffness, 'N/m')}: a constant force of 1 N "
-            f"moves the stage {metres(self.compliance)} (GS at 0 Hz), {low}."
+            f"moves the stage {metres(self.compliance)}, {low}."
         )
         if self.differentiates:
             found += (

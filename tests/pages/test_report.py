@@ -360,8 +360,8 @@ def test_a_foreign_or_damaged_report_json_is_told(
 ) -> None:
     place = tmp_path / "report.json"
     for text, said in (
-        ("{", "is no report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
-        ('{"format": 1, "pages": {"../a.html": {}}}', "names what is no page"),
+        ("{", "is not a report.json"), ('{"format": 2, "pages": {}}', "format: is not 1"),
+        ('{"format": 1, "pages": {"../a.html": {}}}', "names a file that is not a page"),
         ('{"format": 1, "pages": {"a.html": {"head": 3}}}', "is not what a page shows"),
     ):  # fmt: skip
         place.write_text(text)

@@ -145,6 +145,7 @@ def test_what_does_not_match_is_one_sentence() -> None:
     for places, words in (
         (Places(GRID[:-1], POINTS), "19, the plant has 20 inputs"),
         (Places(GRID, (("x",),)), "has 1 coordinates, a node 2"),
+        (Places(GRID, (("x", 0.21),)), "beyond the nodes"),
         (Places(line, POINTS), "on one line"),
     ):
         with pytest.raises(PlantError, match=words):
