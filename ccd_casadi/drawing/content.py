@@ -197,28 +197,7 @@ class Landscape:
         return ~(first[:, None] & second[None, :])
 
 
-@dataclass(frozen=True)
-class SweepMap:
-    """The inner problem at one θ: rows (ω_S Hz, ω_T Hz, ω_b Hz, ‖S‖∞, |S(low)|, feasible 1/0).
-
-    `bandwidth_hz`, `peak` = ln(‖S‖∞/S_max) and `low`, the largest ln(figure/bound) of the bounds
-    that `others` names, lie on the grid of
-    `omega_S`, `omega_T` in Hz, (len(omega_S), len(omega_T)), NaN outside what is known; empty
-    where the rows carry no field. `optimum` is (ω_S, ω_T, ω_b) in Hz.
-    """
-
-    rows: Array
-    omega_S: Array
-    omega_T: Array
-    bandwidth_hz: Array
-    peak: Array
-    low: Array
-    optimum: tuple[float, float, float]
-    source: str
-    others: str = "S_low"
-
-
-Drawing = Lines | Landscape | SweepMap | Modes | Picture
+Drawing = Lines | Landscape | Modes | Picture
 
 
 @dataclass(frozen=True)
