@@ -135,7 +135,9 @@ def verify(sampler: Sampler, x: Array) -> Verified:
 def require_solvable(problem: CoDesignProblem) -> None:
     """Raise UserError where J rewards what it should not."""
     if not problem.figure.larger_is_better and not problem.w2 > 0.0:
-        words = 'with inner.minimise = "rms_error" J = w1 f + w2 e counts the error e in m'
+        v = problem.figure
+        words = f'with inner.minimise = "{v.key}" J = w1 f + w2 {v.symbol} counts the {v.words} '
+        words += f"{v.symbol} in {v.si_unit}"
         raise UserError(f"objective.w2: is {problem.w2:g}; {words}: give a positive number")
 
 

@@ -151,7 +151,7 @@ def _found(problem: CoDesignProblem, best: BandwidthSample) -> Solution:
         "theta": dict(zip(problem.names, best.theta, strict=True)),
         "hardware_cost": hardware_cost(plant_of(problem), best.theta),
         "bandwidth_hz": best.bandwidth / HZ,
-        "error_rms_of_set": best.error,
+        f"{problem.figure.entry}_of_set": best.value,
     }
     outcome = FormulationResult(np.array(best.theta), agreed=True)
     return Solution(result, outcome, None, problem=_at(problem, best.theta, best.kappa))

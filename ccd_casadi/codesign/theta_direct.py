@@ -105,4 +105,5 @@ def pieces_from(
     end = descend(at, start, others, constraints, steps=steps, settled=settled, first=first)
     met = (found for found in map(local, truth.known.values()) if found is not None)
     jumped = any(found.value > end.value and jumps(end, found) for found in met)
-    return min(truth.known.values(), key=lambda sample: objective_of(problem, sample)), jumped
+    found = (best, *truth.known.values())  # where nothing is promised nothing was asked for
+    return min(found, key=lambda sample: objective_of(problem, sample)), jumped

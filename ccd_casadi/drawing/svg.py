@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # at least 3.4 : 1 to white paper, which their pink, yellow and sky have not.
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 PURPLE, AMBER, BROWN = "#b8548c", "#a87000", "#8c564b"
-SKY = "#56b4e9"  # on a dark ground alone
 BLACK, GREY = "#1a1a1a", "#767676"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, AMBER, BROWN, BLACK)
 # Colours of a figure -> the page's variable (`page.CSS`) that it becomes: (light, dark).

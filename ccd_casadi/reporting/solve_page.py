@@ -50,7 +50,7 @@ from ccd_casadi.reporting.landscape import (
 from ccd_casadi.reporting.limits import limit_blocks
 from ccd_casadi.reporting.loops import gains, run_view, view_of
 from ccd_casadi.reporting.machine import SHOWN, mode_shape_figure
-from ccd_casadi.reporting.moves import force_step, move_parts
+from ccd_casadi.reporting.moves import cycle_section, force_step, move_parts
 from ccd_casadi.reporting.sections_page import (
     bandwidths_table,
     binding_words,
@@ -70,8 +70,8 @@ if TYPE_CHECKING:  # solve imports this module
     from ccd_casadi.codesign.verified import Solution
 
 ORDER = (
-    "glance", "design", "controller", "limits", "start", "theta", "stage", "loop", "move", "force",
-    "budget", "history", "trust",
+    "glance", "design", "controller", "limits", "start", "theta", "stage", "loop", "move", "motor",
+    "force", "budget", "history", "trust",
 )  # fmt: skip
 
 
@@ -171,6 +171,7 @@ def design_parts(
         "glance": lambda: [glance(own, theta, view(), move())],
         "design": lambda: [design_section(problem, result)],
         "move": move_section,
+        "motor": lambda: cycle_section(own, theta, result),
         "force": lambda: [Section("A step of force", (force_step(loops(), view().bandwidth_hz),))],
         "stage": lambda: stage_sections(problem, {"start": problem.start, "optimum": theta}),
         "budget": lambda: budget_section(own, theta, K),

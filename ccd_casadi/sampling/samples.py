@@ -16,7 +16,8 @@ class BandwidthSample:
     """ω_b*(θ) in rad/s and its gradient, where it is reached, and what binds; NaN if infeasible.
 
     An infeasible one says what falls short, and by how much (ln) at least: `violation`. With
-    `error`, the least RMS error in m, the gradient is of that, and ω_b that of its controller.
+    `error`, the least RMS error in m or time of a move in s, the gradient is of that, and ω_b that
+    of its controller.
     """
 
     theta: tuple[float, ...]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import problem
 
-from ccd_casadi.codesign import sections_races
+from ccd_casadi.codesign import outer_sections
 from ccd_casadi.codesign.direct import Direct
 from ccd_casadi.codesign.lifted import Lifted
 from ccd_casadi.codesign.nested import Nested
@@ -175,12 +175,12 @@ def test_a_race_is_of_its_own_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyP
         design = SimpleNamespace(certified=False, words=f"none within {case.inner.S_max}")
         return with_sections(case, anchors=((case.inner.S_max,),)), design
 
-    monkeypatch.setattr(sections_races, "prepared", raced)
+    monkeypatch.setattr(outer_sections, "prepared", raced)
     case = quick(PID)
     with SampleStore(tmp_path / "samples.sqlite") as store:
         for bound in (1.2, 2.0, 1.2):
             asked = replace(case, inner=replace(case.inner, S_max=bound))
-            found, words = sections_races.seeded_and_prepared(store, asked, 0, True)
+            found, words = outer_sections.seeded_and_prepared(store, asked, 0, True)
             assert (sections_of_problem(found).anchors, words) == (
                 ((bound,),), f"none within {bound}",
             )  # fmt: skip
