@@ -31,6 +31,7 @@ class BandwidthSample:
     syntheses: int
     kappa: tuple[float, ...] = ()  # of a fixed structure, which has no ω_S and ω_T
     error: float | None = None
+    anew: bool = False  # whether no anchor leads to κ, but a search at this θ did
 
     @property
     def x(self) -> tuple[float, ...]:
@@ -121,6 +122,7 @@ def bandwidth_sample(theta: tuple[float, ...], payload: dict) -> BandwidthSample
         syntheses=syntheses,
         kappa=tuple(kappa or ()),
         error=error,
+        anew=feasible and bool(payload.get("anew")),
     )
 
 
