@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from operator import attrgetter
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -26,7 +27,7 @@ REMEMBERED = 64  # θ whose figures are kept
 class Moved:
     """θ -> Mechanics of a plant with the motors' mass, which is a parameter of θ or fixed."""
 
-    keep: object = None  # what has to live as long
+    keep: Any = None  # what CasADi does not keep
 
     def __init__(self, evaluate: Evaluate, motion: Motion, place: int | None, fixed: float) -> None:
         self.evaluate, self.motion, self.place, self.fixed = evaluate, motion, place, fixed
@@ -91,20 +92,17 @@ def _hardware(plant: Plant, own: Moved, names: Sequence[str]) -> tuple[ca.Functi
     if motor is not None and own.motion.required:
         limits = {"peak force": "peak_share"} if motor.peak_current[0] < UNLIMITED else {}
         limits |= {} if motor.rms_power is None else {"motor power": "heat_share"}
-    if motor is None or not (limits or motor.price):
+    if not limits:
         return ca.Function("hardware", [theta], [f, lam]), []
-    figures, price = ("power", *limits.values()), motor.price
     at = lru_cache(maxsize=REMEMBERED)(own.at)
+    figures = [attrgetter(name) for name in limits.values()]
 
     def values(x: Array) -> Array:
-        cycle = at(tuple(x.tolist())).cycle
-        return np.array([np.real(getattr(cycle, name)) for name in figures])
+        return np.array([np.real(read(at(tuple(x.tolist())).cycle)) - 1.0 for read in figures])
 
     def slopes(x: Array) -> Array:
-        return np.array([at(tuple(x.tolist())).slopes(attrgetter(name)) for name in figures])
+        return np.array([at(tuple(x.tolist())).slopes(read) for read in figures])
 
-    call = VectorCallback("motors", len(names), len(figures), values, slopes)
-    own.keep = call  # CasADi does not
-    found = call(theta)
-    f, lam = f + price * found[0], ca.vertcat(lam, found[1:] - 1.0)
+    own.keep = VectorCallback("motors", len(names), len(limits), values, slopes)
+    lam = ca.vertcat(lam, own.keep(theta))
     return ca.Function("hardware", [theta], [f, lam]), list(limits)

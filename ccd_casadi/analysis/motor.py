@@ -36,8 +36,7 @@ class Motor:
     """One motor, or a catalogue in rising order of the moving mass: N/A, ohm, A, kg.
 
     `rms_power` in W of all motors together, None: any. `size` names the parameter of θ that is the
-    moving mass, which is added to the plant at every input: M + mass b bᵀ. `price` is what a watt
-    adds to the hardware cost.
+    moving mass, which is added to the plant at every input: M + mass b bᵀ.
     """
 
     force_constant: tuple[float, ...]
@@ -46,7 +45,6 @@ class Motor:
     moving_mass: tuple[float, ...] = (0.0,)
     rms_power: float | None = None
     size: str = ""
-    price: float = 0.0
 
     def at(self, mass: Any) -> tuple[Any, Any, Any]:
         """k_f, R and the peak current of the motor with this moving mass."""
@@ -63,12 +61,11 @@ class Motor:
 @dataclass(frozen=True)
 class Motion:
     """A move in SI and its motor: `limits` (acceleration inf: what the motor allows), `window` in
-    which it has settled, `dwell` from its end to the next, the output `axis` that moves."""
+    which it has settled, `dwell` from its end to the next. The first output moves."""
 
     limits: Limits
     window: float
     dwell: float = 0.0
-    axis: int = 0
     motor: Motor | None = None
 
     @property
@@ -177,7 +174,7 @@ def motion_at(
     """
     hold = (0.0, 0.0) if sampling is None else (sampling.period, sampling.delay)
     F, dF = feedforward_slopes(free.plant_si(), free.changes_si(), *hold)
-    ahead, slopes = F[:, :, motion.axis], dF[:, :, :, motion.axis]
+    ahead, slopes = F[:, :, 0], dF[:, :, :, 0]
     found = cycle_of(motion, ahead[2], mass)
     if np.abs(ahead[0]).max() * motion.limits.stroke > HELD * found.peak_force:
         raise UserError("move: a spring holds the output that moves, and its force is not counted")

@@ -93,7 +93,7 @@ def problem_of(case: Case) -> CoDesignProblem:
         plants = [plant_of(with_options(problem, options)) for options in ((), *others)]
         problem.controller.require_plants(plants)
         if problem.source.motion is not None:
-            require_motion(problem, problem.source.motion)
+            require_motion(problem)
         model = model_named(case.plant.model)
         if model is None or not model.sound:
             for finding in diagnose(problem, case.suspension.rigid_modes)[1]:

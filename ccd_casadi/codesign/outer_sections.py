@@ -242,7 +242,8 @@ class SectionsOuter(ThetaOuter):
         kkt = theta_kkt(problem, best, TrueBandwidth(asked, "certificate"), end.found.envelope)
         wide, checked = judged_widely(problem, best.theta, made.controller, worst, asked.workers)
         proof = proof_of(problem, best.theta, made)
-        drawn = None if proof.proven else fresh_yield(problem, best.theta, made, asked.workers)
+        whole = proof.proven and not proof.of_S
+        drawn = None if whole else fresh_yield(problem, best.theta, made, asked.workers)
         with Progress(1, "what limits it", quiet=asked.quiet) as bar:
             make = partial(costs_of, problem, best.theta, made.kappa)
             costs = asked.kept("costs", best.theta, Costs, make)
@@ -342,13 +343,23 @@ def by_pieces(
     """From a sample, and what was asked for near it, to where the pieces of J promise no more.
 
     Where ω_b* jumps beside the best θ the climbs from the anchors have lost its controller: that
-    one becomes an anchor, and the search goes on.
+    one becomes an anchor, and the search goes on. So does one that a search at its θ has found:
+    another search at each θ near by would be dear, and ω_b* none of one controller.
     """
     for _ in range(FOLLOWED):
+        if best.anew and truth.sampler.problem.figure is BANDWIDTH:
+            truth, best = _with_anchor(truth, best)
         best, jumped = pieces_from(truth, best, settled, first)
         if not jumped:
             break
-        problem = joined(truth.sampler.problem, np.array(best.kappa), ())
-        truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
-        best = truth.at(np.array(best.theta))
+        truth, best = _with_anchor(truth, best)
     return truth, best
+
+
+def _with_anchor(
+    truth: TrueBandwidth, best: BandwidthSample
+) -> tuple[TrueBandwidth, BandwidthSample]:
+    """With the controller of a sample as one more anchor, and the sample of that problem."""
+    problem = joined(truth.sampler.problem, np.array(best.kappa), ())
+    truth = TrueBandwidth(truth.sampler.of(problem), truth.label)
+    return truth, truth.at(np.array(best.theta))

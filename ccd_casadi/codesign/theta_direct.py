@@ -17,6 +17,7 @@ from surrogates import design
 
 PRECISE = 1e-6  # IPOPT's tolerance: ω_b* is known to about 1e-8
 SETTLED = 1e-7  # of J: at a kink of ω_b* no residual falls, a hundred line searches gain no more
+FAR = 0.1  # of the box: the first radius where the optimum is not known to be near by
 STEPS = 15  # per parameter, at most, to where pieces meet: from near by it takes half of that
 
 

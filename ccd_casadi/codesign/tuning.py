@@ -139,7 +139,8 @@ def _plant(
         kept = item.hz < (np.inf if rate_hz is None else 0.5 * rate_hz)
         lag = np.exp(-1j * HZ * item.hz * delay)[:, None, None]
         G = (item.matrix * lag).reshape(item.G.shape)
-        return replace(item, hz=item.hz[kept], G=G[kept]), None
+        spread = item.spread if item.spread is None else item.spread[kept]
+        return replace(item, hz=item.hz[kept], G=G[kept], spread=spread), None
     if isinstance(item, interchange.NamedSystem):
         system, own = item.system, item.period
     else:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ccd_casadi.analysis.driven_plant import Moved
-from ccd_casadi.analysis.motor import Motion, MotionAt
+from ccd_casadi.analysis.motor import MotionAt
 from ccd_casadi.analysis.move import simulate
 from ccd_casadi.analysis.yield_bound import Yield
 from ccd_casadi.fixed_structure.uncertainty import UncertainPlant
@@ -38,12 +38,12 @@ def motion_of(problem: CoDesignProblem, theta: Sequence[float]) -> MotionAt:
     return own.at(tuple(map(float, theta)), problem.sampling)
 
 
-def require_motion(problem: CoDesignProblem, motion: Motion) -> None:
+def require_motion(problem: CoDesignProblem) -> None:
     """Raise UserError where the plant does not make its move."""
     plant = plant_of(problem)
-    if plant.inputs != plant.outputs or motion.axis >= plant.outputs:
+    if plant.inputs != plant.outputs:
         words = f"has {plant.inputs} inputs and {plant.outputs} outputs; [move] needs as many"
-        raise PlantError(f"{words} of one as of the other, and output {motion.axis + 1}")
+        raise PlantError(f"{words} of one as of the other")
     motion_of(problem, problem.start)
 
 
@@ -54,7 +54,7 @@ def exact_times(
     profile = motion.cycle.profile
     found = [
         simulate(
-            Loop(plant.plant_si(), K, problem.sampling), profile, axis=motion.motion.axis,
+            Loop(plant.plant_si(), K, problem.sampling), profile, axis=0,
             forces=motion.forward, window=motion.motion.window,
             bandwidth_hz=PER_MOVE / profile.duration,
         ).settled

@@ -53,17 +53,17 @@ def move_parts(
     """
     if problem.source.motion is not None:
         motion = motion_of(problem, theta)
-        profile, axis, window = motion.cycle.profile, motion.motion.axis, motion.motion.window
+        profile, window = motion.cycle.profile, motion.motion.window
         name, other = "feedforward up to snap", "the move of [move]"
         ahead: Array | None = motion.forward
     else:
-        profile, axis, window = setpoint(LIMITS), 0, WINDOW
+        profile, window = setpoint(LIMITS), WINDOW
         modal = modal_plant(mechanics(plant_of(problem), theta), Suspension(0.0, 0.0))
         name, ahead = "mass feedforward", mass_feedforward(modal, 0)
         other = "for other moves [move] of the case, or the options of robustness"
     ways = {"without feedforward": None} | ({} if ahead is None else {name: ahead})
     free = free_loops(problem, theta, controller)
-    found = moves(loops, free, tuple(ways.values()), profile, axis=axis, window=window,
+    found = moves(loops, free, tuple(ways.values()), profile, axis=0, window=window,
                   bandwidth_hz=bandwidth_hz)  # fmt: skip
     end = profile.duration
     time = np.linspace(0.0, (1.0 + AFTER) * end, POINTS)

@@ -48,15 +48,6 @@ def metres(value: float, digits: int = 3) -> str:
     return shown(value, "m", digits).replace("µ", "u")
 
 
-def seconds(value: float, digits: int = 3) -> str:
-    """A time for the terminal, in ASCII.
-
-    >>> seconds(1.922e-3), seconds(6.74e-4)
-    ('1.92 ms', '674 us')
-    """
-    return shown(value, "s", digits).replace("µ", "u")
-
-
 def counted(number: int, noun: str) -> str:
     """A number of things.
 
