@@ -19,14 +19,10 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
-from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_joint import together
@@ -177,16 +173,6 @@ class SectionsOuter(ThetaOuter):
     def __init__(self, sampler: Sampler, words: str = "") -> None:
         super().__init__(sampler)
         self.words = words
-
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
-    ) -> FormulationResult:
-        """Direct from the case's start alone is the polish."""
-        if isinstance(formulation, Direct) and formulation.starts == 1:
-            best = self.sampler.bandwidths(np.array(self.problem.start), "direct")[0]
-            x = np.array(best.theta) if best.feasible else None
-            return FormulationResult(x, None, (), (), None, best.feasible, best.shortfall)
-        return super().formulated(formulation, seed, given)
 
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
