@@ -69,7 +69,7 @@ def deploy(
         run.plant, reduced, run.weights, gamma=UNBOUNDED, omega_low=inner.omega_low
     )
     target = Target(inner.S_max, SAMPLED_EXCESS, full.bandwidth, SAMPLED_BANDWIDTH)
-    conversions = conversions_of(timing, full.sensitivity_peak_frequency)
+    conversions = conversions_of(timing)
     loops = ChannelLoops(channels, small, target)
     for attempt in range(1 + ADDED):
         trials, best, rate = choose(run, timing, loops, family, conversions, progress, attempt)
