@@ -1,4 +1,4 @@
-"""Where the motors of examples/placed_motors stand, and J over their place: docs/positions.png.
+"""Where the motors of examples/placed_motors stand, and J over their place, as a picture in docs/.
 
     python benchmarks/placed_motors.py RUN [EIGHT_RUN]
 

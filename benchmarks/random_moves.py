@@ -137,13 +137,13 @@ def compared(case: MoveCase, which: int) -> tuple[float, float, float, float]:
     profile = motion.cycle.profile
     move = simulate(loop, profile, axis=0, forces=motion.forward, window=motion.motion.window,
                     bandwidth_hz=10.0 / profile.duration)  # fmt: skip
-    own = judged(case, which, len(move.time))
+    own = judged(case, which, 2 * len(move.time))  # whether what follows stays within it
     outside = np.flatnonzero(np.abs(own) > motion.motion.window)
     settled = outside[-1] + 1 if outside.size else 0
     smooth = max(goal.times(case.kappa)[which], motion.cycle.profile.duration)
     return (
         move.settled / case.hold.period - settled,
-        float(np.abs(own - move.error).max() / motion.motion.window),
+        float(np.abs(own[: len(move.time)] - move.error).max() / motion.motion.window),
         max(move.settled, motion.cycle.profile.duration),
         smooth,
     )

@@ -19,14 +19,10 @@ from typing import cast
 import numpy as np
 
 from ccd_casadi.cases.run_folder import read_json, with_function
-from ccd_casadi.codesign.direct import Direct
-from ccd_casadi.codesign.formulation import FormulationResult
-from ccd_casadi.codesign.formulations import Formulation
 from ccd_casadi.codesign.outer import End
 from ccd_casadi.codesign.outer_theta import ThetaOuter
 from ccd_casadi.codesign.post_optimal import PostOptimal, sections_responses
 from ccd_casadi.codesign.robust_check import other_damping, survived
-from ccd_casadi.codesign.stored import Surrogates
 from ccd_casadi.codesign.survival import loops_of
 from ccd_casadi.codesign.theta_direct import TrueBandwidth, pieces_from
 from ccd_casadi.codesign.theta_joint import together
@@ -178,16 +174,6 @@ class SectionsOuter(ThetaOuter):
         super().__init__(sampler)
         self.words = words
 
-    def formulated(
-        self, formulation: Formulation, seed: int, given: Surrogates | None = None
-    ) -> FormulationResult:
-        """Direct from the case's start alone is the polish."""
-        if isinstance(formulation, Direct) and formulation.starts == 1:
-            best = self.sampler.bandwidths(np.array(self.problem.start), "direct")[0]
-            x = np.array(best.theta) if best.feasible else None
-            return FormulationResult(x, None, (), (), None, best.feasible, best.shortfall)
-        return super().formulated(formulation, seed, given)
-
     def prepared(self, seed: int) -> "SectionsOuter":
         """Searched at the start for anchors and the plant set, where there are none."""
         sampler = self.sampler
@@ -294,16 +280,17 @@ def with_members(sampler: Sampler, kappa: Array, members: Sequence[Member]) -> S
 
 
 def carried(sampler: Sampler, theta: Array) -> tuple[Sampler, BandwidthSample]:
-    """`together` again with the worst plants of its end, until there are none that are worse."""
+    """`together` again with the worst plants of its end, until it settles and none is worse."""
     for turn in range(ROUNDS):
-        sampler, best = together(sampler, theta)
+        sampler, best, settled = together(sampler, theta)
         if not best.feasible:
             break
         design, tell = value_at(sampler, best.theta).design, teller("on the way", sampler.quiet)
         members = worst_members(sampler.problem, best.theta, design, turn, tell)[1]
-        if not members:
+        if settled and not members:
             break
-        sampler, theta = with_members(sampler, design.kappa, members), np.array(best.theta)
+        theta = np.array(best.theta)
+        sampler = with_members(sampler, design.kappa, members) if members else sampler
     return sampler, best
 
 

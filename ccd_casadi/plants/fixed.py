@@ -14,7 +14,6 @@ from ccd_casadi.drawing.content import Figure
 from ccd_casadi.drawing.pictures import ModeShapes
 from ccd_casadi.plants.plant import Evaluate, Mechanics, ModelFunction, Plant
 from ccd_casadi.support.arrays import Array
-from ccd_casadi.support.process_pool import Pool
 
 
 def fixed_model(model: ModelFunction, fixed: Mapping[str, float]) -> ModelFunction:
@@ -90,11 +89,7 @@ def through(
 
     `others`: fields that are given as they are, of the new θ.
     """
-    nearby, shapes, drawing = plant.nearby, plant.shapes, plant.drawing
-
-    def near(theta: Sequence[float], reach: float, pool: Pool) -> Evaluate:
-        assert nearby is not None
-        return of(nearby(own(theta), reach, pool))
+    shapes, drawing = plant.shapes, plant.drawing
 
     def shown(theta: Sequence[float], count: int) -> ModeShapes:
         assert shapes is not None
@@ -109,7 +104,6 @@ def through(
         "references": {name: of(closer) for name, closer in plant.references.items()},
         "values": None if plant.values is None else of(plant.values),
         "notes": lambda theta: plant.notes(own(theta)),
-        "nearby": None if nearby is None else near,
         "doubt": lambda theta: plant.doubt(own(theta)),
         "shapes": None if shapes is None else shown,
         "drawing": None if drawing is None else drawn,

@@ -72,7 +72,8 @@ def move_parts(
         error = 1e6 * np.array([np.interp(time, move.time, move.error) for move in made])
         panels.append(over_plants(
             1e3 * time, error, f"error, {name} (µm)", legend="upper right",
-            levels=(Level(1e3 * end, "end of the move", True, GREY),),
+            levels=(Level(1e3 * end, "end of the move", True, GREY),
+                    *(Level(side * 1e6 * window, "") for side in (-1.0, 1.0))),
         ))  # fmt: skip
         columns += _columns(error)
         heads += [f"µm, {name}", "least", "largest"] if len(error) > 1 else [f"µm, {name}"]

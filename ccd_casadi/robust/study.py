@@ -180,7 +180,6 @@ def study_dict(run: FinishedRun, found: Study) -> dict[str, Any]:
             "tolerance": hard.tolerance,
             "samples": len(hard.judged) + hard.failed,
             "no_plant": hard.failed,
-            "reduced_model_difference": hard.difference,
             "unstable": hard.unstable,
             "stable_above_S_max": hard.above(S_max),
             "yield": hard.within(S_max).entry,
